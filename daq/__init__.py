@@ -1,0 +1,1 @@
+"""Acquisition: wires to files and back."""

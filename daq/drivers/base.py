@@ -1,0 +1,103 @@
+"""The seam between devices and the recorder.
+
+A driver serves one *port*, and all sensors of the bench file that name it: one sensor on a serial
+line, three on a digitizer with nine inputs, several slaves on one Modbus bus. It is a thin shell of
+I/O around a sans-IO protocol: open, configure, read, hand over. It does not retry, keep indices
+across sessions, or write files; the recorder does (``daq.recorder``, ``daq.continuity``).
+
+A third-party package adds a driver by an entry point in the group ``huddle.drivers`` that names a
+:class:`DriverType`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pydantic import BaseModel
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.protocols.block import Block, Event
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInformation:
+    """What a device says about itself; empty or None where it does not say."""
+
+    sensor: str
+    model: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    sampling_rate: float | None = None
+    """Actual sampling rate in Hz as read back from the device."""
+    temperature: float | None = None
+    """In °C."""
+    details: dict[str, str] = field(default_factory=dict)
+
+
+class Session(Protocol):
+    """An open, identified device, configured and ready to sample."""
+
+    @property
+    def information(self) -> tuple[DeviceInformation, ...]:
+        """One entry per sensor, as read when the session was opened."""
+        ...
+
+    def read(self) -> AsyncIterator[Block | Event]:
+        """Start sampling and yield what comes, until closed.
+
+        Raises
+        ------
+        NotConnectedError
+            The port went away.
+        NoAnswerError
+            The device stopped sending.
+        RemoteProtocolError
+            The device sends what its protocol does not allow.
+        """
+        ...
+
+
+class DriverType(Protocol):
+    """What an entry point in ``huddle.drivers`` names."""
+
+    @property
+    def name(self) -> str:
+        """As in the bench file's ``driver = "…"``."""
+        ...
+
+    @property
+    def summary(self) -> str:
+        """One line for ``huddle init`` and ``--help``."""
+        ...
+
+    @property
+    def settings(self) -> type[BaseModel]:
+        """Model of the sensor's ``settings`` table in the bench file."""
+        ...
+
+    @property
+    def shares_clock(self) -> bool:
+        """Whether all sensors on one port are sampled by one clock."""
+        ...
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Type of the raw counts this sensor's blocks hold."""
+        ...
+
+    def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AbstractAsyncContextManager[Session]:
+        """Open the port, identify and configure the device; leave it quiet and closed on exit.
+
+        Raises
+        ------
+        NotConnectedError, NoAnswerError, WrongDeviceError
+            Each naming sensor, port, what was expected and what came.
+        """
+        ...

@@ -1,0 +1,43 @@
+"""Errors of acquisition. Each is a HuddleError and of the standard kind it is."""
+
+from __future__ import annotations
+
+
+class HuddleError(Exception):
+    """Root of every error huddle raises on purpose; its message says what to do."""
+
+
+class BenchFileError(HuddleError, ValueError):
+    """The bench file is wrong; the message lists every fault with file, key, value, expectation."""
+
+
+class DeviceError(HuddleError):
+    """A device cannot be used; the message names sensor, port, what was expected and what came."""
+
+
+class NotConnectedError(DeviceError, ConnectionError):
+    """The port cannot be opened, or closed by itself."""
+
+
+class NoAnswerError(DeviceError, TimeoutError):
+    """The port is there, but no device answers."""
+
+
+class WrongDeviceError(DeviceError, ValueError):
+    """Something answers, but it is not the device the bench file names."""
+
+
+class RecordingError(HuddleError, OSError):
+    """A recording cannot be read or written."""
+
+
+class NotARecordingError(RecordingError):
+    """The file is not a huddle recording, or of a format newer than this program."""
+
+
+class CannotAlignError(HuddleError, ValueError):
+    """The sensors of a recording cannot be brought onto one grid."""
+
+
+class ImportFormatError(HuddleError, ValueError):
+    """A foreign file cannot be understood."""

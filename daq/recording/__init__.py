@@ -1,0 +1,1 @@
+"""The recording: the HDF5 file between acquisition and everything else."""

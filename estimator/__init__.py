@@ -1,0 +1,1 @@
+"""Self-noise of collocated sensors: numbers in, numbers out."""

@@ -1,0 +1,19 @@
+"""Errors of estimation."""
+
+from __future__ import annotations
+
+
+class EstimatorError(ValueError):
+    """Root of the errors of this package."""
+
+
+class InvalidMatrixError(EstimatorError):
+    """A cross-spectral matrix is mis-shaped, not Hermitian, or not finite throughout."""
+
+
+class InsufficientDataError(EstimatorError):
+    """Too few averages or too few sensors for what was asked."""
+
+
+class UnknownMethodError(EstimatorError):
+    """No self-noise method of that name."""

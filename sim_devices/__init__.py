@@ -1,0 +1,1 @@
+"""Simulated motion, noise and devices with known truth."""

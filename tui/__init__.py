@@ -1,0 +1,1 @@
+"""Terminal front ends: the `huddle` command and the application."""
