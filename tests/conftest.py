@@ -1,0 +1,93 @@
+"""What every test lives under: nothing may be left behind, and where the real recordings are."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+import os
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+USGS_RECORDING = "usgs-tst-huddle"
+
+
+def _open_descriptors() -> dict[int, str]:
+    """Descriptors of sockets, pseudo-terminals and regular files of this process, by number."""
+    links: dict[int, str] = {}
+    folder = Path("/proc/self/fd")
+    if not folder.exists():  # not Linux: threads and children are still watched
+        return links
+    for entry in folder.iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:  # closed between listing and looking
+            continue
+        if target.startswith(("socket:", "/dev/pt")) or target.endswith(".h5"):
+            links[int(entry.name)] = target
+    return links
+
+
+def _children() -> set[str]:
+    """Process numbers of this process's children, ended but unreaped ones included."""
+    lists = Path("/proc/self/task").glob("*/children")
+    return {number for list_ in lists for number in list_.read_text().split()}
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Fail a test that leaves a thread, task, child, socket, terminal or recording open."""
+    threads = set(threading.enumerate())
+    children = _children()
+    descriptors = _open_descriptors()
+    yield
+    for thread in set(threading.enumerate()) - threads:
+        thread.join(timeout=2.0)  # one that is ending may end
+    left = [
+        t.name for t in set(threading.enumerate()) - threads if not t.name.startswith("asyncio_")
+    ]
+    if left:
+        pytest.fail(f"threads left behind: {left}")
+    born = _children() - children
+    if born:
+        pytest.fail(f"processes left behind: {sorted(born)}")
+    opened = {n: t for n, t in _open_descriptors().items() if descriptors.get(n) != t}
+    if opened:
+        pytest.fail(f"descriptors left open: {opened}")
+
+
+def _leaving_no_task(test: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
+    """Return the asynchronous test, failing where a task it started outlives it."""
+
+    @functools.wraps(test)
+    async def checked(*args: object, **kwargs: object) -> None:
+        before = asyncio.all_tasks()
+        await test(*args, **kwargs)
+        left = {task.get_name() for task in asyncio.all_tasks() - before if not task.done()}
+        if left:
+            pytest.fail(f"tasks left behind: {sorted(left)}")
+
+    return checked
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Watch the tasks of every asynchronous test."""
+    for item in items:
+        if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
+            item.obj = _leaving_no_task(item.obj)
+
+
+@pytest.fixture(scope="session")
+def usgs_recording() -> Path:
+    """Folder of the real recording; its tests are skipped, saying so, where it is absent."""
+    root = Path(os.environ.get("HUDDLE_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = root / USGS_RECORDING
+    if not folder.is_dir():
+        pytest.skip(f"no real recording at {folder} (set HUDDLE_DATA to the folder of data)")
+    return folder
