@@ -1,0 +1,7 @@
+"""Errors of the simulated world."""
+
+from __future__ import annotations
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be simulated: every fault with its key, value and expectation."""
