@@ -1,0 +1,282 @@
+"""Cross-spectral matrices by Welch's method, in one pass over the samples.
+
+Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
+in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
+
+Segments are taken a block at a time, so that the work stays in the cache; blocks are shared by
+two threads, and added in their order, so that the result does not depend on the threads.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
+import scipy.fft
+
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.windows import effective_averages, get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from estimator.arrays import ComplexArray, FloatArray, IntArray
+
+SEGMENTS_PER_BLOCK = 24
+THREADS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class WelchSettings:
+    """How samples become spectra.
+
+    Attributes
+    ----------
+    sampling_rate : float
+        In Hz.
+    segment_length : int
+        Samples per segment.
+    overlap : float
+        Fraction of a segment that the next one repeats, from 0 to below 1.
+    window : str or tuple
+        As `estimator.windows.get_window` takes it.
+    detrend : {"none", "constant", "linear"}
+        What is removed from every segment of every channel before the window.
+    """
+
+    sampling_rate: float
+    segment_length: int
+    overlap: float = 0.5
+    window: str | tuple[str | float, ...] = "hann"
+    detrend: Literal["none", "constant", "linear"] = "constant"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sampling_rate) and self.sampling_rate > 0):
+            raise EstimatorError(f"sampling rate {self.sampling_rate}: expected Hz above 0")
+        if self.segment_length < 2:
+            raise EstimatorError(
+                f"segment length {self.segment_length}: expected 2 samples or more"
+            )
+        if not 0 <= self.overlap < 1:
+            raise EstimatorError(f"overlap {self.overlap}: expected a fraction from 0 to below 1")
+        if self.detrend not in {"none", "constant", "linear"}:
+            raise EstimatorError(
+                f"detrend {self.detrend!r}: expected 'none', 'constant' or 'linear'"
+            )
+        get_window(self.window, self.segment_length)
+
+    @property
+    def hop(self) -> int:
+        """Samples from the start of one segment to the start of the next."""
+        return max(1, self.segment_length - round(self.overlap * self.segment_length))
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Frequencies in Hz, shape (n_freqs,), from 0 to half the sampling rate."""
+        return scipy.fft.rfftfreq(self.segment_length, 1 / self.sampling_rate)
+
+
+class CrossSpectra:
+    """Sum of the segments' spectral matrices; its size does not depend on their number.
+
+    Parameters
+    ----------
+    settings : WelchSettings
+    n_channels : int
+    """
+
+    def __init__(self, settings: WelchSettings, n_channels: int) -> None:
+        if n_channels < 1:
+            raise EstimatorError(f"{n_channels} channels: at least one is needed")
+        self.settings = settings
+        self.n_channels = n_channels
+        self.n_segments = 0
+        self._window = get_window(settings.window, settings.segment_length)
+        n_freqs = settings.segment_length // 2 + 1
+        self._sum = np.zeros((n_freqs, n_channels, n_channels), dtype=np.complex128)
+
+    def add(self, samples: FloatArray, starts: IntArray) -> None:
+        """Add the segments of `samples` that begin at `starts`.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+            In physical units. What no segment covers is not looked at.
+        starts : int64, shape (n_segments,)
+            Row of `samples` at which each segment begins.
+
+        Raises
+        ------
+        EstimatorError
+            If a segment does not lie within `samples`, or the number of channels differs.
+        """
+        samples = np.asarray(samples, dtype=np.float64)
+        starts = np.asarray(starts, dtype=np.int64)
+        if samples.ndim != 2 or samples.shape[1] != self.n_channels:
+            raise EstimatorError(
+                f"samples of shape {samples.shape}, expected (n_samples, {self.n_channels})"
+            )
+        if starts.size == 0:
+            return
+        last = len(samples) - self.settings.segment_length
+        if starts.ndim != 1 or starts.min() < 0 or starts.max() > last:
+            raise EstimatorError(
+                f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
+            )
+        blocks = [
+            starts[first : first + SEGMENTS_PER_BLOCK]
+            for first in range(0, len(starts), SEGMENTS_PER_BLOCK)
+        ]
+        for total in self._totals(samples, blocks):
+            self._sum += total
+        self.n_segments += len(starts)
+
+    def _totals(self, samples: FloatArray, blocks: list[IntArray]) -> Iterator[ComplexArray]:
+        """Spectral sum of each block, in order; a few blocks under way at a time."""
+        if len(blocks) == 1:
+            yield self._total(samples, blocks[0])
+            return
+        with ThreadPoolExecutor(THREADS) as pool:
+            remaining = iter(blocks)
+            under_way = [
+                pool.submit(self._total, samples, block)
+                for block in itertools.islice(remaining, 2 * THREADS)
+            ]
+            while under_way:
+                yield under_way.pop(0).result()
+                under_way += [
+                    pool.submit(self._total, samples, block)
+                    for block in itertools.islice(remaining, 1)
+                ]
+
+    def _total(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
+        length = self.settings.segment_length
+        # (n_samples - length + 1, n_channels, length) without copying; the index copies.
+        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
+        _detrend(frames, self.settings.detrend)
+        frames *= self._window
+        spectra = scipy.fft.rfft(frames, axis=-1, overwrite_x=True)
+        # BLAS wants the summed index beside the channels, one plain matrix a frequency.
+        spectra = np.ascontiguousarray(spectra.transpose(2, 0, 1))
+        total: ComplexArray = np.matmul(spectra.transpose(0, 2, 1), spectra.conj())
+        return total
+
+    @property
+    def n_effective(self) -> float:
+        """Independent averages the segments are worth, were they one run without gaps."""
+        return effective_averages(self._window, self.settings.hop, self.n_segments)
+
+    def csm(self) -> ComplexArray:
+        """Return the cross-spectral matrix.
+
+        Returns
+        -------
+        complex128, shape (n_freqs, n_channels, n_channels)
+            One-sided, in unit**2/Hz.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no segment has been added.
+        """
+        if self.n_segments == 0:
+            raise InsufficientDataError("no segment yet: a spectrum needs at least one")
+        energy = self.settings.sampling_rate * float(self._window @ self._window)
+        density = np.full(len(self._sum), 2 / (energy * self.n_segments))
+        density[0] /= 2
+        if self.settings.segment_length % 2 == 0:
+            density[-1] /= 2
+        csm: ComplexArray = self._sum * density[:, None, None]
+        return csm
+
+    def merge(self, other: CrossSpectra) -> None:
+        """Add the segments of another accumulator with the same settings to this one."""
+        if other.settings != self.settings or other.n_channels != self.n_channels:
+            raise EstimatorError(
+                f"spectra of {other.n_channels} channels with {other.settings} cannot be added to "
+                f"{self.n_channels} channels with {self.settings}"
+            )
+        self._sum += other._sum
+        self.n_segments += other.n_segments
+
+    def __add__(self, other: CrossSpectra) -> CrossSpectra:
+        total = CrossSpectra(self.settings, self.n_channels)
+        total.merge(self)
+        total.merge(other)
+        return total
+
+    def to_bytes(self) -> bytes:
+        """Return everything as a NumPy ``.npz`` archive, for another process or machine."""
+        content = io.BytesIO()
+        np.savez(
+            content,
+            settings=np.array(json.dumps(asdict(self.settings))),
+            n_segments=np.array(self.n_segments),
+            sum=self._sum,
+        )
+        return content.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Return the accumulator that `to_bytes` wrote.
+
+        Raises
+        ------
+        EstimatorError
+            If `content` is something else.
+        """
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                fields = json.loads(str(archive["settings"]))
+                if isinstance(fields["window"], list):  # JSON has no tuples
+                    fields["window"] = tuple(fields["window"])
+                settings = WelchSettings(**fields)
+                total = archive["sum"]
+                n_segments = int(archive["n_segments"])
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise EstimatorError(f"not a serialised cross-spectral matrix: {error}") from error
+        spectra = cls(settings, total.shape[-1])
+        if total.shape != spectra._sum.shape or n_segments < 0:
+            raise EstimatorError(f"not a serialised cross-spectral matrix: shape {total.shape}")
+        spectra._sum = total.astype(np.complex128)
+        spectra.n_segments = n_segments
+        return spectra
+
+
+def _detrend(frames: FloatArray, kind: str) -> None:
+    """Remove mean or line along the last axis, in place."""
+    if kind == "none":
+        return
+    frames -= frames.mean(axis=-1, keepdims=True)
+    if kind == "linear":
+        length = frames.shape[-1]
+        ramp = np.arange(length) - (length - 1) / 2
+        frames -= ((frames @ ramp) / (ramp @ ramp))[..., None] * ramp
+
+
+def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
+    """Divide by the response of every channel: from digitised to physical units.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+    response : complex128, shape (n_freqs, n_channels)
+        What each channel makes of one unit, at each frequency.
+
+    Returns
+    -------
+    complex128, shape (n_freqs, n_channels, n_channels)
+        ``csm[f, p, q] / (h[f, p] conj(h[f, q]))``; NaN where a response is zero, as at 0 Hz.
+    """
+    response = np.asarray(response, dtype=np.complex128)
+    if response.shape != csm.shape[:2]:
+        raise EstimatorError(f"response of shape {response.shape}, expected {csm.shape[:2]}")
+    known = np.isfinite(response) & (response != 0)
+    inverse = np.where(known, 1 / np.where(known, response, 1), np.nan)
+    return csm * inverse[:, :, None] * inverse[:, None, :].conj()
