@@ -1,0 +1,98 @@
+"""NumPy archives: ``sampling_rate`` and one array of counts per sensor.
+
+==================  ====================================================================
+``sampling_rate``   in Hz, one number
+any other name      a sensor: counts ``(n_samples, n_channels)``, or ``(n_samples,)`` for one
+``start_time``      optional: UTC of the first sample, ISO 8601 or ``datetime64``
+==================  ====================================================================
+
+Channels are called 1, 2, 3 … unless a bench file names them. Without ``start_time`` a recording
+starts at 1970-01-01T00:00:00Z. A row with NaN becomes a gap.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.errors import ImportFormatError
+from daq.formats.foreign import ForeignSensor, finite_stretches
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+RESERVED = ("sampling_rate", "start_time")
+
+
+def read_npz(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
+    """Read the sensors of a NumPy archive; ``sampling_rate`` (Hz) is used where it holds none.
+
+    Raises
+    ------
+    ImportFormatError
+        It is no such archive, or what it holds is not as described above.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (ValueError, zipfile.BadZipFile, AttributeError) as error:
+        raise ImportFormatError(
+            f"{path}: expected a NumPy archive (numpy.savez) of plain numbers; {error}"
+        ) from error
+    rate = float(_number(path, arrays["sampling_rate"])) if "sampling_rate" in arrays else None
+    rate = rate or sampling_rate
+    if rate is None or not rate > 0:
+        raise ImportFormatError(
+            f"{path}: expected a positive sampling_rate in Hz in the archive, "
+            f"found {rate}; add it, or give --sampling-rate"
+        )
+    start_utc_ns = _instant_ns(path, arrays["start_time"]) if "start_time" in arrays else 0
+    sensors = tuple(
+        _sensor(path, name, array, rate, start_utc_ns)
+        for name, array in arrays.items()
+        if name not in RESERVED
+    )
+    if not sensors:
+        raise ImportFormatError(f"{path}: no sensors in it; expected one array per sensor")
+    return sensors
+
+
+def _sensor(
+    path: Path, name: str, array: NDArray[Any], rate: float, start_utc_ns: int
+) -> ForeignSensor:
+    if array.ndim == 1:
+        array = array[:, np.newaxis]
+    if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "iuf":
+        raise ImportFormatError(
+            f"{path}: sensor {name!r}: expected numbers of shape (n_samples, n_channels), "
+            f"found {array.dtype} of shape {array.shape}"
+        )
+    stretches = finite_stretches(array, start_utc_ns=start_utc_ns, sampling_rate=rate)
+    if not stretches:
+        raise ImportFormatError(f"{path}: sensor {name!r} holds no samples")
+    channels = tuple(str(number) for number in range(1, array.shape[1] + 1))
+    return ForeignSensor(name, channels, rate, stretches, str(path))
+
+
+def _number(path: Path, array: NDArray[Any]) -> float:
+    if array.size != 1 or array.dtype.kind not in "iuf":
+        raise ImportFormatError(
+            f"{path}: sampling_rate: expected one number in Hz, "
+            f"found {array.dtype} of shape {array.shape}"
+        )
+    return float(array.reshape(()))
+
+
+def _instant_ns(path: Path, array: NDArray[Any]) -> int:
+    try:
+        text = str(array.reshape(()).astype(str)).removesuffix("Z").removesuffix("+00:00")
+        return int(np.datetime64(text, "ns").astype(np.int64))
+    except ValueError as error:
+        raise ImportFormatError(
+            f"{path}: start_time: expected one UTC time as in 2026-11-21T03:00:00, found {array}"
+        ) from error
