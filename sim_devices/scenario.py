@@ -55,6 +55,7 @@ from pydantic import (
     ConfigDict,
     Field,
     NonNegativeFloat,
+    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     ValidationError,
@@ -125,7 +126,7 @@ class SensorModel(_Table):
     delay: float = 0.0
     response: Response | None = None
     noise: Spectrum | tuple[Spectrum, ...] = White(level=0.0)
-    seed: int | None = None
+    seed: NonNegativeInt | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clock: SensorClock = SensorClock()
 
@@ -161,14 +162,17 @@ class CommonMotion(_Table):
 class PlaneWaves(_Table):
     """Rayleigh, Love and vertically arriving waves from all directions at one finite speed.
 
-    `spectrum` is the PSD of each direction (x, y, z); the waves share it out evenly.
+    `spectrum` is the PSD of each direction (x, y, z). A share `from_below` of it arrives
+    vertically, alike at all sensors on a level floor; Rayleigh waves, with `ellipticity` the
+    ratio of their horizontal to their vertical axis, and Love waves make up the rest.
     """
 
     kind: Literal["plane-waves"] = "plane-waves"
     spectrum: Spectrum
     speed: PositiveFloat = 150.0
     n_directions: PositiveInt = 16
-    ellipticity: PositiveFloat = 0.7
+    ellipticity: float = Field(default=0.7, gt=0, le=1)
+    from_below: float = Field(default=1 / 3, ge=0, le=1)
     bandwidth: PositiveFloat | None = None
 
     @property
@@ -183,7 +187,7 @@ MotionModel: TypeAlias = Annotated[CommonMotion | PlaneWaves, Field(discriminato
 class Scenario(_Table):
     """A motion and the sensors in it."""
 
-    seed: int = 0
+    seed: NonNegativeInt = 0
     motion: MotionModel
     sensors: dict[str, SensorModel] = Field(min_length=1)
 

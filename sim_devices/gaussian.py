@@ -1,0 +1,129 @@
+"""Stationary Gaussian series that can be entered anywhere, and are the same wherever they are made.
+
+White sources come in blocks, each from a counter-based generator whose counter is the block's
+index: block 10 million costs as much as block 0, and two processes agree on it without a word.
+A series is those sources through a matrix of finite impulse responses, convolved by
+overlap-save, so it is exactly stationary. Its PSD is the wanted one but for the resolution of
+the impulse response's length, half a block either way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from scipy import fft, signal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sim_devices.arrays import ComplexArray, FloatArray
+
+_Kept = TypeVar("_Kept")
+
+LONGEST_BLOCK = 2**16
+LARGEST_SPECTRUM = 2**19  # sources times samples: keeps a field of many waves in memory
+
+
+class WhiteSources:
+    """Independent white series of unit variance.
+
+    Parameters
+    ----------
+    key
+        Two numbers that name the sources: a seed, and what the seed is used for.
+    n_sources
+        How many.
+    """
+
+    def __init__(self, key: tuple[int, int], n_sources: int) -> None:
+        self.n_sources = n_sources
+        self.block = min(LONGEST_BLOCK, 2 ** ((LARGEST_SPECTRUM // n_sources).bit_length() - 1))
+        self._key = np.array(key, dtype=np.uint64)
+        self._samples: dict[int, FloatArray] = {}
+        self._spectra: dict[int, ComplexArray] = {}
+
+    def samples(self, index: int) -> FloatArray:
+        """Block `index` (any integer), shape (n_sources, block)."""
+        if index not in self._samples:
+            counter = np.array([0, 0, index % 2**64, 0], dtype=np.uint64)
+            random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
+            _keep(self._samples, index, random.standard_normal((self.n_sources, self.block)))
+        return self._samples[index]
+
+    def spectrum(self, index: int) -> ComplexArray:
+        """Fourier transform of the block before and block `index`, shape (n_sources, block + 1)."""
+        if index not in self._spectra:
+            both = np.concatenate([self.samples(index - 1), self.samples(index)], axis=1)
+            _keep(self._spectra, index, fft.rfft(both))
+        return self._spectra[index]
+
+
+class GaussianSeries:
+    """White sources through a matrix of filters, sampled at `sampling_rate`.
+
+    Parameters
+    ----------
+    sources
+        Shared by all series that are to be coherent.
+    response
+        From frequency (Hz, shape (n_freqs,)) to complex amplitude per root of one-sided PSD,
+        shape (n_freqs, n_outputs, n_sources): the cross-spectral matrix of the outputs is
+        ``response @ response^H``.
+    sampling_rate
+        In Hz.
+    """
+
+    def __init__(
+        self,
+        sources: WhiteSources,
+        response: Callable[[FloatArray], ComplexArray],
+        *,
+        sampling_rate: float,
+    ) -> None:
+        self._sources = sources
+        block = sources.block
+        frequency = fft.rfftfreq(2 * block, 1 / sampling_rate)
+        amplitude = np.sqrt(sampling_rate / 2) * response(frequency)  # white unit variance: 2 / fs
+        impulse = fft.irfft(np.moveaxis(amplitude, 0, -1), 2 * block)
+        impulse = np.roll(impulse, block // 2, axis=-1)  # lag −block/2 comes first
+        impulse[..., block:] = 0
+        impulse[..., :block] *= signal.windows.tukey(block, 0.5, sym=False)
+        self._filters: ComplexArray = fft.rfft(impulse)
+        self._used = [np.flatnonzero(np.any(row, axis=1)) for row in self._filters]
+        self._blocks: dict[int, FloatArray] = {}
+
+    @property
+    def n_outputs(self) -> int:
+        """Series side by side."""
+        return len(self._filters)
+
+    def read(self, first: int, n: int) -> FloatArray:
+        """Make samples `first` to `first + n` (any integers), shape (n_outputs, n)."""
+        block = self._sources.block
+        first += block // 2  # the filters delay by half a block
+        out = np.empty((self.n_outputs, n))
+        done = 0
+        while done < n:
+            index, at = divmod(first + done, block)
+            part = self._block(index)[:, at : at + n - done]
+            out[:, done : done + part.shape[1]] = part
+            done += part.shape[1]
+        return out
+
+    def _block(self, index: int) -> FloatArray:
+        if index not in self._blocks:
+            white = self._sources.spectrum(index)
+            shaped = np.empty((self.n_outputs, white.shape[1]), dtype=complex)
+            for row, (filters, used) in enumerate(zip(self._filters, self._used, strict=True)):
+                np.einsum("sf,sf->f", filters[used], white[used], out=shaped[row])
+            both = fft.irfft(shaped, 2 * self._sources.block)
+            _keep(self._blocks, index, both[:, self._sources.block :])
+        return self._blocks[index]
+
+
+def _keep(cache: dict[int, _Kept], index: int, value: _Kept) -> None:
+    """Remember the last two: a reader goes forward, and may straddle a block's end."""
+    cache[index] = value
+    while len(cache) > 2:
+        del cache[next(iter(cache))]
