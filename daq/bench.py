@@ -1,0 +1,140 @@
+"""The bench file: what stands on the floor, how it is sampled, what is wanted of it.
+
+``load`` and ``parse`` report every fault of a file at once, each as file, key, value and what was
+expected. The tables are in :mod:`daq.bench_model`; what needs more than one key to judge is in
+:mod:`daq.bench_checks`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import ValidationError
+
+from daq.bench_checks import Fault, cross_faults, field_faults
+from daq.bench_model import (
+    METHODS,
+    WINDOWS,
+    Bench,
+    Channel,
+    EstimateSettings,
+    Limit,
+    PolesZeros,
+    RecordingSettings,
+    Schedule,
+    Sensor,
+)
+from daq.drivers.registry import driver_names, driver_type
+from daq.durations import format_duration, parse_duration
+from daq.errors import BenchFileError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.drivers.base import DriverType
+
+__all__ = [
+    "METHODS",
+    "WINDOWS",
+    "Bench",
+    "Channel",
+    "EstimateSettings",
+    "Limit",
+    "PolesZeros",
+    "RecordingSettings",
+    "Schedule",
+    "Sensor",
+    "dump",
+    "format_duration",
+    "load",
+    "parse",
+    "parse_duration",
+]
+
+
+def load(path: str | Path) -> Bench:
+    """Read and check a bench file.
+
+    Raises
+    ------
+    BenchFileError
+        With every fault of the file, one a line.
+    """
+    source = Path(path)
+    try:
+        text = source.read_text(encoding="utf-8")
+    except OSError as error:
+        reason = error.strerror or error
+        raise BenchFileError(f"{source}: cannot be read: {reason}; expected a bench file") from None
+    except UnicodeDecodeError as error:
+        raise BenchFileError(f"{source}: byte {error.start} is not UTF-8 text") from None
+    return parse(text, source)
+
+
+def parse(
+    text: str,
+    source: str | Path = "bench",
+    *,
+    drivers: Mapping[str, DriverType] | None = None,
+    check: bool = True,
+) -> Bench:
+    """Parse and check the text of a bench file.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    source : path or str
+        What messages call it; recordings go beside it if it is a path.
+    drivers : mapping, optional
+        Known drivers; those installed, if not given.
+    check : bool
+        Whether the whole must make sense as a huddle test on this computer. A bench that comes out
+        of a recording need not: its drivers may be elsewhere.
+
+    Raises
+    ------
+    BenchFileError
+        With every fault of the file, one a line.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BenchFileError(f"{source}: not TOML: {error}") from None
+    bench: Bench | None = None
+    faults: list[Fault] = []
+    context = {"text": text, "source": source if isinstance(source, Path) else None}
+    try:
+        bench = Bench.model_validate(table, context=context)
+    except ValidationError as error:
+        faults += field_faults(error, Bench, table)
+    if check:
+        faults += cross_faults(table, _Installed() if drivers is None else drivers)
+    if faults or bench is None:
+        unique = dict.fromkeys(str(fault) for fault in faults)
+        raise BenchFileError("\n".join(f"{source}: {fault}" for fault in unique))
+    return bench
+
+
+def dump(bench: Bench) -> str:
+    """Return a bench as TOML text that parses to an equal bench."""
+    return bench.dump()
+
+
+class _Installed(Mapping[str, "DriverType"]):
+    """The installed drivers, imported only when looked at."""
+
+    def __getitem__(self, name: str) -> DriverType:
+        return driver_type(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in driver_names()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(driver_names())
+
+    def __len__(self) -> int:
+        return len(driver_names())

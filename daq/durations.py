@@ -1,0 +1,73 @@
+"""Durations as people write them: ``10s``, ``90 min``, ``1.5h``, ``2d 12h``."""
+
+from __future__ import annotations
+
+import math
+import re
+
+_SECONDS = {
+    "ms": 1e-3,
+    "s": 1.0,
+    "sec": 1.0,
+    "second": 1.0,
+    "seconds": 1.0,
+    "m": 60.0,
+    "min": 60.0,
+    "minute": 60.0,
+    "minutes": 60.0,
+    "h": 3600.0,
+    "hour": 3600.0,
+    "hours": 3600.0,
+    "d": 86400.0,
+    "day": 86400.0,
+    "days": 86400.0,
+    "w": 604800.0,
+    "week": 604800.0,
+    "weeks": 604800.0,
+}
+_PART = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.ASCII)
+_EXPECTED = 'expected a positive duration such as "10s", "90 min", "3h" or "1d 12h"'
+
+
+def parse_duration(value: str | float) -> float:
+    """Return a duration in seconds; a bare number is seconds.
+
+    Raises
+    ------
+    ValueError
+        If ``value`` is not a positive, finite duration; the message says what was expected.
+    """
+    numeric = isinstance(value, (int, float)) and not isinstance(value, bool)
+    seconds = float(value) if numeric else _parse_text(str(value))
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(_EXPECTED)
+    return seconds
+
+
+def _parse_text(text: str) -> float:
+    lowered = text.lower()
+    total, position, bare = 0.0, 0, False
+    while position < len(lowered):
+        part = _PART.match(lowered, position)
+        # A bare number stands alone: in "1h 30" nobody knows what the 30 counts.
+        if part is None or bare or (not part[2] and position > 0):
+            raise ValueError(_EXPECTED)
+        if part[2] and part[2] not in _SECONDS:
+            raise ValueError(_EXPECTED)
+        bare = not part[2]
+        total += float(part[1]) * _SECONDS.get(part[2], 1.0)
+        position = part.end()
+    return total
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration for people: ``10s``, ``1h30m``, ``2d12h``; always parsed back."""
+    if seconds < 60 or not math.isfinite(seconds):
+        return f"{seconds:.3g}s"
+    rest = round(seconds)
+    parts = []
+    for unit, length in (("d", 86400), ("h", 3600), ("m", 60), ("s", 1)):
+        count, rest = divmod(rest, length)
+        if count:
+            parts.append(f"{count}{unit}")
+    return "".join(parts)
