@@ -1,0 +1,44 @@
+"""``python -m sim_devices SPEC.json [INDEX]``; see :mod:`sim_devices.serve`."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+
+from sim_devices.errors import ScenarioError, ServeError
+from sim_devices.launch import start
+from sim_devices.serve import serve
+
+
+def main(arguments: list[str]) -> int:
+    """Serve one device or, each in its own process, all of them."""
+    if len(arguments) not in {1, 2}:
+        print(__doc__, file=sys.stderr)
+        return 2
+    try:
+        spec = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
+        if len(arguments) == 2:
+            asyncio.run(serve(spec, int(arguments[1])))
+            return 0
+        with start(spec) as running:
+            for device in running:
+                said = {
+                    "sensors": device.sensors,
+                    "driver": device.driver,
+                    "port": device.port,
+                    "settings": device.settings,
+                }
+                print(json.dumps(said), flush=True)
+            sys.stdin.read()
+    except KeyboardInterrupt:
+        return 130
+    except (OSError, ScenarioError, ServeError) as error:
+        print(error, file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

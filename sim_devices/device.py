@@ -1,0 +1,145 @@
+"""The seam between a simulated device and the wire it is served on.
+
+A family module (``sim_devices/<family>.py``) offers ``create(spec, source) -> list[Line]``: the
+device's wire ends, all sans-IO and speaking world time in seconds. :mod:`sim_devices.serve` puts
+each on a pseudo-terminal or a port, calls it when bytes come and when time passes, and writes what
+it returns. Bytes are returned in units as the device sends them (a frame, a packet, a datagram),
+so that a fault can strike exactly one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+
+import numpy as np
+
+from sim_devices.scenario import Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sim_devices.arrays import FloatArray
+
+Kind: TypeAlias = Literal["pty", "tcp", "udp"]
+
+NEVER = math.inf
+
+
+class Endpoint(Protocol):
+    """One end of a wire: bytes in, bytes out; ``now`` is world time in seconds."""
+
+    def connected(self, now: float) -> Sequence[bytes]:
+        """Somebody opened the line."""
+        ...
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Answer what came."""
+        ...
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return what the device has sent by itself up to ``now`` and not returned before."""
+        ...
+
+    def next_due(self) -> float:
+        """World time at which :meth:`due` will have something; ``NEVER`` until spoken to."""
+        ...
+
+    def disconnected(self, now: float) -> None:
+        """Nobody has the line open any more."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """An endpoint and the kind of wire it is to be served on.
+
+    ``scheme`` begins the address printed for a TCP or UDP line. The first line of a device is its
+    port; of a further one, ``setting`` names the driver's setting that is to hold its port number.
+    """
+
+    endpoint: Endpoint
+    kind: Kind
+    scheme: str = "socket"
+    setting: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSpec:
+    """One channel of a sensor, as in the bench file; ``sensitivity`` in counts per unit."""
+
+    name: str
+    sensitivity: float
+    auxiliary: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSpec:
+    """One device of a specification (see :mod:`sim_devices.serve`)."""
+
+    sensors: tuple[str, ...]
+    driver: str
+    port: Kind
+    sampling_rate: float
+    channels: Mapping[str, tuple[ChannelSpec, ...]]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Source:
+    """What the sensors of a device read, in counts, and when.
+
+    Parameters
+    ----------
+    scenario
+        The world, as handed over in the specification.
+    device
+        The device whose sensors are read.
+    sampling_rate
+        In Hz; the device's own when not given. The world stays the same at any rate.
+    """
+
+    def __init__(
+        self, scenario: Scenario, device: DeviceSpec, sampling_rate: float | None = None
+    ) -> None:
+        self.sampling_rate = sampling_rate or device.sampling_rate
+        self.device = device
+        self._scenario = scenario
+        table = scenario.to_dict()
+        table["motion"]["bandwidth"] = scenario.bandwidth
+        for sensor in device.sensors:
+            table["sensors"][sensor]["sampling_rate"] = self.sampling_rate
+        self._sampled = Scenario.from_dict(table)
+
+    def at_rate(self, sampling_rate: float) -> Source:
+        """Return the same world read at another rate."""
+        return Source(self._scenario, self.device, sampling_rate)
+
+    def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
+        """Return the main channels in counts, not yet rounded or clipped: (n, n_channels)."""
+        return self._sampled.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+
+    def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
+        """World time of each sample in s, shape (n,)."""
+        return self._sampled.sample_times(sensor, first_sample, n)
+
+    def first_sample_after(self, sensor: str, now: float) -> int:
+        """Index of the first sample taken at or after world time ``now``."""
+        guess = max(0, math.floor((now - float(self.times(sensor, 0, 1)[0])) * self.sampling_rate))
+        while guess > 0 and float(self.times(sensor, guess, 1)[0]) >= now:
+            guess = max(0, guess - max(1, round(guess * 1e-4)))
+        while True:
+            later = np.flatnonzero(self.times(sensor, guess, 256) >= now)
+            if later.size:
+                return guess + int(later[0])
+            guess += 256
+
+    @cached_property
+    def _sensitivities(self) -> dict[str, FloatArray]:
+        return {
+            sensor: np.array([c.sensitivity for c in channels if not c.auxiliary])
+            for sensor, channels in self.device.channels.items()
+        }

@@ -1,0 +1,173 @@
+"""Serve simulated devices: ``python -m sim_devices SPEC.json [INDEX]``.
+
+The specification is one JSON object::
+
+    {"epoch_ns": 123,              instant of the system's monotonic clock at which world time is 0
+     "speed": 1.0,                 world seconds that pass in one second
+     "scenario": {...},            see sim_devices.scenario
+     "devices": [
+       {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
+        "driver": "epson",         whose protocol it speaks: a key of FAMILIES
+        "port": "pty",             or "tcp", "udp"
+        "sampling_rate": 200.0,    Hz
+        "settings": {...},         as the driver's settings in the bench file
+        "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
+
+With INDEX this process serves that device alone; without, it starts one process for each. Each
+prints one JSON line when it can be connected to::
+
+    {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
+
+``settings`` holds what must be added to the sensors' settings (further port numbers). A process
+ends on SIGTERM, SIGINT, or when its standard input is closed, so that none outlives its parent.
+
+Device families (``FAMILIES``) are named here and imported when served; see
+:mod:`sim_devices.device` for what a family offers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from sim_devices.device import NEVER, ChannelSpec, DeviceSpec, Endpoint, Line, Source
+from sim_devices.lines import Wire, make_wire
+from sim_devices.pacing import WorldClock
+from sim_devices.scenario import Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+FAMILIES = {
+    "epson": "sim_devices.epson:create",
+    "registers": "sim_devices.registers:create",
+}
+"""Driver name → ``module:function`` that makes its simulated device."""
+
+LEAST_INTERVAL = 0.004
+"""Least time between two sends of one line, s: what is due in between goes together."""
+
+
+class Served:
+    """One endpoint on its wire: calls the one when the other says so, and when time has come.
+
+    Sends are made at absolute instants of world time, so that lateness never adds up.
+    """
+
+    def __init__(self, line: Line, clock: WorldClock) -> None:
+        self.line = line
+        self._endpoint: Endpoint = line.endpoint
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._last = 0.0
+        self._connected = False
+        self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme)
+
+    def connected(self) -> None:
+        """Somebody opened the line."""
+        self._connected = True
+        self._send(self._endpoint.connected(self._clock.now()))
+        self._schedule()
+
+    def received(self, received: bytes) -> None:
+        """Bytes came."""
+        self._send(self._endpoint.receive(received, self._clock.now()))
+        self._schedule()
+
+    def disconnected(self) -> None:
+        """Nobody has the line open any more."""
+        self._connected = False
+        self._endpoint.disconnected(self._clock.now())
+        self._schedule()
+
+    async def close(self) -> None:
+        """Take the line away."""
+        if self._timer is not None:
+            self._timer.cancel()
+        await self.wire.close()
+
+    def _send(self, units: Sequence[bytes]) -> None:
+        if units:
+            self.wire.send(units)
+
+    def _schedule(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        when = self._endpoint.next_due()
+        if when < NEVER:
+            at = max(self._clock.monotonic(when), self._last + LEAST_INTERVAL)
+            self._timer = self._loop.call_at(at, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self._last = self._loop.time()
+        self._send(self._endpoint.due(self._clock.now()))
+        self._schedule()
+
+
+async def serve(spec: Mapping[str, Any], index: int) -> None:
+    """Serve device ``index`` of a specification until told to end; print where it listens."""
+    device = device_spec(spec["devices"][index])
+    scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
+    clock = WorldClock(int(spec["epoch_ns"]), float(spec.get("speed", 1.0)))
+    module, _, function = FAMILIES[device.driver].partition(":")
+    lines: Sequence[Line] = getattr(import_module(module), function)(
+        device, Source(scenario, device)
+    )
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ended.set)
+    with contextlib.suppress(PermissionError):  # /dev/null: nobody will close it
+        loop.add_reader(sys.stdin.fileno(), _end_of_input, ended)
+    served = [Served(line, clock) for line in lines]
+    opened: list[Served] = []
+    try:
+        for one in served:
+            opened.append(one)
+            await one.wire.open()
+        print(json.dumps(_announcement(device, served)), flush=True)
+        await ended.wait()
+    finally:
+        loop.remove_reader(sys.stdin.fileno())
+        for one in opened:
+            await one.close()
+
+
+def _end_of_input(ended: asyncio.Event) -> None:
+    if not os.read(sys.stdin.fileno(), 4096):
+        ended.set()
+
+
+def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any]:
+    return {
+        "sensors": list(device.sensors),
+        "driver": device.driver,
+        "port": served[0].wire.address,
+        "settings": {
+            one.line.setting: int(one.wire.address.rpartition(":")[2]) for one in served[1:]
+        },
+    }
+
+
+def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
+    """Read one entry of ``devices``."""
+    return DeviceSpec(
+        sensors=tuple(table["sensors"]),
+        driver=table["driver"],
+        port=table.get("port", "pty"),
+        sampling_rate=float(table["sampling_rate"]),
+        channels={
+            sensor: tuple(ChannelSpec(**channel) for channel in channels)
+            for sensor, channels in table["channels"].items()
+        },
+        settings=table.get("settings", {}),
+    )
