@@ -1,0 +1,309 @@
+"""Maximum likelihood of complex factor analysis, ``S = A A* + diag(psi)``, at all frequencies.
+
+For given psi the best A is known: with ``w`` the eigenvalues (descending) and ``U`` the
+eigenvectors of ``psi^(-1/2) S psi^(-1/2)``, it takes up the q largest eigenvalues, as far as
+they exceed one, and what is left of -2/n times the log likelihood ratio is twice
+
+    f(psi) = sum over the other eigenvalues of (w - ln w - 1)           (Lawley and Maxwell)
+
+which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
+eigendecomposition, negative curvature turned round, steps kept in a trust region, every
+frequency at its own pace, and those that have arrived left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+
+if TYPE_CHECKING:
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+MAX_ITERATIONS = 200
+DECREMENT = 1e-8
+"""Newton decrement at which a frequency has arrived: ln psi is then within 1e-4 standard errors
+of a single average, and the step still taken squares that."""
+BOUNDARY = 1e-6
+"""psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
+_MAX_STEP = 2.0  # in ln psi, the first trust region
+_MIN_RADIUS = 1e-9
+_MIN_CURVATURE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Maximum:
+    """Where the likelihood is largest, and how it was reached.
+
+    Attributes
+    ----------
+    psi : float64, shape (n_freqs, n_channels)
+        Noise PSD at the maximum (one Newton step beyond the rest below), unit**2/Hz, not
+        corrected for small samples; NaN where the matrix is singular.
+    discrepancy : float64, shape (n_freqs,)
+        ``sum(w - ln w - 1)`` over the eigenvalues no factor explains.
+    eigenvalues : float64, shape (n_freqs, n_channels)
+        Of the whitened matrix, descending; the first ``n_factors`` belong to the motion. Those
+        of the unit matrix where the matrix is singular.
+    eigenvectors : complex128, shape (n_freqs, n_channels, n_channels)
+        Theirs, as columns.
+    n_factors : int
+    iterations : int64, shape (n_freqs,)
+        Evaluations of the likelihood and its derivatives.
+    gradient_norm : float64, shape (n_freqs,)
+        Largest derivative of the discrepancy by ln psi, boundary channels aside.
+    converged : bool, shape (n_freqs,)
+    boundary : bool, shape (n_freqs, n_channels)
+        Where the likelihood grows towards psi = 0 (Heywood's case); psi is then at the small
+        positive number at which the search stopped.
+    singular : bool, shape (n_freqs,)
+        Where the matrix is not positive definite, so that there is no maximum.
+    """
+
+    psi: FloatArray
+    discrepancy: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: ComplexArray
+    n_factors: int
+    iterations: IntArray
+    gradient_norm: FloatArray
+    converged: BoolArray
+    boundary: BoolArray
+    singular: BoolArray
+
+
+@dataclass(slots=True)
+class _Point:
+    """The likelihood at one psi per frequency."""
+
+    x: FloatArray
+    discrepancy: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: ComplexArray
+
+    def take(self, index: IntArray | BoolArray) -> _Point:
+        return _Point(
+            self.x[index],
+            self.discrepancy[index],
+            self.eigenvalues[index],
+            self.eigenvectors[index],
+        )
+
+    def put(self, index: IntArray | BoolArray, other: _Point) -> None:
+        self.x[index] = other.x
+        self.discrepancy[index] = other.discrepancy
+        self.eigenvalues[index] = other.eigenvalues
+        self.eigenvectors[index] = other.eigenvectors
+
+
+def max_factors(n_channels: int) -> int:
+    """Largest number of factors the model can identify, ``(p - q)**2 >= p``."""
+    return int(np.floor(n_channels - np.sqrt(n_channels) + 1e-12))
+
+
+def maximise(
+    csm: ComplexArray,
+    n_factors: int,
+    *,
+    start: FloatArray | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Maximum:
+    """Maximum likelihood noise PSD of every channel, at all frequencies at once.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``.
+    n_factors : int
+        Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= p``.
+    start : float64, shape (n_freqs, n_channels), optional
+        Noise PSD to start from; where it is not positive, and by default, the search starts
+        from ``(1 - q / (2 p)) / (S^-1)_ii``.
+    max_iterations : int
+        After as many a frequency is reported as not converged.
+
+    Returns
+    -------
+    Maximum
+
+    Raises
+    ------
+    InvalidMatrixError
+        If the shape is not that of square matrices.
+    InsufficientDataError
+        If so many factors cannot be identified from so many channels.
+
+    Notes
+    -----
+    Gradient ``sum_m (1 - w_m) |u_im|**2`` over the residual eigenvalues; Hessian after Clarke
+    (1970) carried over to complex matrices. Its expectation ``|P_ij|**2``, P the projector on
+    the residual eigenvectors, is the Fisher information of ln psi with A eliminated.
+    """
+    if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
+        raise InvalidMatrixError(
+            f"cross-spectral matrix of shape {csm.shape}: expected (n_freqs, p, p)"
+        )
+    p = csm.shape[-1]
+    if not 0 <= n_factors <= max_factors(p):
+        raise InsufficientDataError(
+            f"{n_factors} factors of motion cannot be told from the noise of {p} channels: "
+            f"at most {max_factors(p)} can"
+        )
+    usable, partial = _partial_spectra(csm)
+    n_freqs = len(csm)
+    found = Maximum(
+        psi=np.full((n_freqs, p), np.nan),
+        discrepancy=np.full(n_freqs, np.nan),
+        eigenvalues=np.ones((n_freqs, p)),
+        eigenvectors=np.broadcast_to(np.eye(p, dtype=np.complex128), csm.shape).copy(),
+        n_factors=n_factors,
+        iterations=np.zeros(n_freqs, np.int64),
+        gradient_norm=np.full(n_freqs, np.nan),
+        converged=np.zeros(n_freqs, np.bool_),
+        boundary=np.zeros((n_freqs, p), np.bool_),
+        singular=~usable,
+    )
+    if usable.any():
+        x0 = np.log(partial[usable] * (1 - n_factors / (2 * p)))
+        if start is not None:
+            given = start[usable]
+            x0 = np.where(given > 0, np.log(np.where(given > 0, given, 1.0)), x0)
+        lowest = np.log(partial[usable] * BOUNDARY)
+        _search(
+            csm[usable],
+            np.maximum(x0, lowest),
+            lowest=lowest,
+            found=found,
+            where=np.flatnonzero(usable),
+            max_iterations=max_iterations,
+        )
+    return found
+
+
+def _partial_spectra(csm: ComplexArray) -> tuple[BoolArray, FloatArray]:
+    """Where the matrices are positive definite, and 1 / (S^-1)_ii, what no channel predicts."""
+    p = csm.shape[-1]
+    power = np.real(np.einsum("fii->fi", csm))
+    usable = np.isfinite(csm).all(axis=(1, 2)) & (power > 0).all(axis=1)
+    scale = 1 / np.sqrt(np.where(usable[:, None], power, 1.0))
+    coherency = np.where(
+        usable[:, None, None], csm * scale[:, :, None] * scale[:, None, :], np.eye(p)
+    )
+    w, u = np.linalg.eigh(coherency)
+    usable &= w[:, 0] > 4 * p * np.finfo(np.float64).eps
+    w = np.where(usable[:, None], w, 1.0)
+    inverse = np.einsum("fik,fk->fi", np.abs(u) ** 2, 1 / w)
+    return usable, power / inverse
+
+
+def _search(
+    csm: ComplexArray,
+    x0: FloatArray,
+    *,
+    lowest: FloatArray,
+    found: Maximum,
+    where: IntArray,
+    max_iterations: int,
+) -> None:
+    """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
+    q = found.n_factors
+    n = len(csm)
+    best = _evaluate(csm, x0, q)
+    gradient, step, decrement, at_boundary = _newton(best, lowest, q)
+    radius = np.full(n, _MAX_STEP)
+    iterations = np.ones(n, np.int64)
+    converged = decrement < DECREMENT
+    going = np.flatnonzero(~converged)
+    for _ in range(max_iterations):
+        if not len(going):
+            break
+        size = np.abs(step[going]).max(axis=1)
+        shrink = np.minimum(1.0, radius[going] / np.maximum(size, _MIN_RADIUS))
+        trial_step = step[going] * shrink[:, None]
+        trial = _evaluate(csm[going], np.maximum(best.x[going] + trial_step, lowest[going]), q)
+        iterations[going] += 1
+        expected = decrement[going] * shrink * (1 - shrink / 2)
+        gain = best.discrepancy[going] - trial.discrepancy
+        rounding = 1e-13 * best.eigenvalues[going, 0] + 1e-12
+        accept = gain >= 1e-4 * expected - rounding
+        poor = gain < 0.25 * expected - rounding
+        radius[going] = np.where(
+            poor,
+            0.25 * np.minimum(size, radius[going]),
+            np.where(shrink < 1, 2.0, 1.0) * radius[going],
+        )
+        moved = going[accept]
+        point = trial.take(accept)
+        best.put(moved, point)
+        gradient[moved], step[moved], decrement[moved], at_boundary[moved] = _newton(
+            point, lowest[moved], q
+        )
+        converged[moved] = decrement[moved] < DECREMENT
+        stuck = radius < _MIN_RADIUS
+        going = np.flatnonzero(~converged & ~stuck)
+    last = np.where(converged[:, None], step, 0.0)
+    found.psi[where] = np.exp(np.maximum(best.x + last, lowest))
+    found.discrepancy[where] = best.discrepancy
+    found.eigenvalues[where] = best.eigenvalues
+    found.eigenvectors[where] = best.eigenvectors
+    found.iterations[where] = iterations
+    found.gradient_norm[where] = np.abs(np.where(at_boundary, 0.0, gradient)).max(axis=1)
+    found.converged[where] = converged
+    found.boundary[where] = at_boundary
+
+
+def _evaluate(csm: ComplexArray, x: FloatArray, q: int) -> _Point:
+    scale = np.exp(-0.5 * x)
+    w, u = np.linalg.eigh(csm * scale[:, :, None] * scale[:, None, :])
+    w, u = w[:, ::-1], u[:, :, ::-1]
+    w = np.maximum(w, np.finfo(np.float64).tiny)
+    terms = np.where(_residual(w, q), w - np.log(w) - 1, 0.0)
+    return _Point(x.copy(), terms.sum(axis=1), w.copy(), u.copy())
+
+
+def _residual(w: FloatArray, q: int) -> BoolArray:
+    """Eigenvalues no factor takes up: all but the first q, and those below one (A would vanish)."""
+    return (np.arange(w.shape[1]) >= q) | (w <= 1)
+
+
+def _newton(
+    at: _Point, lowest: FloatArray, q: int
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
+    w, u = at.eigenvalues, at.eigenvectors
+    residual = _residual(w, q)
+    power = np.abs(u) ** 2
+    gradient = np.einsum("fik,fk->fi", power, np.where(residual, 1 - w, 0.0))
+    hessian = _hessian(w, u, residual, q)
+    at_boundary = (at.x <= lowest) & (gradient > 0)
+    free = ~at_boundary
+    hessian *= free[:, :, None] & free[:, None, :]
+    i = np.arange(w.shape[1])
+    hessian[:, i, i] += at_boundary
+    downhill = np.where(free, gradient, 0.0)
+    curvature, axes = np.linalg.eigh(hessian)
+    floor = _MIN_CURVATURE * np.maximum(curvature[:, -1:], 1.0)
+    curvature = np.maximum(np.abs(curvature), floor)
+    along = np.einsum("fik,fi->fk", axes, downhill)
+    step = -np.einsum("fik,fk->fi", axes, along / curvature)
+    return gradient, step, (along**2 / curvature).sum(axis=1), at_boundary
+
+
+def _hessian(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:
+    """Second derivatives of the discrepancy by ln psi, shape (n_freqs, p, p)."""
+    conj = u.conj().swapaxes(1, 2)
+    projector = (u * residual[:, None, :]) @ conj
+    weighted = (u * np.where(residual, w, 0.0)[:, None, :]) @ conj
+    hessian = np.real(weighted * projector.conj())
+    if q:
+        p = w.shape[1]
+        factor, rest = w[:, None, :q], w[:, q:, None]
+        distance = np.maximum(factor - rest, 1e-6 * factor)
+        weight = np.where(residual[:, None, :q], 0.0, (1 - rest) * (factor + rest) / distance)
+        pairs = (u[:, :, q:, None].conj() * u[:, :, None, :q]).reshape(len(w), p, q * (p - q))
+        bent = (pairs * weight.reshape(len(w), 1, q * (p - q))) @ pairs.conj().swapaxes(1, 2)
+        hessian += np.real(bent)
+    return np.asarray(hessian, np.float64)
