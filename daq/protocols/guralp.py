@@ -1,0 +1,366 @@
+"""Sensors made of GCF streams: the streams of a sensor joined by time, over serial and Scream.
+
+Theory of operation
+-------------------
+A Güralp digitizer sends each component as a stream of its own (``DEMOZ2``, ``DEMON2``, ``DEMOE2``),
+in blocks that start on UTC and need not be equally long. :class:`Streams` lines up the streams of
+each sensor on the grid that the block times define and yields what is there in all of them, one
+column a stream. The sampling clock is disciplined by GPS and stated in every block
+(``BlockFlag.DEVICE_UTC``), so no clock is fitted.
+
+A hole in a stream is left open while the link may still recover it (``awaiting``), then becomes a
+gap, exact because blocks carry their time. Blocks seen twice are dropped. A device whose time jumps
+by more than an hour has had its clock set: its grid starts anew (``BlockFlag.CLOCK_RESTART``).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.brp import Damaged, Frame, Lost, Receiver, Skipped
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.gcf import SampleBlock, StatusBlock, decode_block
+from daq.protocols.scream import (
+    ACKNOWLEDGED,
+    NO_SERVER,
+    Packet,
+    PacketFinder,
+    decode_packet,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from fractions import Fraction
+
+    from numpy.typing import NDArray
+
+_NS = 1_000_000_000
+_HOUR_NS = 3600 * _NS
+MAX_PENDING = 64
+"""Blocks a stream may be ahead of the others."""
+FULL_SCALE_COUNTS = 1 << 23
+"""Of a 24-bit digitizer."""
+
+
+@dataclass(slots=True)
+class _Stream:
+    """What of one stream waits for the others: (index of its first sample, samples), in order."""
+
+    pending: deque[tuple[int, NDArray[np.int32]]] = field(default_factory=deque)
+
+    def add(self, start: int, counts: NDArray[np.int32], *, taken_to: int | None) -> None:
+        """Put samples in their place; those already there or taken are dropped."""
+        if self.pending and start >= self.pending[-1][0]:  # nearly always
+            tail = self.pending[-1]
+            fresh = counts[max(0, tail[0] + len(tail[1]) - start) :]
+            if len(fresh):
+                self.pending.append((start + len(counts) - len(fresh), fresh))
+            return
+        in_order = sorted((*self.pending, (start, counts)), key=lambda entry: entry[0])
+        self.pending.clear()
+        end = in_order[0][0] if taken_to is None else taken_to
+        for first, samples in in_order:
+            fresh = samples[max(0, end - first) :]
+            if len(fresh):
+                end = first + len(samples)
+                self.pending.append((end - len(fresh), fresh))
+
+    def skip_to(self, index: int) -> None:
+        """Forget what lies before ``index``."""
+        while self.pending and self.pending[0][0] < index:
+            first, samples = self.pending.popleft()
+            if first + len(samples) > index:
+                self.pending.appendleft((index, samples[index - first :]))
+
+
+class _Sensor:
+    """The streams of one sensor, on one grid."""
+
+    def __init__(self, name: str, stream_ids: tuple[str, ...]) -> None:
+        self._name = name
+        self._streams = {stream_id: _Stream() for stream_id in stream_ids}
+        self._rate: Fraction | None = None
+        self._origin_ns = 0  # UTC of sample 0
+        self._taken_to: int | None = None  # None until the first block is complete
+        self._flags = BlockFlag.CLOCK_RESTART
+        self._latest: tuple[int, HostTime] | None = None  # index and arrival of the latest block
+
+    @property
+    def sampling_rate(self) -> Fraction | None:
+        """As the first block said."""
+        return self._rate
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """The streams of which nothing has come."""
+        if self._taken_to is not None:
+            return ()
+        return tuple(name for name, stream in self._streams.items() if not stream.pending)
+
+    def add(self, block: SampleBlock, at: HostTime) -> Iterator[Event]:
+        """Take a block of one of the streams."""
+        if self._rate is None:
+            self._rate, self._origin_ns = block.sampling_rate, block.start_ns
+        if block.sampling_rate != self._rate:
+            text = f"{block.stream_id} came at {block.sampling_rate} Hz; expected {self._rate} Hz"
+            yield Event(self._name, "refused", text, at)
+            return
+        index = round((block.start_ns - self._origin_ns) * self._rate / _NS)
+        jumped = self._jump(index, at)
+        if jumped:
+            text = f"the time of {block.stream_id} jumped by {float(jumped / self._rate):.0f} s"
+            yield Event(self._name, "reset", text, at)
+            index -= jumped
+            self._origin_ns = block.start_ns - round(index * _NS / self._rate)
+            self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+            for stream in self._streams.values():
+                stream.pending.clear()
+        self._latest = (max(index, self._latest[0]) if self._latest else index, at)
+        stream = self._streams[block.stream_id]
+        stream.add(index, block.counts, taken_to=self._taken_to)
+        if len(stream.pending) > MAX_PENDING:
+            text = f"dropped a block of {block.stream_id}: another stream does not come"
+            yield Event(self._name, "overflow", text, at)
+            stream.pending.popleft()
+
+    def _jump(self, index: int, at: HostTime) -> int:
+        """Return by how many samples the device's time has been set, 0 within an hour."""
+        if self._rate is None or self._latest is None:
+            return 0
+        waited = round((at.monotonic_ns - self._latest[1].monotonic_ns) * self._rate / _NS)
+        hour = round(_HOUR_NS * self._rate / _NS)
+        if -hour <= index - self._latest[0] <= hour + waited:
+            return 0
+        ends = (
+            s.pending[-1][0] + len(s.pending[-1][1]) for s in self._streams.values() if s.pending
+        )
+        return index - max(self._latest[0] + waited, self._taken_to or 0, *ends)
+
+    def take(self, at: HostTime, *, awaiting: bool, reason: str) -> Iterator[Block]:
+        """Yield what all streams have; across a hole only if nothing is awaited."""
+        streams = self._streams.values()
+        while all(stream.pending for stream in streams):
+            start = max(stream.pending[0][0] for stream in streams)
+            if awaiting and self._taken_to is not None and start > self._taken_to:
+                return
+            for stream in streams:
+                stream.skip_to(start)
+            if not all(stream.pending and stream.pending[0][0] == start for stream in streams):
+                continue
+            end = min(start + len(stream.pending[0][1]) for stream in streams)
+            counts = np.column_stack([stream.pending[0][1][: end - start] for stream in streams])
+            for stream in streams:
+                stream.skip_to(end)
+            yield self._block(start, counts, at, reason)
+
+    def _block(self, start: int, counts: NDArray[np.int32], at: HostTime, reason: str) -> Block:
+        if self._taken_to is None:  # the first sample of the first block is sample 0
+            self._origin_ns = self._utc_ns(start)
+            for stream in self._streams.values():
+                stream.pending = deque((first - start, kept) for first, kept in stream.pending)
+            if self._latest is not None:
+                self._latest = (self._latest[0] - start, self._latest[1])
+            start = self._taken_to = 0
+        flags, self._flags = self._flags | BlockFlag.DEVICE_UTC, BlockFlag.NONE
+        if counts.max() >= FULL_SCALE_COUNTS - 1 or counts.min() <= -FULL_SCALE_COUNTS:
+            flags |= BlockFlag.CLIPPED
+        missing = start > self._taken_to
+        self._taken_to = start + len(counts)
+        return Block(
+            self._name,
+            start,
+            counts,
+            at,
+            device_counter=self._utc_ns(start),
+            flags=flags,
+            reason=reason if missing else "",
+        )
+
+    def _utc_ns(self, index: int) -> int:
+        return self._origin_ns + (round(index * _NS / self._rate) if self._rate else 0)
+
+
+class Streams:
+    """Sorts GCF blocks by sensor and joins the streams of each.
+
+    Parameters
+    ----------
+    sensors : mapping of str to sequence of str
+        For each sensor the stream ID of each channel, in the order of its channels.
+    """
+
+    def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
+        ids = {name: tuple(stream_ids) for name, stream_ids in sensors.items()}
+        self._sensors = {name: _Sensor(name, stream_ids) for name, stream_ids in ids.items()}
+        self._owner = {stream: name for name, streams in ids.items() for stream in streams}
+        self._unknown: set[str] = set()
+        self._lost = "block missing"
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """IDs of the streams of which nothing has come yet."""
+        return tuple(stream for sensor in self._sensors.values() for stream in sensor.silent)
+
+    @property
+    def unknown(self) -> frozenset[str]:
+        """Stream IDs that came and belong to no sensor."""
+        return frozenset(self._unknown)
+
+    def sampling_rate(self, sensor: str) -> float | None:
+        """Return the sampling rate of a sensor in Hz, once a block has said it."""
+        rate = self._sensors[sensor].sampling_rate
+        return None if rate is None else float(rate)
+
+    def lost(self, reason: str) -> None:
+        """Note why samples may be missing from now on."""
+        self._lost = reason
+
+    def receive(
+        self, block: SampleBlock | StatusBlock, at: HostTime, *, awaiting: bool = False
+    ) -> Iterator[Block | Event]:
+        """Take one block; yield what it completes."""
+        if isinstance(block, StatusBlock):
+            yield from self._status(block, at)
+        elif block.stream_id in self._owner:
+            yield from self._sensors[self._owner[block.stream_id]].add(block, at)
+        elif block.stream_id not in self._unknown and len(self._unknown) < MAX_PENDING:
+            self._unknown.add(block.stream_id)
+            yield Event("", "refused", f"stream {block.stream_id} is of no sensor here", at)
+        for sensor in self._sensors.values():
+            yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
+
+    def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event]:
+        serial = block.stream_id[:4]
+        owners = {name for stream, name in self._owner.items() if stream[:4] == serial} or {""}
+        for line in block.text.splitlines():
+            text = "".join(c if c.isprintable() else "?" for c in line).strip()
+            if text:
+                for name in sorted(owners):
+                    yield Event(name, "status", _cut(text), at)
+
+
+def _cut(text: str) -> str:
+    return text.encode()[:200].decode(errors="ignore")
+
+
+class SerialDecoder:
+    """GCF over a serial line with block recovery; see :mod:`daq.protocols.brp`.
+
+    Parameters
+    ----------
+    sensors : mapping of str to sequence of str
+        For each sensor the stream ID of each channel.
+    replies : bool
+        Whether blocks are acknowledged and lost ones asked for again.
+    """
+
+    def __init__(self, sensors: Mapping[str, Iterable[str]], *, replies: bool = True) -> None:
+        self.streams = Streams(sensors)
+        self._receiver = Receiver(replies=replies)
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take bytes from the line; replies are then to be taken and sent."""
+        found: list[Block | Event] = []
+        for item in self._receiver.receive(data):
+            match item:
+                case Frame(_, data):
+                    found += self._frame(data, at)
+                case Damaged(sequence):
+                    found.append(Event("", "checksum", f"block {sequence} was damaged", at))
+                    self.streams.lost("damaged block")
+                case Lost(sequence, n_frames):
+                    text = f"{n_frames} blocks from number {sequence} did not come again"
+                    found.append(Event("", "resynchronised", text, at))
+                    self.streams.lost("lost block")
+                case Skipped(n_bytes, start):
+                    found.append(Event("", "status", _told(n_bytes, start), at))
+        return found
+
+    def take_replies(self) -> bytes:
+        """Return what is to be sent to the digitizer, once."""
+        return self._receiver.take_replies()
+
+    def _frame(self, data: bytes, at: HostTime) -> Iterator[Block | Event]:
+        try:
+            block = decode_block(data)
+        except RemoteProtocolError as error:
+            yield Event("", "checksum", _cut(str(error)), at)
+            return
+        yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
+
+
+def _told(n_bytes: int, start: bytes) -> str:
+    if sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in start) > 0.9 * len(start):
+        return _cut("terminal: " + " ".join(start.decode("ascii", "replace").split()))
+    return f"skipped {n_bytes} bytes that are no block"
+
+
+class ScreamDecoder:
+    """GCF from a Scream server: ``receive`` for TCP, ``receive_datagram`` for UDP.
+
+    Packets that were overtaken on the way, or are asked for again by number (``missing``), are put
+    in their place if they come before ``PATIENCE`` others.
+    """
+
+    PATIENCE = 32
+
+    def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
+        self.streams = Streams(sensors)
+        self._finder = PacketFinder()
+        self._next: int | None = None
+        self._missing: dict[int, int] = {}  # sequence number: how many came since
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Sequence numbers of packets that are still awaited."""
+        return tuple(self._missing)
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take bytes of the TCP connection, cut anywhere."""
+        found: list[Block | Event] = []
+        for item in self._finder.receive(data):
+            if isinstance(item, Packet):
+                found += self._packet(item, at)
+            else:
+                found.append(Event("", "resynchronised", f"skipped {item} bytes", at))
+        return found
+
+    def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take one UDP packet."""
+        text = data[:16].rstrip(b"\0") + b"\0"
+        if text == ACKNOWLEDGED:
+            return []
+        if text == NO_SERVER:
+            return [Event("", "stopped", "the Scream server shuts down", at)]
+        try:
+            return list(self._packet(decode_packet(data), at))
+        except RemoteProtocolError as error:
+            return [Event("", "resynchronised", _cut(str(error)), at)]
+
+    def not_available(self, sequence: int) -> None:
+        """Note that the server no longer has this packet."""
+        self._missing.pop(sequence, None)
+
+    def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
+        sequence = packet.sequence
+        due = sequence if self._next is None else self._next
+        ahead = (sequence - due) % 65536
+        if ahead < 32768:
+            yield from self._advance(due, ahead, at)
+            self._next = (sequence + 1) % 65536
+        self._missing.pop(sequence, None)
+        yield from self.streams.receive(packet.block, at, awaiting=bool(self._missing))
+
+    def _advance(self, due: int, ahead: int, at: HostTime) -> Iterator[Event]:
+        if ahead:
+            self.streams.lost("lost packet")
+            yield Event("", "resynchronised", f"{ahead} packets missing", at)
+        aged = {number: since + 1 for number, since in self._missing.items()}
+        if ahead <= self.PATIENCE:  # more than that is no disorder on the way
+            aged |= {(due + i) % 65536: 0 for i in range(ahead)}
+        self._missing = {n: since for n, since in aged.items() if since < self.PATIENCE}
