@@ -3,14 +3,14 @@
 Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
 in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
 
-Segments are taken a block at a time, so that the work stays in the cache; blocks are shared by
-two threads, and added in their order, so that the result does not depend on the threads.
+Segments are taken a block at a time, so that the work stays in the cache. Two threads take half
+of them each; their sums are added in order, so that the result does not depend on their timing.
 """
 
 from __future__ import annotations
 
+import functools
 import io
-import itertools
 import json
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -18,17 +18,16 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
-import scipy.fft
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from estimator.arrays import ComplexArray, FloatArray, IntArray
 
-SEGMENTS_PER_BLOCK = 24
+SEGMENTS_PER_BLOCK = 32
+BLOCK_VALUES = 2**21  # samples of all channels in a block, at most: 16 MB
+FREQUENCIES_PER_BLOCK = 512
 THREADS = 2
 
 
@@ -79,7 +78,7 @@ class WelchSettings:
     @property
     def frequencies(self) -> FloatArray:
         """Frequencies in Hz, shape (n_freqs,), from 0 to half the sampling rate."""
-        return scipy.fft.rfftfreq(self.segment_length, 1 / self.sampling_rate)
+        return np.arange(self.segment_length // 2 + 1) * self.sampling_rate / self.segment_length
 
 
 class CrossSpectra:
@@ -97,9 +96,19 @@ class CrossSpectra:
         self.settings = settings
         self.n_channels = n_channels
         self.n_segments = 0
-        self._window = get_window(settings.window, settings.segment_length)
+        length = settings.segment_length
+        self._window = get_window(settings.window, length)
         n_freqs = settings.segment_length // 2 + 1
         self._sum = np.zeros((n_freqs, n_channels, n_channels), dtype=np.complex128)
+        self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
+        # One value a sample and channel: numpy multiplies contiguous arrays several times faster.
+        self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
+        # Trends are fitted to the samples and taken off their spectra, where they fill few bins.
+        trends = _trends(settings.detrend, length)
+        self._fit = trends / np.sum(trends**2, axis=1, keepdims=True)
+        spectra = np.fft.rfft(trends * self._window, axis=1).T
+        self._trend_bins = slice(0, _last_bin(spectra))
+        self._trend_spectra = spectra[self._trend_bins]
 
     def add(self, samples: FloatArray, starts: IntArray) -> None:
         """Add the segments of `samples` that begin at `starts`.
@@ -129,42 +138,45 @@ class CrossSpectra:
             raise EstimatorError(
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
             )
-        blocks = [
-            starts[first : first + SEGMENTS_PER_BLOCK]
-            for first in range(0, len(starts), SEGMENTS_PER_BLOCK)
-        ]
-        for total in self._totals(samples, blocks):
-            self._sum += total
+        workers = min(THREADS, -(-len(starts) // self._block))
+        if workers == 1:
+            self._sum += self._total(samples, starts)
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                for total in pool.map(
+                    functools.partial(self._total, samples), np.array_split(starts, workers)
+                ):
+                    self._sum += total
         self.n_segments += len(starts)
 
-    def _totals(self, samples: FloatArray, blocks: list[IntArray]) -> Iterator[ComplexArray]:
-        """Spectral sum of each block, in order; a few blocks under way at a time."""
-        if len(blocks) == 1:
-            yield self._total(samples, blocks[0])
-            return
-        with ThreadPoolExecutor(THREADS) as pool:
-            remaining = iter(blocks)
-            under_way = [
-                pool.submit(self._total, samples, block)
-                for block in itertools.islice(remaining, 2 * THREADS)
-            ]
-            while under_way:
-                yield under_way.pop(0).result()
-                under_way += [
-                    pool.submit(self._total, samples, block)
-                    for block in itertools.islice(remaining, 1)
-                ]
-
     def _total(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
-        length = self.settings.segment_length
-        # (n_samples - length + 1, n_channels, length) without copying; the index copies.
-        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
-        _detrend(frames, self.settings.detrend)
-        frames *= self._window
-        spectra = scipy.fft.rfft(frames, axis=-1, overwrite_x=True)
-        # BLAS wants the summed index beside the channels, one plain matrix a frequency.
-        spectra = np.ascontiguousarray(spectra.transpose(2, 0, 1))
-        total: ComplexArray = np.matmul(spectra.transpose(0, 2, 1), spectra.conj())
+        """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels)."""
+        length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
+        block = min(self._block, len(starts))
+        frames = np.empty((block, length, n_channels))
+        spectra = np.empty((block, n_freqs, n_channels), dtype=np.complex128)
+        trend = np.empty((block, len(self._fit), n_channels))
+        # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
+        # so that BLAS does half the work.
+        gram = np.zeros((n_freqs, 2 * n_channels, 2 * n_channels))
+        for first in range(0, len(starts), block):
+            rows = starts[first : first + block]
+            n = len(rows)
+            for i, row in enumerate(rows):
+                segment = samples[row : row + length]
+                np.matmul(self._fit, segment, out=trend[i])
+                np.multiply(segment, self._taper, out=frames[i])
+            np.fft.rfft(frames[:n], axis=1, out=spectra[:n])
+            spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
+            parts = spectra[:n].view(np.float64)
+            for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
+                some = slice(low, low + FREQUENCIES_PER_BLOCK)
+                gram[some] += np.matmul(
+                    parts[:, some].transpose(1, 2, 0), parts[:, some].swapaxes(0, 1)
+                )
+        total = np.empty_like(self._sum)
+        total.real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
+        total.imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
         return total
 
     @property
@@ -249,15 +261,17 @@ class CrossSpectra:
         return spectra
 
 
-def _detrend(frames: FloatArray, kind: str) -> None:
-    """Remove mean or line along the last axis, in place."""
-    if kind == "none":
-        return
-    frames -= frames.mean(axis=-1, keepdims=True)
-    if kind == "linear":
-        length = frames.shape[-1]
-        ramp = np.arange(length) - (length - 1) / 2
-        frames -= ((frames @ ramp) / (ramp @ ramp))[..., None] * ramp
+def _trends(detrend: str, length: int) -> FloatArray:
+    """Orthogonal trends that `detrend` removes, shape (n_trends, length)."""
+    line = np.arange(length) - (length - 1) / 2
+    return np.stack([np.ones(length), line])[: {"none": 0, "constant": 1, "linear": 2}[detrend]]
+
+
+def _last_bin(spectra: ComplexArray) -> int:
+    """Bins, from 0, beyond which spectra of shape (n_freqs, n_trends) are rounding only."""
+    size = np.abs(spectra)
+    above = np.any(size > len(size) * np.finfo(np.float64).eps * size.max(axis=0), axis=1)
+    return int(np.max(np.nonzero(above), initial=-1)) + 1
 
 
 def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
