@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Self
 
-    from sim_devices.arrays import FloatArray
+    from sim_devices.arrays import ComplexArray, FloatArray
     from sim_devices.world import World
 
 ELSEWHERE = frozenset({"speed", "devices", "faults"})
@@ -274,6 +274,37 @@ class Scenario(_Table):
     def true_noise_psd(self, sensor: str, channel: int, frequency: FloatArray) -> FloatArray:
         """One-sided noise PSD of a channel (by index) in (m/s²)²/Hz, shape of `frequency` (Hz)."""
         return self.noise_spectra(sensor)[channel].psd(np.asarray(frequency, dtype=float))
+
+    def motion_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
+        """Cross-spectral matrix that perfect clocks and no noise would give.
+
+        Parameters
+        ----------
+        sensors
+            Names, in the order of the channels.
+        frequency
+            In Hz, shape (n_freqs,).
+
+        Returns
+        -------
+        complex128, shape (n_freqs, n_channels, n_channels)
+            ``E[X_p conj(X_q)]``, one-sided, in (m/s²)²/Hz.
+        """
+        return self._world.motion_csm(
+            tuple(self._known(sensor) for sensor in sensors), np.asarray(frequency, dtype=float)
+        )
+
+    def true_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
+        """`motion_csm` and the sensors' true noise on its diagonal."""
+        csm = self.motion_csm(sensors, frequency)
+        noise = [
+            self.true_noise_psd(sensor, channel, frequency)
+            for sensor in sensors
+            for channel in range(self.n_channels(sensor))
+        ]
+        diagonal = np.arange(len(noise))
+        csm[:, diagonal, diagonal] += np.transpose(noise)
+        return csm
 
     def _known(self, sensor: str) -> str:
         self._sensor(sensor)

@@ -102,6 +102,11 @@ class World:
             )
         return self._noises[sensor].read(first_sample, n).T
 
+    def motion_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
+        """Cross-spectral matrix of what the sensors' channels feel, without noise and clocks."""
+        rows = np.concatenate([self._response(sensor, frequency) for sensor in sensors], axis=1)
+        return np.asarray(rows @ rows.conj().transpose(0, 2, 1))
+
     def _key(self, sensor: str, use: str) -> tuple[int, int]:
         own = self._scenario.sensors[sensor].seed
         return self._scenario.seed if own is None else own, crc32(f"{use} {sensor}".encode()) + 1

@@ -41,7 +41,7 @@ def csm(*channels: FloatArray) -> tuple[FloatArray, ComplexArray, int]:
     spectra = np.fft.rfft(cut * window)
     scale = 2 / (RATE * np.sum(window**2) * n_segments)
     matrix: ComplexArray = scale * np.einsum("psf,qsf->fpq", spectra, spectra.conj())
-    frequency: FloatArray = np.arange(n_segment // 2 + 1) * (RATE / n_segment)
+    frequency = np.arange(n_segment // 2 + 1, dtype=np.float64) * (RATE / n_segment)
     return frequency, matrix, n_segments
 
 
@@ -189,3 +189,19 @@ def test_noise_is_each_sensors_and_each_channels_own() -> None:
     correlation = np.corrcoef(channels)
     off = correlation[~np.eye(len(correlation), dtype=bool)]
     assert np.max(np.abs(off)) < 5 / np.sqrt(100_000)
+
+
+def test_the_true_cross_spectral_matrix_is_what_the_samples_have() -> None:
+    sensors: dict[str, dict[str, Any]] = {
+        "A": {"noise": white(0.5)},
+        "B": {"rotation": [40, 20, 0], "delay": 0.004, "noise": white(2.0), "gain": 1.5},
+    }
+    model = scenario(sensors, spectra=[white(1.0), white(2.0), white(0.5)])
+    channels = np.concatenate([model.samples(name, 0, 400_000) for name in "AB"], axis=1)
+    frequency, matrix, n = csm(*channels.T)
+    band = np.flatnonzero((frequency > 1) & (frequency < 88))[::2]
+    true = model.true_csm(("A", "B"), frequency[band])
+    power = np.sqrt(np.einsum("fp,fq->fpq", *[np.einsum("fpp->fp", true.real)] * 2))
+    away = np.abs(matrix[band] - true) / power * np.sqrt(n)
+    assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.05)
+    assert np.abs(((matrix[band] - true) / power).mean()) < 5 / np.sqrt(n * band.size)
