@@ -1,0 +1,89 @@
+"""Spectra as a terminal can show them: at most one point per column, logarithmic both ways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tui.bands import band_means, log_edges
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tui.bands import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One curve, one point per band of frequencies; shape (n_points,).
+
+    ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; there ``high_db``
+    may still be a number: the noise is below it. ``low_db`` and ``high_db`` bound the 95 %
+    interval and are NaN throughout for a curve without one.
+    """
+
+    label: str
+    style: str
+    band_style: str
+    log_frequency: FloatArray
+    level_db: FloatArray
+    low_db: FloatArray
+    high_db: FloatArray
+
+
+def decibels(psd: FloatArray) -> FloatArray:
+    """Return 10 log10 of what is positive, NaN elsewhere."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(psd > 0, 10 * np.log10(psd), np.nan)
+
+
+def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: str) -> Curve:
+    """Return the spectrum of a channel's samples as a curve without an interval."""
+    edges = log_edges(frequency, n_points)
+    starts = edges[:-1]
+    mean = np.add.reduceat(psd[: edges[-1]], starts) / np.diff(edges)
+    nothing = np.full(mean.size, np.nan)
+    return Curve("data", style, style, _centres(frequency, edges), decibels(mean), nothing, nothing)
+
+
+def noise_curve(
+    frequency: FloatArray,
+    psd: FloatArray,
+    cov: FloatArray,
+    *,
+    correlation: FloatArray,
+    n_points: int,
+    label: str,
+    style: str,
+    band_style: str,
+) -> Curve:
+    """Return a self-noise estimate as a curve with the 95 % interval of each of its points."""
+    edges = log_edges(frequency, n_points)
+    means = band_means(psd, cov, edges, correlation)
+    return Curve(
+        label,
+        style,
+        band_style,
+        _centres(frequency, edges),
+        decibels(means.mean),
+        decibels(means.low),
+        decibels(means.high),
+    )
+
+
+def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
+    """Return log10 of the middle of each band, on a logarithmic axis."""
+    return np.asarray(np.log10(frequency[edges[:-1]] * frequency[edges[1:] - 1]) / 2)
+
+
+def level_limits(curves: list[Curve], step: float = 10.0) -> tuple[float, float]:
+    """Return limits in dB, multiples of ``step``, that hold all curves but for lone outliers."""
+    levels = np.concatenate([curve.level_db for curve in curves] or [np.array([])])
+    levels = levels[np.isfinite(levels)]
+    if levels.size == 0:
+        return -150.0, -50.0
+    low, high = np.quantile(levels, [0.01, 1.0])
+    low, high = step * np.floor(low / step - 0.3), step * np.ceil(high / step + 0.1)
+    return float(low), float(max(high, low + 2 * step))

@@ -1,0 +1,133 @@
+"""The plot: power spectral densities over frequency, logarithmic both ways."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from textual_plot import HiResMode, LegendLocation, PlotWidget
+from textual_plot.axis_formatter import AxisFormatter
+
+from tui.application.curves import level_limits
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tui.application.curves import Curve
+
+DOTS_PER_ROW = 4  # of a Braille character
+
+
+class FrequencyAxis(AxisFormatter):
+    """Ticks on an axis of log10 of frequency: decades, and 2 and 5 between where there is room."""
+
+    def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
+        """Return tick positions in log10 of Hz."""
+        decades = range(math.floor(min_), math.ceil(max_) + 1)
+        for digits in ((1, 2, 5), (1, 3), (1,)):
+            ticks = [decade + math.log10(digit) for decade in decades for digit in digits]
+            ticks = [tick for tick in ticks if min_ <= tick <= max_]
+            if len(ticks) <= max_ticks:
+                break
+        return ticks
+
+    def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
+        """Return frequencies in Hz."""
+        return [f"{10**tick:.3g}" for tick in ticks]
+
+
+class LevelAxis(AxisFormatter):
+    """Ticks in dB at round multiples."""
+
+    def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
+        """Return tick positions in dB."""
+        step = next((s for s in (5, 10, 20, 40, 50) if (max_ - min_) / s <= max_ticks), 100)
+        return [float(t) for t in np.arange(math.ceil(min_ / step) * step, max_ + 1e-9, step)]
+
+    def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
+        """Return levels in dB, with a real minus sign."""
+        return [f"{tick:.0f}".replace("-", "−") for tick in ticks]
+
+
+class PsdPlot(PlotWidget, can_focus=False):
+    """Curves with their 95 % bands, redrawn as a whole when any of them changes."""
+
+    def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
+        super().__init__(id=id, allow_pan_and_zoom=False)
+        self._curves: tuple[Curve, ...] = ()
+        self.set_x_formatter(FrequencyAxis())
+        self.set_y_formatter(LevelAxis())
+
+    @property
+    def n_points(self) -> int:
+        """How many points across it can show."""
+        return max(8, self.size.width - self.margin_left - 2)
+
+    def on_mount(self) -> None:
+        """Set margins and labels."""
+        super().on_mount()
+        self.margin_left = 6
+        self.margin_top = 1
+        self.margin_bottom = 2
+        self.show_legend(LegendLocation.TOPRIGHT)
+
+    def show(self, curves: Sequence[Curve], *, unit: str) -> None:
+        """Draw these curves and no others.
+
+        Parameters
+        ----------
+        curves : sequence of Curve
+            The last one is drawn on top.
+        unit : str
+            Of the samples, such as ``m/s²``; spectra are in its square per Hz.
+        """
+        self._curves = tuple(curves)
+        self.set_ylabel("")
+        self.set_xlabel("")
+        self._draw(unit)
+
+    def _draw(self, unit: str) -> None:
+        self.clear()
+        if not self._curves:
+            return
+        frequencies = np.concatenate([curve.log_frequency for curve in self._curves])
+        low, high = level_limits(list(self._curves))
+        self.set_xlimits(float(frequencies.min()), float(frequencies.max()))
+        self.set_ylimits(low, high)
+        rows = max(4, self.size.height - self.margin_top - self.margin_bottom - 2)
+        dot = (high - low) / (rows * DOTS_PER_ROW)
+        self.set_ylabel(f"dB re ({unit})²/Hz")
+        for curve in self._curves:
+            self._draw_band(curve, dot=dot, limits=(low, high))
+        for curve in self._curves:
+            self.plot(
+                curve.log_frequency,
+                curve.level_db,
+                line_style=curve.style,
+                hires_mode=HiResMode.BRAILLE,
+                label=curve.label,
+            )
+
+    def _draw_band(self, curve: Curve, *, dot: float, limits: tuple[float, float]) -> None:
+        floor, ceiling = limits
+        low = np.clip(np.where(np.isnan(curve.low_db), curve.level_db, curve.low_db), *limits)
+        high = np.clip(curve.high_db, *limits)
+        known = np.isfinite(low) & np.isfinite(high)
+        if known.any():
+            counts = np.ceil((high[known] - low[known]) / dot).astype(int) + 1
+            step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            self.scatter(
+                np.repeat(curve.log_frequency[known], counts),
+                np.minimum(np.repeat(low[known], counts) + step * dot, ceiling),
+                marker_style=curve.band_style,
+                hires_mode=HiResMode.BRAILLE,
+            )
+        below = np.isfinite(curve.high_db) & np.isnan(curve.level_db)
+        if below.any():  # the estimate came out negative: all that is known is an upper bound
+            self.scatter(
+                curve.log_frequency[below],
+                np.maximum(high[below], floor),
+                marker="▾",
+                marker_style=curve.style,
+            )

@@ -1,0 +1,137 @@
+"""The ``huddle`` command: its subcommands, and the one place where errors become exit codes.
+
+What a subcommand needs is imported when it runs; so ``huddle --help`` loads neither numpy nor
+HDF5, and ``huddle record`` never loads Textual.
+
+====  ==========================================================
+exit  meaning
+====  ==========================================================
+0     done
+1     a limit was not met
+2     the command line or the bench file is wrong
+3     a device or a file is in trouble
+130   interrupted
+====  ==========================================================
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+from tui.commands import EXAMPLES, acquisition, recordings, setup
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+LIMIT_NOT_MET, USAGE, TROUBLE, INTERRUPTED = 1, 2, 3, 130
+
+
+class HuddleGroup(TyperGroup):
+    """Runs a subcommand and turns what it raises into a message and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - the context is the library's own
+        """Run the subcommand."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+        except BrokenPipeError:  # | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except Exception as error:
+            code = exit_code(error)
+            if code is None:
+                raise
+            for line in messages(error):
+                typer.echo(f"huddle: {line}", err=True)
+            raise typer.Exit(code) from None
+
+
+def exit_code(error: BaseException) -> int | None:
+    """Return the exit code of an error; None for one that we did not foresee."""
+    from daq.errors import BenchFileError, HuddleError  # noqa: PLC0415
+
+    if isinstance(error, BaseExceptionGroup):
+        codes = [exit_code(inner) for inner in error.exceptions]
+        return None if None in codes else max(code for code in codes if code is not None)
+    if isinstance(error, BenchFileError) or type(error).__name__ == "ScenarioError":
+        return USAGE
+    if isinstance(error, (HuddleError, OSError)):
+        return TROUBLE
+    estimator = sys.modules.get("estimator.errors")
+    if estimator is not None and isinstance(error, estimator.EstimatorError):
+        return TROUBLE
+    return None
+
+
+def messages(error: BaseException) -> Iterator[str]:
+    """Yield what went wrong, one line for each failure of a group."""
+    if isinstance(error, BaseExceptionGroup):
+        for inner in error.exceptions:
+            yield from messages(inner)
+    elif isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
+        yield ": ".join(str(part) for part in (error.filename, error.strerror) if part)
+    else:
+        yield str(error) or type(error).__name__
+
+
+app = typer.Typer(
+    name="huddle",
+    cls=HuddleGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=(
+        "Self-noise of accelerometers that stand side by side: read them over their wires, "
+        "record, estimate - however they happen to point.\n\n"
+        "No hardware at hand? [b]huddle demo[/b] runs a whole test on a simulated bench."
+    ),
+)
+
+_PANELS = {
+    "On the bench": (
+        setup.init,
+        setup.check,
+        acquisition.tui,
+        acquisition.run,
+        acquisition.record,
+        acquisition.watch,
+        acquisition.serve,
+    ),
+    "Recordings": (recordings.estimate, recordings.import_),
+    "Without hardware": (setup.demo, setup.devices, recordings.simulate),
+}
+for _panel, _commands in _PANELS.items():
+    for _command in _commands:
+        _epilog = "\n\n".join(("[b]Examples[/b]", *EXAMPLES[_command.__name__]))
+        app.command(_command.__name__.rstrip("_"), rich_help_panel=_panel, epilog=_epilog)(_command)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        typer.echo(f"huddle {version('huddle-bench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Show the version and exit."
+    ),
+) -> None:
+    del version
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command and exit with its code."""
+    app(arguments)
+    raise SystemExit(0)

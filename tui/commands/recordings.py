@@ -1,0 +1,148 @@
+"""``estimate``, ``import``, ``simulate``."""
+
+# ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tui.commands import examples
+from tui.options import (
+    BandOption,
+    CsvOption,
+    DetrendOption,
+    DurationOption,
+    FilesArgument,
+    JsonOption,
+    MethodOption,
+    NoCorrectionOption,
+    OverlapOption,
+    SegmentOption,
+    UnitOption,
+    WindowOption,
+)
+
+
+@examples(
+    "huddle estimate night.h5",
+    "huddle estimate night.h5 --method all --band 1:20",
+    "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
+)
+def estimate(
+    files: FilesArgument,
+    *,
+    method: MethodOption = None,
+    segment: SegmentOption = None,
+    overlap: OverlapOption = None,
+    window: WindowOption = None,
+    detrend: DetrendOption = None,
+    no_correction: NoCorrectionOption = False,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--end", metavar="T", help="To here: UTC, or after the start.")
+    ] = None,
+    unit: UnitOption = None,
+    band: BandOption = None,
+    json: JsonOption = None,
+    csv: CsvOption = None,
+) -> None:
+    """Estimate the self-noise of every channel from recordings.
+
+    What is not given here is taken from the bench file inside the recording.
+    """
+    from tui.estimating import estimate_recordings
+
+    estimate_recordings(
+        files,
+        method=method,
+        segment=segment,
+        overlap=overlap,
+        window=window,
+        detrend=detrend,
+        correct=False if no_correction else None,
+        start=start,
+        end=end,
+        unit=unit,
+        band=band,
+        json=json,
+        csv=csv,
+    )
+
+
+@examples(
+    "huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5",
+    "huddle import samples.csv --bench lab.toml --out lab.h5",
+    "huddle import arrays.npz --sampling-rate 200 --out lab.h5",
+)
+def import_(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="SRC", help="miniSEED (or what ObsPy reads), .npz, .csv."),
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
+    ],
+    bench: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench", metavar="BENCH", help="Bench file: sensitivities, names, settings."
+        ),
+    ] = None,
+    response: Annotated[
+        Path | None,
+        typer.Option(
+            "--response",
+            metavar="FILE",
+            help="RESP or StationXML; a file with one response serves all channels.",
+        ),
+    ] = None,
+    sampling_rate: Annotated[
+        float | None,
+        typer.Option("--sampling-rate", metavar="HZ", min=1e-6, help="Where no file says it."),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Make a recording from files of other programs.
+
+    [b]miniSEED[/b]  a sensor is network.station.location, its channels are codes
+
+    [b].npz[/b]      sampling_rate, and one array (n_samples, n_channels) per sensor
+
+    [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
+    """
+    from tui.importing import import_recording
+
+    import_recording(
+        sources,
+        out=out,
+        bench=bench,
+        response=response,
+        sampling_rate=sampling_rate,
+        json=json,
+    )
+
+
+@examples("huddle simulate lab.toml --duration 3h --out model.h5")
+def simulate(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO", help="Bench file with a \\[simulation] table, or a named scenario."
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Recording to write (.h5).")
+    ],
+    duration: DurationOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Write a recording straight from the model, without devices and wires."""
+    from tui.simulate import simulate_recording
+
+    simulate_recording(scenario, out=out, duration=duration, json=json)

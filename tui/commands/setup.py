@@ -1,0 +1,99 @@
+"""``init``, ``check``, ``devices``, ``demo``."""
+
+# ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tui.commands import examples
+from tui.options import (
+    BenchArgument,
+    DurationOption,
+    JsonOption,
+    OutOption,
+    SpeedOption,
+)
+
+
+@examples("huddle init", "huddle init -o lab.toml")
+def init(
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Bench file to write.")
+    ] = Path("bench.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Write a commented bench file, to be filled in for your sensors."""
+    from tui.benches import write_template
+
+    write_template(out, force=force)
+
+
+@examples("huddle check lab.toml", "huddle check lab.toml --no-devices --json -")
+def check(
+    bench: BenchArgument,
+    *,
+    devices: Annotated[
+        bool, typer.Option("--devices/--no-devices", help="Talk to the devices as well.")
+    ] = True,
+    json: JsonOption = None,
+) -> None:
+    """Validate a bench file, then ask each device who it is.
+
+    Every fault of the file is told at once, and so is every device that does not answer.
+    """
+    from tui.benches import check_bench
+
+    check_bench(bench, devices=devices, json=json)
+
+
+@examples(
+    "huddle devices lab.toml",
+    "huddle devices lab.toml --speed 10 -o simulated.toml   (and in another terminal:)",
+    "huddle run simulated.toml --duration 10min",
+)
+def devices(
+    bench: BenchArgument,
+    *,
+    speed: SpeedOption = None,
+    out: OutOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Serve a bench's devices, simulated, until Ctrl-C.
+
+    Each device is a process of its own and speaks its real protocol, on a
+    pseudo-terminal or a TCP port. Prints a bench file that connects to them.
+
+    What moves, and how noisy each sensor is, stands in the bench file under
+    simulation.
+    """
+    from tui.devices import serve_devices
+
+    serve_devices(bench, speed=speed, out=out, json=json)
+
+
+@examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
+def demo(
+    *,
+    duration: DurationOption = None,
+    speed: SpeedOption = None,
+    keep: Annotated[
+        Path | None, typer.Option("--keep", metavar="FILE", help="Keep the recording here.")
+    ] = None,
+    table: Annotated[
+        bool, typer.Option("--table", help="Print the table even on a terminal.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Run a whole huddle test on a simulated bench, over its real protocols.
+
+    Three triaxial accelerometers that do not point the same way stand on one
+    floor. Their noise is known, so the table shows which estimate is right.
+
+    On a terminal it opens the application.
+    """
+    from tui.demo import run_demo
+
+    run_demo(duration=duration, speed=speed, keep=keep, table=table, json=json)

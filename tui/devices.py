@@ -1,0 +1,139 @@
+"""A bench's devices, simulated: the specification for their processes, and how to reach them."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from daq.bench import dump, load
+from daq.errors import BenchFileError
+from sim_devices.launch import start
+from sim_devices.scenario import Scenario
+from tui.output import console, notices, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from daq.bench import Bench, Sensor
+    from sim_devices.launch import RunningDevice
+
+HEAD_START_NS = 200_000_000
+"""World time 0 lies this far ahead, so that every process is there when it begins."""
+
+
+def scenario_of(bench: Bench) -> Scenario:
+    """Return the world a bench's ``[simulation]`` table describes.
+
+    Raises
+    ------
+    BenchFileError
+        It has none, or one that does not fit its sensors.
+    """
+    source = bench.source or "bench"
+    if not bench.simulation:
+        raise BenchFileError(
+            f"{source}: simulation: is missing; expected a table with motion and sensors "
+            "(huddle init writes one)"
+        )
+    scenario = Scenario.from_dict(bench.simulation, sampling_rate=bench.sampling_rate)
+    for sensor in bench.sensors:
+        if sensor.name not in scenario.names:
+            raise BenchFileError(
+                f"{source}: simulation.sensors.{sensor.name}: is missing; "
+                "expected a table for every sensor"
+            )
+        if scenario.n_channels(sensor.name) != sensor.n_main_channels:
+            raise BenchFileError(
+                f"{source}: simulation.sensors.{sensor.name}: has "
+                f"{scenario.n_channels(sensor.name)} channels; expected {sensor.n_main_channels}, "
+                "one for each channel that is not auxiliary"
+            )
+    return scenario
+
+
+def specification(bench: Bench, *, speed: float) -> dict[str, Any]:
+    """Return what ``sim_devices.serve`` needs to serve every port of a bench."""
+    scenario = scenario_of(bench).to_dict()
+    for sensor in bench.sensors:
+        scenario["sensors"][sensor.name]["sampling_rate"] = sensor.sampling_rate
+    return {
+        "epoch_ns": time.monotonic_ns() + HEAD_START_NS,
+        "speed": speed,
+        "scenario": scenario,
+        "devices": [_device(sensors) for sensors in bench.ports().values()],
+    }
+
+
+def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
+    first = sensors[0]
+    return {
+        "sensors": [sensor.name for sensor in sensors],
+        "driver": first.driver,
+        "port": _kind(first.port),
+        "sampling_rate": first.sampling_rate,
+        "settings": first.settings,
+        "channels": {
+            sensor.name: [
+                {
+                    "name": channel.name,
+                    "sensitivity": channel.sensitivity,
+                    "auxiliary": channel.auxiliary,
+                }
+                for channel in sensor.channels
+            ]
+            for sensor in sensors
+        },
+    }
+
+
+def _kind(port: str) -> str:
+    scheme = port.partition("://")[0] if "://" in port else ""
+    return "udp" if scheme == "udp" else "tcp" if scheme else "pty"
+
+
+@contextmanager
+def simulated(bench: Bench, *, speed: float) -> Iterator[Bench]:
+    """Serve a bench's devices while the context lasts; yields a bench that connects to them."""
+    with start(specification(bench, speed=speed)) as running:
+        yield connected(bench, running, speed=speed)
+
+
+def connected(bench: Bench, running: Sequence[RunningDevice], *, speed: float) -> Bench:
+    """Return the bench with the ports and settings of devices that run."""
+    of_sensor = {name: device for device in running for name in device.sensors}
+    sensors = tuple(
+        sensor.model_copy(
+            update={
+                "port": of_sensor[sensor.name].port,
+                "settings": sensor.settings | of_sensor[sensor.name].settings,
+            }
+        )
+        for sensor in bench.sensors
+    )
+    simulation = bench.simulation | {"speed": speed}
+    return bench.model_copy(update={"sensors": sensors, "simulation": simulation})
+
+
+def serve_devices(path: Path, *, speed: float | None, out: Path | None, json: str | None) -> None:
+    """Serve a bench's devices until interrupted, and tell how to reach them."""
+    bench = load(path)
+    speed = bench.speed if speed is None else speed
+    with simulated(bench, speed=speed) as reachable:
+        text = dump(reachable)
+        if out is not None:
+            out.write_text(text, encoding="utf-8")
+        elif json is None:
+            console().print(text, markup=False, soft_wrap=True)
+        write_json(
+            json,
+            {"speed": speed, "ports": {sensor.name: sensor.port for sensor in reachable.sensors}},
+        )
+        notices().print(
+            f"{len(bench.sensors)} sensors served at {speed:g} × life"
+            + (f"; huddle run {out} connects to them" if out else "")
+            + ". Ctrl-C ends it."
+        )
+        while True:
+            time.sleep(3600)

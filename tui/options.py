@@ -1,0 +1,115 @@
+"""Options that several commands share, each defined once."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+from daq.durations import parse_duration
+
+
+class Method(StrEnum):
+    """Self-noise methods, and all of them."""
+
+    TWO_CHANNEL = "two-channel"
+    THREE_CHANNEL = "three-channel"
+    THREE_SENSOR = "three-sensor"
+    MAXIMUM_LIKELIHOOD = "maximum-likelihood"
+    ALL = "all"
+
+
+class Detrend(StrEnum):
+    """What is taken out of each segment before it is transformed."""
+
+    NONE = "none"
+    CONSTANT = "constant"
+    LINEAR = "linear"
+
+
+class Unit(StrEnum):
+    """The physical unit of spectra: ``unit²/Hz``."""
+
+    ACCELERATION = "m/s²"
+    VELOCITY = "m/s"
+    DISPLACEMENT = "m"
+    NATIVE = "native"
+
+    @classmethod
+    def _missing_(cls, value: object) -> "Unit | None":
+        return cls.ACCELERATION if value in {"m/s2", "m/s^2", "m/s**2"} else None
+
+
+def duration(value: str | float) -> float:
+    """Read a duration from the command line, in seconds."""
+    try:
+        return parse_duration(value)
+    except ValueError as error:
+        raise typer.BadParameter(f"{value!r}: {error}") from None
+
+
+def band(value: str | tuple[float, float]) -> tuple[float, float]:
+    """Read a band of frequencies such as ``1:20``, in Hz."""
+    if isinstance(value, tuple):
+        return value
+    try:
+        low, high = (float(part) for part in value.replace("-", ":").split(":"))
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not 0 < low < high:
+        raise typer.BadParameter(f"{value!r}: expected two frequencies in Hz such as 1:20")
+    return low, high
+
+
+BenchArgument: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="BENCH", help="Bench file (TOML); [b]huddle init[/b] writes one.")
+]
+FileArgument: TypeAlias = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.h5).")]
+FilesArgument: TypeAlias = Annotated[
+    list[Path], typer.Argument(metavar="FILE", help="Recordings (.h5); several are put together.")
+]
+OutOption: TypeAlias = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="FILE", help="Where to write it.")
+]
+JsonOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - is standard output."),
+]
+CsvOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--csv", metavar="FILE", help="Write the curves as CSV; - is standard output."),
+]
+DurationOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--duration", "-d", metavar="TIME", parser=duration, help="As in 90s, 20min, 3h."),
+]
+MethodOption: TypeAlias = Annotated[
+    Method | None, typer.Option("--method", "-m", help="Self-noise method.")
+]
+SegmentOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--segment", metavar="TIME", parser=duration, help="Length of one segment."),
+]
+OverlapOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--overlap", min=0, max=0.99, help="Share by which segments overlap."),
+]
+WindowOption: TypeAlias = Annotated[
+    str | None, typer.Option("--window", metavar="NAME", help="Any window of scipy.")
+]
+DetrendOption: TypeAlias = Annotated[
+    Detrend | None, typer.Option("--detrend", help="Taken out of each segment.")
+]
+NoCorrectionOption: TypeAlias = Annotated[
+    bool, typer.Option("--no-correction", help="Leave the small-sample bias in.")
+]
+UnitOption: TypeAlias = Annotated[
+    Unit | None, typer.Option("--unit", help="Unit of the spectra, through ω² where needed.")
+]
+BandOption: TypeAlias = Annotated[
+    tuple[float, float] | None,
+    typer.Option("--band", metavar="LOW:HIGH", parser=band, help="Band of the table, in Hz."),
+]
+SpeedOption: TypeAlias = Annotated[
+    float | None, typer.Option("--speed", min=0.01, help="How many times as fast as life.")
+]
