@@ -1,0 +1,74 @@
+"""Every self-noise method behind one signature."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from estimator.errors import UnknownMethodError
+from estimator.likelihood import maximum_likelihood
+from estimator.self_noise import Flag, SelfNoise
+from estimator.three_channel import three_channel
+from estimator.three_sensor import three_sensor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from estimator.arrays import ComplexArray
+
+__all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
+
+
+Method: TypeAlias = "Callable[..., SelfNoise]"
+"""``method(csm, *, dims, n_effective, correct, **options)``, as `self_noise` calls it."""
+
+METHODS: Mapping[str, Method] = MappingProxyType(
+    {
+        "three-channel": three_channel,
+        "three-sensor": three_sensor,
+        "maximum-likelihood": maximum_likelihood,
+    }
+)
+
+
+def self_noise(
+    method: str,
+    csm: ComplexArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    correct: bool = True,
+    **options: Any,  # noqa: ANN401 - each method's own
+) -> SelfNoise:
+    """Self-noise PSD of every channel by a named method.
+
+    Parameters
+    ----------
+    method : str
+        One of `METHODS`.
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+        Independent averages in `csm`.
+    correct : bool
+        Remove the small-sample bias.
+    **options
+        What the method alone takes; see there.
+
+    Returns
+    -------
+    SelfNoise
+
+    Raises
+    ------
+    UnknownMethodError
+        If there is no method of that name.
+    EstimatorError
+        As the method says.
+    """
+    if method not in METHODS:
+        raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")
+    return METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
