@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 HALF_WIDTH = 40
 """Samples the kernel reaches to either side, at the lower of the two rates."""
@@ -89,53 +90,61 @@ def resample(samples: FloatArray, positions: FloatArray, *, ratio: float = 1.0) 
     if ratio <= 1.0 and are_whole(positions):
         first = round(float(positions[0]))
         return _padded(samples, first, first + len(positions))
-    n_spans = -(-len(positions) // SPAN)
-    spread = np.empty(n_spans)
-    middle = np.empty(n_spans)
-    for span in range(n_spans):  # a span is a few milliseconds of work
-        part = positions[span * SPAN : (span + 1) * SPAN]
-        steps = part - np.arange(len(part))
-        middle[span] = (steps.max() + steps.min()) / 2
-        spread[span] = (steps.max() - steps.min()) / 2
-    delays = _delays_needed(float(spread.max()))
-    if ratio > 1.0 or delays is None:
-        return _direct(samples, positions, max(1.0, ratio))
-    return _by_spans(samples, positions, middle, float(spread.max()), delays)
+    if ratio > 1.0:
+        return _direct(samples, positions, ratio)
+    starts = np.arange(0, len(positions), SPAN)
+    steps = positions - (np.arange(len(positions)) % SPAN)
+    highest = np.maximum.reduceat(steps, starts)
+    lowest = np.minimum.reduceat(steps, starts)
+    middle, spread = (highest + lowest) / 2, (highest - lowest) / 2
+    delays = _delays_needed(spread)
+    out = np.empty((len(positions), samples.shape[1]))
+    for first in range(0, len(starts), _SPANS_AT_ONCE):
+        spans = slice(first, first + _SPANS_AT_ONCE)
+        for count in np.unique(delays[spans]):
+            for run in _runs(np.flatnonzero(delays[spans] == count) + first):
+                rows = slice(run[0] * SPAN, (run[-1] + 1) * SPAN)
+                if count > _MOST_DELAYS:
+                    out[rows] = _direct(samples, positions[rows], 1.0)
+                    continue
+                nodes = spread[run, None] * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+                out[rows] = _by_spans(samples, positions[rows], middle[run], nodes)
+    return out
+
+
+def _runs(numbers: IntArray) -> list[IntArray]:
+    """Split increasing numbers where one is left out."""
+    return np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
 
 
 def _by_spans(
-    samples: FloatArray, positions: FloatArray, middle: FloatArray, spread: float, delays: int
+    samples: FloatArray, positions: FloatArray, middle: FloatArray, nodes: FloatArray
 ) -> FloatArray:
-    """Convolve span by span at `delays` fixed delays, and interpolate between those."""
-    n_channels = samples.shape[1]
-    nodes = spread * np.cos(np.pi * (np.arange(delays) + 0.5) / delays)
+    """Convolve each span at its fixed delays, and interpolate between those.
+
+    `middle` is the row at which a span's first output stands, halfway through the span;
+    `nodes`, shape (n_spans, n_delays), are the delays around it.
+    """
+    n_spans, n_channels = len(middle), samples.shape[1]
     base = np.floor(middle).astype(np.int64)
-    out = np.empty((len(positions), n_channels))
     offsets = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)
-    for first in range(0, len(middle), _SPANS_AT_ONCE):
-        spans = np.arange(first, min(first + _SPANS_AT_ONCE, len(middle)))
-        fraction = middle[spans] - base[spans]
-        # Output k of a span lies between rows base + k and base + k + 1. (n_spans, n_delays, taps)
-        taps = _kernel(offsets - (fraction[:, None] + nodes)[:, :, None])
-        responses = scipy.fft.rfft(taps[:, :, ::-1], n=_FFT_LENGTH, axis=-1)
-        start = base[spans] + offsets[0]
-        low = int(start.min())
-        inputs = _padded(samples, low, int(start.max()) + _FFT_LENGTH)
-        windows = np.lib.stride_tricks.sliding_window_view(inputs, _FFT_LENGTH, axis=0)
-        spectra = scipy.fft.rfft(windows[start - low], axis=-1)  # (n_spans, n_channels, n_freqs)
-        steps = np.full((len(spans), SPAN), np.nan)
-        part = positions[first * SPAN : (first + len(spans)) * SPAN]
-        steps.reshape(-1)[: len(part)] = part
-        steps -= np.arange(SPAN) + middle[spans, None]
-        result = np.zeros((len(spans), n_channels, SPAN))
-        for delay in range(delays):
-            filtered = scipy.fft.irfft(spectra * responses[:, None, delay], axis=-1)
-            weight = _lagrange(steps, nodes, delay)
-            valid = filtered[:, :, len(offsets) - 1 : len(offsets) - 1 + SPAN]
-            result += valid * weight[:, None, :]
-        rows = result.transpose(0, 2, 1).reshape(-1, n_channels)
-        out[first * SPAN : first * SPAN + len(part)] = rows[: len(part)]
-    return out
+    # Output k of a span lies between rows base + k and base + k + 1. (n_spans, n_delays, taps)
+    taps = _kernel(offsets - (((middle - base)[:, None] + nodes)[:, :, None]))
+    responses = scipy.fft.rfft(taps[:, :, ::-1], n=_FFT_LENGTH, axis=-1)
+    start = base + offsets[0]
+    low = int(start.min())
+    inputs = _padded(samples, low, int(start.max()) + _FFT_LENGTH)
+    windows = np.lib.stride_tricks.sliding_window_view(inputs, _FFT_LENGTH, axis=0)
+    spectra = scipy.fft.rfft(windows[start - low], axis=-1)  # (n_spans, n_channels, n_freqs)
+    steps = np.zeros((n_spans, SPAN))
+    steps.reshape(-1)[: len(positions)] = positions
+    steps -= np.arange(SPAN) + middle[:, None]
+    result = np.zeros((n_spans, n_channels, SPAN))
+    for delay in range(nodes.shape[1]):
+        filtered = scipy.fft.irfft(spectra * responses[:, None, delay], axis=-1)
+        valid = filtered[:, :, len(offsets) - 1 : len(offsets) - 1 + SPAN]
+        result += valid * _lagrange(steps, nodes, delay)[:, None, :]
+    return result.transpose(0, 2, 1).reshape(-1, n_channels)[: len(positions)]
 
 
 def _direct(samples: FloatArray, positions: FloatArray, ratio: float) -> FloatArray:
@@ -156,24 +165,26 @@ def _direct(samples: FloatArray, positions: FloatArray, ratio: float) -> FloatAr
     return out
 
 
-def _delays_needed(spread: float) -> int | None:
+def _delays_needed(spread: FloatArray) -> IntArray:
     """Return how many fixed delays keep the error of interpolation within tolerance.
 
     Interpolation at m Chebyshev nodes of exp(iπx) over ±spread errs by at most
-    ``(π spread)^m / (2^(m-1) m!)``.
+    ``(π spread)^m / (2^(m-1) m!)``. Above `_MOST_DELAYS` there is no such number.
     """
-    for delays in range(1, _MOST_DELAYS + 1):
+    needed = np.full(len(spread), _MOST_DELAYS + 1)
+    for delays in range(_MOST_DELAYS, 0, -1):
         error = (np.pi * spread) ** delays / (2 ** (delays - 1) * math.factorial(delays))
-        if error < _TOLERANCE:
-            return delays
-    return None
+        needed[error < _TOLERANCE] = delays
+    return needed
 
 
 def _lagrange(x: FloatArray, nodes: FloatArray, which: int) -> FloatArray:
+    """Weight of node `which` at `x`; shapes (n_spans, n) and (n_spans, n_delays)."""
     weight = np.ones_like(x)
-    for other in range(len(nodes)):
+    for other in range(nodes.shape[1]):
         if other != which:
-            weight *= (x - nodes[other]) / (nodes[which] - nodes[other])
+            distance = nodes[:, which] - nodes[:, other]
+            weight *= (x - nodes[:, other, None]) / distance[:, None]
     return weight
 
 
@@ -192,7 +203,7 @@ def _kernel(u: FloatArray) -> FloatArray:
     table, steps = _table()
     place = np.minimum(np.abs(u) * _PHASES, float(len(table) - 1))
     index = place.astype(np.int64)
-    return table[index] + (place - index) * steps[index]
+    return np.asarray(table[index] + (place - index) * steps[index])
 
 
 def _padded(samples: FloatArray, first: int, last: int) -> FloatArray:

@@ -1,0 +1,399 @@
+"""A recording on one common grid, in physical units.
+
+Theory of operation
+-------------------
+Every sensor's samples are counted without error within an *epoch* of its clock; the clock says when
+each was taken (:mod:`daq.clock_model`). The grid runs at one rate from the instant the last sensor
+has begun. Where a sensor's samples fall on the grid (sensors of one clock, recordings with exact
+times) they pass through untouched; elsewhere they are interpolated (:mod:`daq.resampling`).
+
+A grid instant is valid if every sensor has all samples it takes; gaps are never filled. Filtering
+is done on whole spans counted from the grid's start, so that what is read does not depend on how
+the reading is cut. Memory is that of the piece asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.clock_model import ArrivalTimes, Clock, ClockState, from_instants, nominal
+from daq.errors import CannotAlignError
+from daq.protocols.block import BlockFlag
+from daq.resampling import SPAN, reach, resample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.bench_model import Channel
+    from daq.recording.reader import Recording, SensorRecord
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+_SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Contiguous samples, in the file as well as in time."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+
+    @property
+    def last_row(self) -> int:
+        return self.first_row + self.n_samples
+
+
+@dataclass(slots=True)
+class _Source:
+    """One sensor of the recording: where its samples are, and when they were taken."""
+
+    record: SensorRecord
+    columns: list[int]
+    sensitivity: FloatArray
+    arrivals: ArrivalTimes
+    runs: list[_Run] = field(default_factory=list)
+    n_blocks: int = 0
+    device_utc: bool = False
+    clock: Clock | None = None
+
+    @property
+    def end_sample(self) -> int:
+        run = self.runs[-1]
+        return run.first_sample + run.n_samples
+
+    def refresh(self) -> None:
+        """Take the blocks that have been committed since."""
+        blocks = self.record.blocks[self.n_blocks :]
+        ends = blocks["first_row"] + blocks["n_samples"]
+        blocks = blocks[: np.searchsorted(ends, self.record.n_samples, side="right")]
+        if len(blocks) == 0:
+            return
+        if self.n_blocks == 0:
+            self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
+        self.arrivals.add(blocks)
+        first = blocks["first_sample"].astype(np.int64)
+        length = blocks["n_samples"].astype(np.int64)
+        expected = np.append(self.end_sample if self.runs else -1, (first + length)[:-1])
+        starts = np.flatnonzero(first != expected)
+        if len(starts) == 0 or starts[0] > 0:  # the run before goes on
+            until = int(starts[0]) if len(starts) else len(blocks)
+            run = self.runs[-1]
+            self.runs[-1] = _Run(
+                run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
+            )
+        for start, end in zip(starts, np.append(starts[1:], len(blocks)), strict=True):
+            n_samples = int(length[start:end].sum())
+            self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
+        self.n_blocks += len(blocks)
+
+    def read(self, first: int, last: int) -> tuple[FloatArray, BoolArray]:
+        """Return samples `first` to `last` (not included), and which of them are there."""
+        samples = np.zeros((last - first, len(self.columns)))
+        present = np.zeros(last - first, dtype=bool)
+        for run in self.runs:
+            low = max(first, run.first_sample)
+            high = min(last, run.first_sample + run.n_samples)
+            if low >= high:
+                continue
+            row = run.first_row + low - run.first_sample
+            counts = self.record.counts(row, row + high - low)
+            np.divide(
+                counts[:, self.columns], self.sensitivity, out=samples[low - first : high - first]
+            )
+            present[low - first : high - first] = True
+        return samples, present
+
+
+class AlignedRecording:
+    """The sensors of a recording on one grid, as long as the recording is, or as it grows.
+
+    Parameters
+    ----------
+    recording : Recording
+        Open; may still be growing.
+    sampling_rate : float, optional
+        Of the grid, in Hz; the lowest of the sensors' where not given.
+    start_utc_ns, end_utc_ns : int, optional
+        Only what lies between.
+
+    Raises
+    ------
+    CannotAlignError
+        If there are no main channels, or `sampling_rate` is above that of a sensor.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        sampling_rate: float | None = None,
+        start_utc_ns: int | None = None,
+        end_utc_ns: int | None = None,
+    ) -> None:
+        self._recording = recording
+        self._wanted = (start_utc_ns, end_utc_ns)
+        records = [record for record in recording.sensors if _main(record)]
+        if not records:
+            raise CannotAlignError(
+                f"{recording.path}: no sensor with a channel that is not auxiliary"
+            )
+        self.sampling_rate = _grid_rate(records, sampling_rate)
+        self.channels: tuple[tuple[str, Channel], ...] = tuple(
+            (record.name, record.channels[column]) for record in records for column in _main(record)
+        )
+        self.dims = tuple(len(_main(record)) for record in records)
+        self._records = records
+        self._sources: list[_Source] = []
+        self._origin = (0, 0)
+        self._start: float | None = None
+        self._end = math.inf
+        self.refresh()
+
+    @property
+    def start_utc_ns(self) -> int:
+        """UTC of grid sample 0, in ns since 1970."""
+        return self._origin[1] + round((self._start or 0.0) * 1e9)
+
+    @property
+    def clocks(self) -> tuple[ClockState, ...]:
+        """What is known about each sensor's clock, in the order of the sensors."""
+        return tuple(source.clock.state for source in self._sources if source.clock)
+
+    @property
+    def n_available(self) -> int:
+        """Grid samples that can be read now."""
+        if self._start is None:
+            return 0
+        ends = []
+        for source in self._sources:
+            clock = _known(source)
+            margin = 0 if self._passes(source) else reach(self._ratio(source))
+            rate = source.record.sampling_rate
+            ends.append(clock.end - margin / rate)
+        stop = (min(*ends, self._end) - self._start) * self.sampling_rate
+        return max(0, math.floor(stop + _SNAP) + 1)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether every sensor's samples fall on the grid, so that no clock had to be estimated."""
+        return self._start is None or all(self._passes(source) for source in self._sources)
+
+    def delays(self, at: FloatArray) -> FloatArray:
+        """Return how far each sensor's count of time lags the grid, by the clocks as known now.
+
+        Parameters
+        ----------
+        at : float64, shape (n,)
+            Grid positions in samples.
+
+        Returns
+        -------
+        float64, shape (n, n_sensors)
+            In seconds; only differences mean anything.
+        """
+        seconds = (self._start or 0.0) + at / self.sampling_rate
+        delays = np.empty((len(at), len(self._sources)))
+        for column, source in enumerate(self._sources):
+            epochs = _known(source).epochs
+            which = np.searchsorted([epoch.start for epoch in epochs[1:]], seconds, side="right")
+            for number in np.unique(which):
+                mine = which == number
+                index = epochs[number].position(seconds[mine])
+                delays[mine, column] = seconds[mine] - index / source.record.sampling_rate
+        return delays
+
+    def refresh(self) -> None:
+        """Take what has been committed since, and set every clock by it."""
+        self._recording.refresh()
+        if not self._sources:
+            if any(record.n_samples == 0 for record in self._records):
+                return
+            at = self._recording.created_at
+            self._origin = (at.monotonic_ns, at.utc_ns)
+            self._sources = [_source(record, *self._origin) for record in self._records]
+        for source in self._sources:
+            source.refresh()
+        self._set_clocks()
+        if self._start is None:
+            self._set_start()
+
+    def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        """Return grid samples `start` to `stop` (not included).
+
+        Returns
+        -------
+        samples : float64, shape (stop - start, n_channels)
+            In physical units. Arbitrary where not valid.
+        valid : bool, shape (stop - start,)
+            False where any sensor has a gap.
+
+        Raises
+        ------
+        CannotAlignError
+            If the samples are not available (yet).
+        """
+        if not 0 <= start <= stop <= self.n_available:
+            raise CannotAlignError(
+                f"{self._recording.path}: grid samples {start} to {stop} asked for,"
+                f" {self.n_available} available"
+            )
+        # Whole spans: then the same numbers come out however the reading is cut.
+        first = start // SPAN * SPAN
+        last = -(-stop // SPAN) * SPAN
+        samples = np.empty((stop - start, len(self.channels)))
+        valid = np.ones(stop - start, dtype=bool)
+        column = 0
+        for source in self._sources:
+            width = len(source.columns)
+            if self._passes(source):
+                part, present = self._read_source(source, start, stop)
+            else:
+                part, present = self._read_source(source, first, last)
+                part = part[start - first : stop - first]
+                present = present[start - first : stop - first]
+            samples[:, column : column + width] = part
+            valid &= present
+            column += width
+        return samples, valid
+
+    def _read_source(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        seconds = (self._start or 0.0) + np.arange(start, stop) / self.sampling_rate
+        samples = np.zeros((stop - start, len(source.columns)))
+        valid = np.zeros(stop - start, dtype=bool)
+        ratio = self._ratio(source)
+        for epoch in _known(source).epochs:
+            if epoch.end < seconds[0] or epoch.start > seconds[-1]:
+                continue
+            positions = epoch.position(seconds)
+            whole = ratio == 1.0 and self._passes(source)
+            if whole:
+                positions = np.round(positions[0]) + np.arange(len(positions))
+            margin = 0 if whole else reach(ratio)
+            low = math.floor(positions[0]) - margin
+            high = math.ceil(positions[-1]) + margin + 1
+            inputs, present = source.read(low, high)
+            inside = np.arange(low, high)
+            present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
+            inputs[~present] = 0.0
+            usable = _all_present(present, np.floor(positions).astype(np.int64) - low, margin)
+            if usable.any():
+                samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
+                valid |= usable
+        return samples, valid
+
+    def _set_clocks(self) -> None:
+        names = {source.record.clock or source.record.name for source in self._sources}
+        together = len(names) == 1 and not any(
+            source.device_utc or source.record.polled for source in self._sources
+        )
+        rates = {source.record.sampling_rate for source in self._sources}
+        first_of: dict[str, Clock] = {}
+        for source in self._sources:
+            name = source.record.clock or source.record.name
+            if source.record.polled:
+                source.clock = self._polled(source)
+            elif together and len(rates) == 1:
+                source.clock = nominal(
+                    source.record.name,
+                    name,
+                    end_sample=source.end_sample,
+                    sampling_rate=source.record.sampling_rate,
+                )
+            elif name in first_of and not source.device_utc:
+                source.clock = first_of[name]
+            else:
+                source.clock = source.arrivals.solve(source.record.name)
+                first_of[name] = source.clock
+
+    def _polled(self, source: _Source) -> Clock:
+        instants = source.record.instants_ns(0, source.runs[-1].last_row)
+        return from_instants(
+            source.record.name,
+            np.asarray((instants - self._origin[0]) * 1e-9, dtype=np.float64),
+            sampling_rate=source.record.sampling_rate,
+            runs=[(run.first_sample, run.first_row, run.n_samples) for run in source.runs],
+        )
+
+    def _set_start(self) -> None:
+        start_utc_ns, end_utc_ns = self._wanted
+        self._start = max(_known(source).start for source in self._sources)
+        if not all(self._passes(source) for source in self._sources):
+            self._start += max(
+                reach(self._ratio(source)) / source.record.sampling_rate for source in self._sources
+            )
+        first = _known(self._sources[0])
+        if start_utc_ns is not None:
+            wanted = (start_utc_ns - self._origin[1]) * 1e-9
+            if wanted > self._start:  # the first sensor's next sample
+                epoch = first.epochs[0]
+                index = np.ceil(epoch.position(np.array([wanted])) - _SNAP)
+                self._start = float(epoch.at(index)[0])
+        if end_utc_ns is not None:
+            self._end = (end_utc_ns - self._origin[1]) * 1e-9
+
+    def _passes(self, source: _Source) -> bool:
+        """Whether the sensor's samples fall on the grid."""
+        if source.record.sampling_rate != self.sampling_rate or self._start is None:
+            return source.record.sampling_rate == self.sampling_rate and self._start is None
+        clock = _known(source)
+        for epoch in clock.epochs:
+            rate = (epoch.index[-1] - epoch.index[0]) / (epoch.seconds[-1] - epoch.seconds[0])
+            if len(epoch.index) > 2 or abs(rate / self.sampling_rate - 1) > 1e-12:
+                return False
+            position = epoch.position(np.array([self._start]))
+            if abs(position[0] - round(position[0])) > _SNAP:
+                return False
+        return True
+
+    def _ratio(self, source: _Source) -> float:
+        return max(1.0, source.record.sampling_rate / self.sampling_rate)
+
+
+def _known(source: _Source) -> Clock:
+    if source.clock is None:
+        raise CannotAlignError(f"sensor {source.record.name!r}: no block recorded yet")
+    return source.clock
+
+
+def _main(record: SensorRecord) -> list[int]:
+    return [column for column, channel in enumerate(record.channels) if not channel.auxiliary]
+
+
+def _source(record: SensorRecord, monotonic_ns: int, utc_ns: int) -> _Source:
+    columns = _main(record)
+    return _Source(
+        record,
+        columns,
+        np.array([record.channels[column].sensitivity for column in columns]),
+        ArrivalTimes(record.sampling_rate, monotonic_ns, utc_ns),
+    )
+
+
+def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:
+    rates = {record.name: record.sampling_rate for record in records}
+    lowest = min(rates.values())
+    if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):
+        return lowest
+    if wanted > lowest or wanted <= 0:
+        listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise CannotAlignError(
+            f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
+            f" ask for {lowest:g} Hz or less"
+        )
+    return wanted
+
+
+def _all_present(present: BoolArray, base: NDArray[np.int64], margin: int) -> BoolArray:
+    """Whether all samples that the kernel takes around `base` are present."""
+    missing = np.concatenate([[0], np.cumsum(~present)])
+    low = np.clip(base - max(margin - 1, 0), 0, len(present))
+    high = np.clip(base + margin + 1, 0, len(present))
+    inside = (base >= 0) & (base < len(present))
+    return np.asarray(inside & (missing[high] == missing[low]), dtype=np.bool_)

@@ -1,0 +1,549 @@
+"""Follows a recording and estimates: the only module of this package that knows the estimator.
+
+Theory of operation
+-------------------
+Segments lie on a fixed lattice of the common grid; one that touches a gap is left out, for every
+sensor, and nothing else is. Each new segment is transformed once, with what is known about the
+clocks by then. When what is known has become materially better for segments already taken (looked
+at whenever their number has doubled), they are taken again.
+
+``finish`` is one pass over the whole recording with the final clocks: a function of the file
+alone. So what is shown when a run ends is what ``huddle estimate`` says about its file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from daq.alignment import AlignedRecording
+from daq.errors import CannotAlignError
+from daq.recording.reader import Recording
+from daq.units import canonical, conversion
+from estimator.errors import InsufficientDataError
+from estimator.methods import METHODS, self_noise
+from estimator.spectra import CrossSpectra, WelchSettings, scale
+from estimator.windows import effective_averages, get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from datetime import datetime
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daq.bench_model import Bench
+    from daq.clock_model import ClockState
+    from daq.recording.reader import SensorRecord
+    from estimator.self_noise import SelfNoise
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+Progress = Callable[[int, int], None]
+
+_VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
+_MATERIAL = 1e-6  # seconds; clocks that move less than this change nothing one could see
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is estimated, and how.
+
+    Attributes
+    ----------
+    segment : float
+        Length of a segment in seconds.
+    overlap, window, detrend
+        As `estimator.spectra.WelchSettings` takes them.
+    methods : tuple of str
+        Names in `estimator.methods.METHODS`; ``("all",)`` for every method that applies.
+    correct : bool
+        Whether the small-sample bias is removed.
+    unit : str or None
+        Of the result; that of the first channel where not given.
+    start, end : datetime or None
+        Only what lies between; with time zone.
+    band : (float, float) or None
+        Frequencies in Hz in which `target_cov` is wanted; 0.05 to 0.45 of the rate if not given.
+    target_cov : float or None
+        Wanted coefficient of variation.
+    sampling_rate : float or None
+        Of the common grid in Hz; the lowest of the sensors' where not given.
+    options : dict
+        Further options of the methods.
+    """
+
+    segment: float = 10.0
+    overlap: float = 0.5
+    window: str = "hann"
+    detrend: Literal["none", "constant", "linear"] = "constant"
+    methods: tuple[str, ...] = ("three-sensor",)
+    correct: bool = True
+    unit: str | None = None
+    start: datetime | None = None
+    end: datetime | None = None
+    band: tuple[float, float] | None = None
+    target_cov: float | None = None
+    sampling_rate: float | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, bench: Bench | None) -> Settings:
+        """Return what a bench file says, or what holds where there is none."""
+        if bench is None:
+            return cls()
+        wanted = bench.estimate
+        return cls(
+            segment=wanted.segment,
+            overlap=wanted.overlap,
+            window=wanted.window,
+            detrend=wanted.detrend,
+            methods=(wanted.method,),
+            correct=wanted.correct,
+            band=wanted.band,
+            target_cov=wanted.target_cov,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelLabel:
+    """Which channel a column of the result is, and its unit (of the motion, not of the PSD)."""
+
+    sensor: str
+    channel: str
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class SensorState:
+    """What the recording says about a sensor now."""
+
+    name: str
+    sampling_rate: float
+    n_samples: int
+    n_gaps: int
+    n_missing: int
+    last_seen: float
+    """UTC of the last committed block, in seconds since 1970; NaN before the first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """The estimate at one moment, with everything a front end shows.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+        In Hz.
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Cross-spectral matrix in unit**2/Hz; ``csm[f, p, q] = E[X_p conj(X_q)]``. NaN before the
+        first segment.
+    results : dict
+        Self-noise by name of the method; without those that cannot say anything (yet).
+    refused : dict
+        Why, by name of the method.
+    channels : tuple of ChannelLabel
+    dims : tuple of int
+        Number of channels of each sensor.
+    n_segments, n_dropped : int
+        Segments taken, and left out for gaps.
+    n_effective : float
+        Independent averages the segments are worth.
+    elapsed : float
+        Seconds from the start to the end of what was looked at.
+    time_left : float or None
+        Seconds until the target c.o.v. is reached; None where there is no target or no estimate.
+    start_utc_ns : int
+        UTC of the first grid sample.
+    sensors, clocks : tuple
+    closed : bool
+        Whether nothing more will come.
+    """
+
+    frequency: FloatArray
+    csm: ComplexArray
+    results: dict[str, SelfNoise]
+    refused: dict[str, str]
+    channels: tuple[ChannelLabel, ...]
+    dims: tuple[int, ...]
+    unit: str
+    n_segments: int
+    n_dropped: int
+    n_effective: float
+    elapsed: float
+    time_left: float | None
+    start_utc_ns: int
+    sensors: tuple[SensorState, ...]
+    clocks: tuple[ClockState, ...]
+    closed: bool
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def data_psd(self) -> FloatArray:
+        """PSD of what each channel recorded, shape (n_freqs, n_channels), in unit**2/Hz."""
+        return np.ascontiguousarray(np.diagonal(self.csm, axis1=1, axis2=2).real)
+
+
+class _Pass:
+    """Segments of one recording, taken in order."""
+
+    def __init__(self, recording: Recording, settings: Settings) -> None:
+        self.recording = recording
+        self.aligned = AlignedRecording(
+            recording,
+            sampling_rate=settings.sampling_rate,
+            start_utc_ns=_utc_ns(settings.start),
+            end_utc_ns=_utc_ns(settings.end),
+        )
+        rate = self.aligned.sampling_rate
+        self.welch = WelchSettings(
+            sampling_rate=rate,
+            segment_length=round(settings.segment * rate),
+            overlap=settings.overlap,
+            window=settings.window,
+            detrend=settings.detrend,
+        )
+        self.n_channels = len(self.aligned.channels)
+        self.spectra = CrossSpectra(self.welch, self.n_channels)
+        self.n_seen = 0
+        self.taken_at: list[FloatArray] = []
+
+    @property
+    def n_complete(self) -> int:
+        """Segments of the lattice that are available now."""
+        beyond = self.aligned.n_available - self.welch.segment_length
+        return max(0, beyond // self.welch.hop + 1)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of the grid that have been looked at."""
+        if self.n_seen == 0:
+            return 0.0
+        length = (self.n_seen - 1) * self.welch.hop + self.welch.segment_length
+        return length / self.welch.sampling_rate
+
+    def advance(self, progress: Callable[[int], None] | None = None) -> None:
+        """Take every segment that is complete."""
+        hop, length = self.welch.hop, self.welch.segment_length
+        at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
+        total = self.n_complete
+        while self.n_seen < total:
+            count = min(at_once, total - self.n_seen)
+            first = self.n_seen * hop
+            samples, valid = self.aligned.read(first, first + (count - 1) * hop + length)
+            starts = np.arange(count) * hop
+            missing = np.concatenate([[0], np.cumsum(~valid)])
+            starts = starts[missing[starts + length] == missing[starts]]
+            self.spectra.add(samples, starts)
+            self.taken_at.append(self._positions(self.n_seen + np.arange(count)))
+            self.n_seen += count
+            if progress is not None:
+                progress(count)
+
+    def is_outdated(self) -> bool:
+        """Whether the clocks, as known now, differ materially from those segments were taken by."""
+        if not self.taken_at:
+            return False
+        before = np.concatenate(self.taken_at)
+        moved = self._positions(np.arange(len(before))) - before
+        moved -= moved.mean(axis=1, keepdims=True)  # all sensors alike: no delay between them
+        return bool(np.sqrt(np.mean(moved**2)) > _MATERIAL)
+
+    def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
+        middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
+        return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+
+
+class Estimation:
+    """The estimate from recordings, kept up with them as they grow.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Several recordings of the same sensors accumulate into one estimate.
+    settings : Settings, optional
+        What the bench in the first recording says, where not given.
+
+    Raises
+    ------
+    RecordingError
+        If a file cannot be read.
+    CannotAlignError
+        If the sensors cannot be brought onto one grid, or the recordings do not match.
+    """
+
+    def __init__(self, paths: Sequence[str | Path], settings: Settings | None = None) -> None:
+        if not paths:
+            raise CannotAlignError("no recording given; expected at least one")
+        self._recordings: list[Recording] = []
+        try:
+            for path in paths:
+                self._recordings.append(Recording.open(path))
+            self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
+            self._passes = [_Pass(recording, self.settings) for recording in self._recordings]
+            _check_same(self._passes)
+            self._unit = canonical(
+                self.settings.unit or self._passes[0].aligned.channels[0][1].unit
+            )
+            self._response = self._responses()
+        except BaseException:
+            self.close()
+            raise
+        self._next_review = 2
+
+    def close(self) -> None:
+        """Close the recordings."""
+        for recording in self._recordings:
+            recording.close()
+
+    def __enter__(self) -> Estimation:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def n_segments(self) -> int:
+        """Segments taken so far."""
+        return sum(each.spectra.n_segments for each in self._passes)
+
+    def update(self) -> bool:
+        """Take what has been committed since; return whether there was a new segment.
+
+        Raises
+        ------
+        RecordingError
+            If a file is damaged.
+        """
+        before = sum(each.n_seen for each in self._passes)
+        for each in self._passes:
+            each.aligned.refresh()
+            each.advance()
+        seen = sum(each.n_seen for each in self._passes)
+        if seen >= self._next_review:
+            self._next_review = 2 * seen
+            for number, each in enumerate(self._passes):
+                if each.is_outdated():
+                    self._passes[number] = again = _Pass(each.recording, self.settings)
+                    again.advance()
+        return seen > before
+
+    def finish(self, progress: Progress | None = None) -> Snapshot:
+        """Return the one result: the same while the recording was followed and afterwards.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told how many segments are done, and of how many.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no method can say anything; the message says why.
+        """
+        total = 0
+        for number, each in enumerate(self._passes):
+            each.aligned.refresh()
+            if each.n_seen and not each.aligned.is_exact:
+                self._passes[number] = _Pass(each.recording, self.settings)
+            total += self._passes[number].n_complete
+        done = sum(each.n_seen for each in self._passes)
+
+        def count(n: int) -> None:
+            nonlocal done
+            done += n
+            if progress is not None:
+                progress(done, total)
+
+        for each in self._passes:
+            each.advance(count)
+        snapshot = self.snapshot()
+        if not snapshot.results:
+            raise InsufficientDataError(self._why_nothing(snapshot))
+        return snapshot
+
+    def snapshot(self) -> Snapshot:
+        """Return the estimate as it stands, from the segments taken so far."""
+        first = self._passes[0]
+        spectra = CrossSpectra(first.welch, first.n_channels)
+        for each in self._passes:
+            spectra.merge(each.spectra)
+        n_segments = spectra.n_segments
+        results: dict[str, SelfNoise] = {}
+        refused: dict[str, str] = {}
+        if n_segments == 0:
+            shape = (len(first.welch.frequencies), first.n_channels, first.n_channels)
+            csm = np.full(shape, np.nan, dtype=np.complex128)
+            n_effective = 0.0
+        else:
+            csm = spectra.csm()
+            if self._response is not None:
+                csm = scale(csm, self._response)
+            n_effective = self._n_effective()
+            results, refused = self._methods(csm, n_effective)
+        return Snapshot(
+            frequency=first.welch.frequencies,
+            csm=csm,
+            results=results,
+            refused=refused,
+            channels=tuple(
+                ChannelLabel(sensor, channel.name, self._unit)
+                for sensor, channel in first.aligned.channels
+            ),
+            dims=first.aligned.dims,
+            unit=self._unit,
+            n_segments=n_segments,
+            n_dropped=sum(each.n_seen for each in self._passes) - n_segments,
+            n_effective=n_effective,
+            elapsed=sum(each.elapsed for each in self._passes),
+            time_left=self._time_left(results, n_effective),
+            start_utc_ns=first.aligned.start_utc_ns,
+            sensors=tuple(_sensor_state(record) for record in self._recordings[-1].sensors),
+            clocks=self._passes[-1].aligned.clocks,
+            closed=all(recording.closed for recording in self._recordings),
+        )
+
+    def _n_effective(self) -> float:
+        window = get_window(self.settings.window, self._passes[0].welch.segment_length)
+        return sum(
+            effective_averages(window, each.welch.hop, each.spectra.n_segments)
+            for each in self._passes
+            if each.spectra.n_segments
+        )
+
+    def _methods(
+        self, csm: ComplexArray, n_effective: float
+    ) -> tuple[dict[str, SelfNoise], dict[str, str]]:
+        wanted = tuple(METHODS) if "all" in self.settings.methods else self.settings.methods
+        results: dict[str, SelfNoise] = {}
+        refused: dict[str, str] = {}
+        for method in wanted:
+            try:
+                results[method] = self_noise(
+                    method,
+                    csm,
+                    dims=self._passes[0].aligned.dims,
+                    n_effective=n_effective,
+                    correct=self.settings.correct,
+                    **self.settings.options,
+                )
+            except InsufficientDataError as error:
+                refused[method] = str(error)
+        return results, refused
+
+    def _time_left(self, results: dict[str, SelfNoise], n_effective: float) -> float | None:
+        target = self.settings.target_cov
+        if target is None or not results:
+            return None
+        welch = self._passes[0].welch
+        band = self.settings.band or (0.0, 0.45 * welch.sampling_rate)
+        inside = (welch.frequencies >= band[0]) & (welch.frequencies <= band[1])
+        inside[0] = False
+        cov = next(iter(results.values())).cov[inside]
+        if not np.isfinite(cov).any():
+            return None
+        reached = float(np.nanmax(np.nanmedian(cov, axis=0)))
+        # c.o.v. ~ 1 / √n, and averages come at a steady pace.
+        missing = n_effective * max(0.0, (reached / target) ** 2 - 1)
+        pace = self.n_segments * welch.hop / welch.sampling_rate / n_effective
+        return missing * pace
+
+    def _responses(self) -> ComplexArray | None:
+        """Return what spectra are divided by: the response, and the way to the unit."""
+        aligned, welch = self._passes[0].aligned, self._passes[0].welch
+        frequency = welch.frequencies
+        response = np.ones((len(frequency), len(aligned.channels)), dtype=np.complex128)
+        for column, (_, channel) in enumerate(aligned.channels):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                response[:, column] = 1 / conversion(channel.unit, self._unit, frequency)
+            if channel.response is not None:
+                response[:, column] *= channel.response.at(frequency)
+        return None if np.all(response == 1) else response
+
+    def _why_nothing(self, snapshot: Snapshot) -> str:
+        names = ", ".join(str(recording.path) for recording in self._recordings)
+        if snapshot.n_segments == 0:
+            welch = self._passes[0].welch
+            available = sum(each.aligned.n_available for each in self._passes)
+            return (
+                f"{names}: not one whole segment: {available / welch.sampling_rate:.3g} s with all"
+                f" sensors, {snapshot.n_dropped} segments left out for gaps, and a segment takes"
+                f" {self.settings.segment:g} s; record longer or choose a shorter segment"
+            )
+        return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
+
+
+def estimate(
+    paths: Sequence[str | Path],
+    settings: Settings | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Snapshot:
+    """Estimate the self-noise from finished recordings (or from what there is of a growing one).
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Several recordings of the same sensors accumulate into one estimate.
+    settings : Settings, optional
+        What the bench in the first recording says, where not given.
+    progress : callable, optional
+        Told how many segments are done, and of how many.
+
+    Raises
+    ------
+    RecordingError, CannotAlignError
+        If a file cannot be read, or its sensors not be aligned.
+    InsufficientDataError
+        If there is too little for any of the methods.
+    """
+    with Estimation(paths, settings) as estimation:
+        return estimation.finish(progress)
+
+
+def _check_same(passes: list[_Pass]) -> None:
+    first = passes[0]
+    for other in passes[1:]:
+        same = (
+            other.welch == first.welch
+            and other.aligned.dims == first.aligned.dims
+            and _labels(other) == _labels(first)
+        )
+        if not same:
+            raise CannotAlignError(
+                f"{other.recording.path} does not match {first.recording.path}:"
+                f" {_described(other)} against {_described(first)};"
+                " one estimate takes recordings of the same sensors at one sampling rate"
+            )
+
+
+def _labels(each: _Pass) -> list[tuple[str, str, str]]:
+    return [(sensor, channel.name, channel.unit) for sensor, channel in each.aligned.channels]
+
+
+def _described(each: _Pass) -> str:
+    names = ", ".join(f"{sensor} {channel} in {unit}" for sensor, channel, unit in _labels(each))
+    return f"{names} at {each.welch.sampling_rate:g} Hz"
+
+
+def _utc_ns(instant: datetime | None) -> int | None:
+    if instant is None:
+        return None
+    return math.floor(instant.timestamp()) * 10**9 + instant.microsecond * 1000
+
+
+def _sensor_state(record: SensorRecord) -> SensorState:
+    blocks = record.blocks
+    return SensorState(
+        name=record.name,
+        sampling_rate=record.sampling_rate,
+        n_samples=record.n_samples,
+        n_gaps=len(record.gaps),
+        n_missing=int(record.gaps["missing"].sum()),
+        last_seen=float(blocks["utc_ns"][-1]) * 1e-9 if len(blocks) else float("nan"),
+    )
