@@ -1,0 +1,1 @@
+"""Codecs: golden vectors, fuzzing, any split."""
