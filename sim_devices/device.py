@@ -87,6 +87,8 @@ class DeviceSpec:
     sampling_rate: float
     channels: Mapping[str, tuple[ChannelSpec, ...]]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    model: str = ""
+    serial_number: str = ""
 
 
 class Source:

@@ -11,6 +11,7 @@ The specification is one JSON object::
         "port": "pty",             or "tcp", "udp"
         "sampling_rate": 200.0,    Hz
         "settings": {...},         as the driver's settings in the bench file
+        "model": "", "serial_number": "",     what it says it is; the family's own if empty
         "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
 
 With INDEX this process serves that device alone; without, it starts one process for each. Each
@@ -119,9 +120,10 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
     scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
     clock = WorldClock(int(spec["epoch_ns"]), float(spec.get("speed", 1.0)))
     module, _, function = FAMILIES[device.driver].partition(":")
-    lines: Sequence[Line] = getattr(import_module(module), function)(
-        device, Source(scenario, device)
-    )
+    source = Source(scenario, device)
+    for sensor in device.sensors:  # the first sample takes its time: before anybody waits for it
+        source.counts(sensor, source.first_sample_after(sensor, clock.now()), 1)
+    lines: Sequence[Line] = getattr(import_module(module), function)(device, source)
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -170,4 +172,6 @@ def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
             for sensor, channels in table["channels"].items()
         },
         settings=table.get("settings", {}),
+        model=table.get("model", ""),
+        serial_number=table.get("serial_number", ""),
     )

@@ -1,0 +1,352 @@
+"""Driver for Epson M-A352 and M-A370 accelerometers on a UART.
+
+The device is put into configuration mode (it may be found streaming from before), identified, set
+up completely and read back, and streams by itself (UART_AUTO) until the session ends; then it is
+left in configuration mode, quiet. Nothing is written to its flash.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, PositiveFloat, field_validator
+
+from daq.drivers.base import DeviceInformation
+from daq.errors import BenchFileError, DeviceError, NoAnswerError, WrongDeviceError
+from daq.protocols import epson
+from daq.protocols.epson import BurstFormat, Register
+from daq.protocols.epson_burst import BurstDecoder
+from daq.transport import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator, Sequence
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.protocols.block import Block, Event
+    from daq.transport import ByteStream
+
+REPLY_TIMEOUT = 0.3
+QUIET = 0.03
+"""Without a byte for so long, in s, the device has stopped streaming: six frames at 200 Hz."""
+ATTEMPTS = 5
+SETTLE_TIMEOUT = 3.0
+"""For the device to get ready (flash, reset) or change its mode or filter, s."""
+STALLED = 1.0
+"""Without a frame for so long, in s, the device has stopped sending."""
+WRITE_INTERVAL = 0.001
+"""Between two commands, s; the data sheet asks for 350 µs."""
+
+Field = Literal["x", "y", "z", "temperature"]
+EXTERNAL = {
+    "off": 0,
+    "trigger-rising": 2,
+    "trigger-falling": 3,
+    "pps-rising": 4,
+    "pps-falling": 5,
+}
+
+
+class EpsonSettings(BaseModel):
+    """``[sensors.settings]`` of an Epson accelerometer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    baud_rate: Literal[460800, 230400, 115200] = 460800
+    """As the device is set (it leaves the factory at 460800)."""
+    filter: str | None = None
+    """Name of the filter; the usual one for the sampling rate if not given."""
+    fields: tuple[Field, ...] | None = None
+    """What each channel is, in order; x, y, z, and temperature for an auxiliary channel."""
+    flags: bool = True
+    """Whether bursts carry the error flag."""
+    tilt: bool = False
+    """Whether x, y, z are tilt angles instead of accelerations."""
+    reduced_noise: bool = False
+    """The reduced-noise-floor condition of the M-A352."""
+    temperature_stabilisation: bool = True
+    """Bias stabilisation against thermal shock of the M-A352."""
+    external: Literal["off", "trigger-rising", "trigger-falling", "pps-rising", "pps-falling"] = (
+        "off"
+    )
+    """What the EXT pin does; 1PPS on the M-A370 only."""
+    full_scale: PositiveFloat = 15.0
+    """In g, peak; samples beyond are marked as clipped."""
+
+    @field_validator("filter")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None and value not in epson.FILTERS:
+            raise ValueError(f"expected one of {', '.join(epson.FILTERS)}")
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class _Configuration:
+    """What a sensor's settings come to in the device's registers."""
+
+    sampling_rate: int
+    filter: str
+    fields: tuple[Field, ...]
+    burst: BurstFormat
+    settings: EpsonSettings
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> _Configuration:
+        """Raise BenchFileError for what the device cannot do."""
+        settings = EpsonSettings.model_validate(sensor.settings)
+        who = f"sensor {sensor.name!r}"
+        rate = round(sensor.sampling_rate)
+        if rate not in epson.RATES or rate != sensor.sampling_rate:
+            rates = ", ".join(map(str, epson.RATES))
+            raise BenchFileError(
+                f"{who}: sampling_rate = {sensor.sampling_rate:g}; the device has {rates} Hz"
+            )
+        axes: Iterator[Field] = iter(("x", "y", "z"))
+        fields = settings.fields or tuple(
+            "temperature" if channel.auxiliary else next(axes, "temperature")
+            for channel in sensor.channels
+        )
+        if len(fields) != len(sensor.channels) or len(set(fields)) < len(fields):
+            raise BenchFileError(
+                f"{who}: {len(sensor.channels)} channels, but settings.fields = {list(fields)};"
+                " expected a different one of x, y, z, temperature for each channel"
+            )
+        flags = ("flag",) if settings.flags else ()
+        burst = BurstFormat.of(*flags, *fields, "count", "checksum")
+        if (needed := rate * burst.size * 10) > settings.baud_rate:
+            raise BenchFileError(
+                f"{who}: {rate} Hz of {burst.size} bytes need {needed} baud;"
+                f" settings.baud_rate = {settings.baud_rate} (fewer fields, or a lower rate)"
+            )
+        usual = settings.filter or epson.USUAL_FILTER[rate]
+        return cls(rate, usual, fields, burst, settings)
+
+    def writes(self) -> list[tuple[Register, bool, int]]:
+        """Return what to set: which register, whether its high byte, and to what."""
+        s, burst_ctrl = self.settings, self.burst.burst_ctrl
+        sig_low = 0xE0 * s.tilt | 0x10 * s.reduced_noise | 0x04 * s.temperature_stabilisation
+        sig_high = (burst_ctrl >> 8 & 0x07) << 1 | 0x80 * ("temperature" in self.burst)
+        return [
+            (epson.MSC_CTRL, False, EXTERNAL[s.external] << 5 | 0x06),
+            (epson.SIG_CTRL, True, sig_high),
+            (epson.SIG_CTRL, False, sig_low),
+            (epson.SMPL_CTRL, True, epson.RATES[self.sampling_rate]),
+            (epson.FILTER_CTRL, False, epson.FILTERS[self.filter]),
+            (epson.UART_CTRL, False, epson.UART_AUTO),
+            (epson.BURST_CTRL, True, burst_ctrl >> 8),
+            (epson.BURST_CTRL, False, burst_ctrl & 0xFF),
+        ]
+
+
+class _Device:
+    """Registers of one device in configuration mode."""
+
+    def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
+        self._sensor = sensor
+        self._stream = stream
+
+    async def write(self, register: Register, value: int, *, high: bool = False) -> None:
+        await self._stream.write(epson.write(register, value, high=high))
+        await asyncio.sleep(WRITE_INTERVAL)
+
+    async def read(self, register: Register) -> int:
+        self._stream.discard()
+        await self._stream.write(epson.read(register))
+        received = b""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                while True:
+                    received += (await self._stream.read())[0]
+                    value = epson.find_reply(received, register.address)
+                    if value is not None:
+                        return value
+        expected = f"expected {register.address:02X} xx xx 0D for register {register.address:02X}"
+        if received:
+            raise WrongDeviceError(
+                f"{self._stream.label}: no Epson accelerometer: {expected} of window"
+                f" {register.window}, got {received[-16:].hex(' ')}"
+            )
+        raise NoAnswerError(
+            f"{self._stream.label}: no answer: {expected} of window {register.window}, got nothing;"
+            " check cable, power and settings.baud_rate"
+        )
+
+    async def wait_clear(self, register: Register, bits: int, doing: str) -> int:
+        try:
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while (value := await self.read(register)) & bits:
+                    pass
+        except TimeoutError as error:
+            raise NoAnswerError(
+                f"{self._stream.label}: the device is still {doing} after {SETTLE_TIMEOUT:g} s"
+            ) from error
+        return value
+
+    async def stop(self) -> None:
+        """Enter configuration mode and let what was on its way pass."""
+        await self.write(epson.MODE_CTRL, epson.CONFIGURATION, high=True)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while True:
+                    async with asyncio.timeout(QUIET):
+                        await self._stream.read()
+
+    async def identify(self) -> None:
+        """Find the device, streaming or not, in the middle of a command or not."""
+        failure: DeviceError | None = None
+        for _ in range(ATTEMPTS):
+            await self.stop()
+            try:
+                found = await self.read(epson.ID)
+            except (NoAnswerError, WrongDeviceError) as error:
+                failure = error
+                await self._stream.write(bytes([epson.DELIMITER]))
+                continue
+            if found == epson.DEVICE_ID:
+                return
+            failure = WrongDeviceError(
+                f"{self._stream.label}: expected ID {epson.DEVICE_ID:04X}, got {found:04X}"
+            )
+        if failure is not None:
+            raise failure
+
+    async def information(self) -> DeviceInformation:
+        """Read what the device says about itself; refuse it if it is not the one expected."""
+        await self.wait_clear(epson.GLOB_CMD, epson.NOT_READY, "starting")
+        model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
+        serial_number = epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
+        named = re.search(r"A\d{3}", self._sensor.model.upper())
+        for what, wanted, found, differs in (
+            ("model", self._sensor.model, model, named and named[0] not in model),
+            ("serial number", self._sensor.serial_number, serial_number, True),
+        ):
+            if wanted and wanted != found and differs:
+                raise WrongDeviceError(
+                    f"{self._stream.label}: expected {what} {wanted!r}, got {found!r}"
+                )
+        version = await self.read(epson.VERSION)
+        high = await self.read(epson.TEMP_HIGH)
+        low = await self.read(Register(epson.TEMP_HIGH.window, epson.TEMP_HIGH.address + 2))
+        count = (high << 16 | low) - (1 << 32) * (high >> 15)
+        diagnosis = await self.read(epson.DIAG_STAT)
+        return DeviceInformation(
+            sensor=self._sensor.name,
+            model=model,
+            serial_number=serial_number,
+            firmware=f"{version >> 8:X}.{version & 0xFF:X}",
+            temperature=round(epson.temperature(count), 2) if count else None,
+            details={"DIAG_STAT": f"{diagnosis:04X}"} if diagnosis else {},
+        )
+
+    async def sampling_rate(self) -> float | None:
+        code = await self.read(epson.SMPL_CTRL) >> 8
+        return next((float(rate) for rate, c in epson.RATES.items() if c == code), None)
+
+    async def configure(self, configuration: _Configuration) -> None:
+        """Set every register that matters, and read each back."""
+        for register, high, value in configuration.writes():
+            await self.write(register, value, high=high)
+            if register is epson.FILTER_CTRL:
+                await self.wait_clear(register, epson.FILTER_BUSY, "changing its filter")
+        for register, high, value in configuration.writes():
+            found = await self.read(register) >> (8 if high else 0) & 0xFF
+            if found != value:
+                raise WrongDeviceError(
+                    f"{self._stream.label}: register {register.address + high:02X} of window"
+                    f" {register.window} was set to {value:02X} and reads {found:02X}:"
+                    " this model does not have that setting"
+                )
+
+
+class EpsonSession:
+    """An accelerometer, set up and quiet until :meth:`read`."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        stream: ByteStream,
+        configuration: _Configuration,
+        information: DeviceInformation,
+    ) -> None:
+        self.information = (information,)
+        self._sensor = sensor
+        self._stream = stream
+        self._configuration = configuration
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Start sampling and yield blocks and events."""
+        configuration = self._configuration
+        full_scale = configuration.settings.full_scale * epson.COUNTS_PER_G
+        decoder = BurstDecoder(
+            self._sensor.name,
+            configuration.burst,
+            fields=configuration.fields,
+            sampling_rate=configuration.sampling_rate,
+            full_scale_counts=min(round(full_scale), 2**31 - 1),
+        )
+        self._stream.discard()
+        await self._stream.write(epson.write(epson.MODE_CTRL, epson.SAMPLING, high=True))
+        # filters settle before the first frame
+        patience = STALLED + 1.0
+        while True:
+            try:
+                async with asyncio.timeout(patience):
+                    received, at = await self._stream.read()
+            except TimeoutError as error:
+                raise NoAnswerError(
+                    f"{self._stream.label}: nothing came for {patience:g} s;"
+                    f" expected {configuration.sampling_rate} frames a second"
+                ) from error
+            patience = STALLED
+            for item in decoder.receive(received, at):
+                yield item
+
+
+class EpsonDriver:
+    """See :class:`daq.drivers.base.DriverType`."""
+
+    name = "epson"
+    summary = "Epson M-A352 or M-A370 quartz accelerometer on a UART"
+    settings = EpsonSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return int32: counts, and those of the temperature too."""
+        return np.dtype(np.int32)
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[EpsonSession]:
+        """Open the port, identify the accelerometer and set it up."""
+        sensor = sensors[0]
+        if len(sensors) > 1:
+            names = ", ".join(repr(other.name) for other in sensors)
+            raise BenchFileError(f"port {sensor.port} is given to {names}; an Epson has its own")
+        configuration = _Configuration.of(sensor)
+        async with open_port(
+            sensor.port,
+            clock,
+            label=f"sensor {sensor.name!r} on {sensor.port}",
+            baud_rate=configuration.settings.baud_rate,
+        ) as stream:
+            device = _Device(sensor, stream)
+            await device.identify()
+            try:
+                information = await device.information()
+                await device.configure(configuration)
+                actual = await device.sampling_rate()
+                information = replace(information, sampling_rate=actual)
+                yield EpsonSession(sensor, stream, configuration, information)
+            finally:
+                with contextlib.suppress(DeviceError):
+                    await device.write(epson.MODE_CTRL, epson.CONFIGURATION, high=True)
+
+
+DRIVER = EpsonDriver()
