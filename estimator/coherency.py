@@ -44,6 +44,10 @@ class Coherency:
     flags: IntArray
     duplicates: BoolArray
 
+    def block(self, some: slice) -> Coherency:
+        """Return the same for some frequencies only."""
+        return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])
+
     def part(self, channels: list[int]) -> Coherency:
         """Return the same for some channels only."""
         square = np.ix_(range(len(self.psd)), channels, channels)

@@ -26,8 +26,13 @@ from estimator.self_noise import Flag, SelfNoise
 from estimator.uncertainty import delta_variance, score_interval
 
 if TYPE_CHECKING:
-    from estimator.arrays import BoolArray, ComplexArray, FloatArray
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
     from estimator.coherency import Coherency
+
+    _Inverse = tuple[ComplexArray, BoolArray]
+
+
+FREQUENCIES = 256  # worked on at a time: what the processor's cache holds
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,42 +95,58 @@ def estimate(
     given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool
 ) -> SelfNoise:
     """Do what `three_sensor` does, from a matrix that has been checked and normalised."""
-    shape = given.psd.shape
-    noise, deviation, low, high = (np.full(shape, np.nan) for _ in range(4))
+    n_freqs = len(given.psd)
+    blocks = [
+        _estimate(given.block(slice(low, low + FREQUENCIES)), dims, n_effective, correct=correct)
+        for low in range(0, n_freqs, FREQUENCIES)
+    ]
+    noise, deviation, low, high, flags = (
+        np.concatenate(parts) for parts in zip(*blocks, strict=True)
+    )
+    flags[noise <= 0] |= Flag.NEGATIVE
+    unknown = (flags & ~Flag.NEGATIVE) != 0
+    flags[unknown] &= ~Flag.NEGATIVE
+    noise, deviation, low, high = (
+        np.where(unknown, np.nan, given.psd * part) for part in (noise, deviation, low, high)
+    )
+    with np.errstate(divide="ignore"):
+        cov = deviation / np.abs(noise)
+    return SelfNoise("three-sensor", noise, cov, low, high, flags)
+
+
+def _estimate(
+    given: Coherency, dims: tuple[int, ...], n_effective: float, *, correct: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Noise, its deviation and interval, all in parts of the channel's PSD; flags."""
+    noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
     flags = given.flags.copy()
-    first = np.concatenate([[0], np.cumsum(dims)])
+    first = [int(start) for start in np.cumsum([0, *dims])]
+    inverses: dict[tuple[int, int, int], _Inverse] = {}
     for i in range(len(dims)):
         others, d = _counterparts(dims, i)
         check_averages(n_effective, d)
+        leading = {j: slice(first[j], first[j] + d) for j in others}
         rows = slice(first[i], first[i] + min(d, dims[i]))
         flags[:, rows.stop : first[i + 1]] |= Flag.NO_COUNTERPART
-        pairs = [
-            _pair(given, rows, slice(first[j], first[j] + d), slice(first[k], first[k] + d))
-            for j, k in itertools.combinations(others, 2)
-        ]
+        pairs = []
+        for j, k in itertools.combinations(others, 2):
+            if (j, k, d) not in inverses:
+                inverses[j, k, d] = inverse(given.matrix[:, leading[j], leading[k]])
+            pairs.append(_pair(given, rows, (leading[j], leading[k]), inverses[j, k, d]))
         weights = np.array([pair.regular for pair in pairs], dtype=np.float64)
         n_regular = weights.sum(axis=0)
         flags[n_regular == 0, rows] |= Flag.SINGULAR
         weights /= np.maximum(n_regular, 1)
-        gain = 1 / (1 - d / n_effective) if correct else 1.0
-        mean = gain * sum(
-            weight[:, None] * pair.cross.real for weight, pair in zip(weights, pairs, strict=True)
+        gain, averages = (
+            (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
         )
+        mean = gain * np.einsum("tf,tfr->fr", weights, [pair.cross.real for pair in pairs])
         variance, slope = _moments(given.matrix, rows, pairs, weights)
-        variance, slope = gain**2 * variance, gain * slope
-        averages = n_effective - d if correct else n_effective
+        variance, slope = gain**2 * np.maximum(variance, 0), gain * slope
         noise[:, rows] = mean
         deviation[:, rows] = np.sqrt(variance / averages)
         low[:, rows], high[:, rows] = score_interval(mean, variance, slope, averages=averages)
-    flags[noise <= 0] |= Flag.NEGATIVE
-    unknown = (flags & ~Flag.NEGATIVE) != 0
-    noise, deviation, low, high = (
-        np.where(unknown, np.nan, given.psd * part) for part in (noise, deviation, low, high)
-    )
-    flags[unknown] &= ~Flag.NEGATIVE
-    with np.errstate(divide="ignore"):
-        cov = deviation / np.abs(noise)
-    return SelfNoise("three-sensor", noise, cov, low, high, flags)
+    return noise, deviation, low, high, flags
 
 
 def _counterparts(dims: tuple[int, ...], i: int) -> tuple[list[int], int]:
@@ -134,10 +155,9 @@ def _counterparts(dims: tuple[int, ...], i: int) -> tuple[list[int], int]:
     return [j for j, n in enumerate(dims) if j != i and n >= d], d
 
 
-def _pair(given: Coherency, i: slice, j: slice, k: slice) -> _Pair:
-    S = given.matrix
+def _pair(given: Coherency, i: slice, others: tuple[slice, slice], inverse_jk: _Inverse) -> _Pair:
+    S, (j, k), (inv_jk, regular) = given.matrix, others, inverse_jk
     S_ij, S_ik = S[:, i, j], S[:, i, k]
-    inv_jk, regular = inverse(S[:, j, k])
     P = S_ik @ inv_jk
     Q = S_ij @ inv_jk.conj().swapaxes(1, 2)
     # Eq. (25); its conjugate, j and k swapped, is the other half of (26).
@@ -146,7 +166,7 @@ def _pair(given: Coherency, i: slice, j: slice, k: slice) -> _Pair:
     used[j] = used[k] = True
     used_or_target = used.copy()
     used_or_target[i] = True
-    regular &= ~given.duplicates[:, used][:, :, used_or_target].any(axis=(1, 2))
+    regular = regular & ~given.duplicates[:, used][:, :, used_or_target].any(axis=(1, 2))
     regular &= ~(given.flags[:, used] & Flag.DEAD_CHANNEL).any(axis=1)
     return _Pair(j, k, P, Q, cross, regular)
 
@@ -154,34 +174,23 @@ def _pair(given: Coherency, i: slice, j: slice, k: slice) -> _Pair:
 def _moments(
     S: ComplexArray, i: slice, pairs: list[_Pair], weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """``v0`` and ``m`` of `estimator.uncertainty` for the weighted mean of the pairs' estimates."""
-    if len(pairs) == 1:
-        (pair,) = pairs
-        uu = _residual(S, i, pair.j, pair.P)
-        vv = _residual(S, i, pair.k, pair.Q)
-        uv = pair.cross
-        return (uu * vv + (uv**2).real) / 2, (uu + vv + 2 * uv.real) / 4
+    """``v0`` and ``m`` of `estimator.uncertainty` for the weighted mean of the pairs' estimates.
+
+    With W the rows a, b of all pairs, M = W^H omega W, where omega holds half of each pair's
+    weight; so ``tr(M S M S) = tr(omega G omega G)``, where G = W S W^H are the residuals' spectra.
+    """
     n_freqs, n_rows = pairs[0].cross.shape
-    M = np.zeros((n_freqs, n_rows, S.shape[1], S.shape[1]), dtype=np.complex128)
-    c = np.zeros((n_freqs, n_rows, S.shape[1]), dtype=np.complex128)
-    for r in range(n_rows):
-        c[:, r, i.start + r] = weights.sum(axis=0)
-    for weight, pair in zip(weights[:, :, None, None] / 2, pairs, strict=True):
-        c[:, :, pair.j] -= weight * pair.P
-        c[:, :, pair.k] -= weight * pair.Q
-        block = weight[..., None] * pair.P.conj()[..., :, None] * pair.Q[..., None, :]
-        M[:, :, pair.j, pair.k] += block
-        M[:, :, pair.k, pair.j] += block.conj().swapaxes(-1, -2)
-    for r in range(n_rows):
-        M[:, r, i.start + r, :] += c[:, r]
-        M[:, r, :, i.start + r] += c[:, r].conj()
-        M[:, r, i.start + r, i.start + r] = weights.sum(axis=0)
-    slope = np.einsum("frp,fpq,frq->fr", c, S, c.conj(), optimize=True).real
-    return delta_variance(S[:, None], M), slope
-
-
-def _residual(S: ComplexArray, i: slice, j: slice, P: ComplexArray) -> FloatArray:
-    """PSD of ``X_i - P X_j`` for each channel of i, shape (n_freqs, rows)."""
-    power = np.einsum("frr->fr", S[:, i, i]).real
-    power = power - 2 * np.einsum("frc,frc->fr", P, S[:, i, j].conj()).real
-    return np.asarray(power + np.einsum("frc,frc->fr", P @ S[:, j, j], P.conj()).real)
+    n = 2 * len(pairs)
+    W = np.zeros((n_freqs, n_rows, n, S.shape[1]), dtype=np.complex128)
+    W[:, np.arange(n_rows), :, i.start + np.arange(n_rows)] = 1
+    omega = np.zeros((n_freqs, 1, n, n))
+    for t, (weight, pair) in enumerate(zip(weights / 2, pairs, strict=True)):
+        a, b = 2 * t, 2 * t + 1
+        W[:, :, a, pair.j] = -pair.P
+        W[:, :, b, pair.k] = -pair.Q
+        omega[:, 0, a, b] = omega[:, 0, b, a] = weight
+    WS = (W.reshape(n_freqs, n_rows * n, -1) @ S).reshape(W.shape)
+    G = WS @ W.conj().swapaxes(-1, -2)
+    row = omega.sum(axis=2, keepdims=True)
+    slope = (row @ G @ row.swapaxes(-1, -2))[:, :, 0, 0].real
+    return delta_variance(G, omega), slope

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
 
-def delta_variance(csm: ComplexArray, differential: ComplexArray) -> FloatArray:
+def delta_variance(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
     """Variance of an estimate times the number of averages.
 
     Parameters
