@@ -1,0 +1,338 @@
+"""Reads a recording: growing, killed or closed, by the same code.
+
+A file is opened as a SWMR reader, which works in all three states. What ``/committed`` counts is
+what there is; longer datasets are a tail that was never acknowledged.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import h5py
+import numpy as np
+
+from daq.bench import parse
+from daq.errors import BenchFileError, NotARecordingError, RecordingError
+from daq.protocols.block import Event, HostTime
+from daq.recording import layout
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from daq.bench_model import Bench, Channel
+
+
+class _Rows:
+    """The committed rows of a table, read once each."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._parts: list[NDArray[np.void]] = []
+        self.n_rows = 0
+
+    def take(self, n_rows: int) -> None:
+        """Read up to ``n_rows``."""
+        if n_rows > self.n_rows:
+            self._dataset.id.refresh()
+            self._parts.append(self._dataset[self.n_rows : n_rows])
+            self.n_rows = n_rows
+
+    def rows(self) -> NDArray[np.void]:
+        """Return all rows."""
+        if not self._parts:
+            return np.zeros(0, self._dataset.dtype)
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0]
+
+
+class SensorRecord:
+    """What has been committed of one sensor; grows when its recording is refreshed."""
+
+    def __init__(self, group: h5py.Group) -> None:
+        attributes = group.attrs
+        self.name: str = group.name.rpartition("/")[2]
+        self.model: str = attributes["model"]
+        self.serial_number: str = attributes["serial_number"]
+        self.driver: str = attributes["driver"]
+        self.port: str = attributes["port"]
+        self.clock: str = attributes["clock"]
+        """Sensors of one clock name are sampled by one clock."""
+        self.sampling_rate = float(attributes["sampling_rate"])
+        """In Hz, as the device says; nominal where it does not."""
+        self._samples: h5py.Dataset = group["samples"]
+        self._instants: h5py.Dataset | None = group.get("instants")
+        self.channels: tuple[Channel, ...] = layout.channels_of(self._samples.attrs)
+        self.dtype: np.dtype[Any] = self._samples.dtype
+        self.chunk_rows: int = self._samples.chunks[0]
+        """Rows a chunk holds: reading multiples of it is fastest."""
+        self._blocks = _Rows(group["blocks"])
+        self._gaps = _Rows(group["gaps"])
+        self.n_samples = 0
+        """Number of committed rows of samples."""
+
+    @property
+    def polled(self) -> bool:
+        """Whether the instant of every sample is known."""
+        return self._instants is not None
+
+    @property
+    def blocks(self) -> NDArray[np.void]:
+        """Committed blocks, dtype :data:`daq.recording.layout.BLOCK_DTYPE`."""
+        return self._blocks.rows()
+
+    @property
+    def gaps(self) -> NDArray[np.void]:
+        """Committed gaps, dtype :data:`daq.recording.layout.GAP_DTYPE`."""
+        return self._gaps.rows()
+
+    def counts(self, first_row: int = 0, last_row: int | None = None) -> NDArray[Any]:
+        """Return raw counts.
+
+        Parameters
+        ----------
+        first_row, last_row : int
+            Rows, ``last_row`` not included; up to ``n_samples`` if not given.
+
+        Returns
+        -------
+        ndarray, shape (last_row - first_row, n_channels)
+
+        Raises
+        ------
+        IndexError
+            If these rows were not committed.
+        RecordingError
+            If the file is damaged there.
+        """
+        return self._read(self._samples, first_row, last_row)
+
+    def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
+        """Return the host monotonic instants of samples, in ns, of a polled sensor.
+
+        Raises
+        ------
+        IndexError
+            If these rows were not committed.
+        RecordingError
+            If the sensor is not polled, or the file damaged.
+        """
+        if self._instants is None:
+            raise RecordingError(f"sensor {self.name!r} has no instants of single samples")
+        return self._read(self._instants, first_row, last_row)
+
+    def _read(self, dataset: h5py.Dataset, first_row: int, last_row: int | None) -> NDArray[Any]:
+        last_row = self.n_samples if last_row is None else last_row
+        if not 0 <= first_row <= last_row <= self.n_samples:
+            raise IndexError(
+                f"rows {first_row} to {last_row} of sensor {self.name!r}: {self.n_samples} are"
+                " committed"
+            )
+        try:
+            rows: NDArray[Any] = dataset[first_row:last_row]
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(
+                f"{dataset.file.filename}: sensor {self.name!r} is damaged between rows"
+                f" {first_row} and {last_row}: {error}"
+            ) from error
+        return rows
+
+    def take(self, counts: NDArray[np.int64]) -> bool:
+        """Take over what was committed (a row of ``/committed``); return whether that is news."""
+        before = self.n_samples, self._blocks.n_rows, self._gaps.n_rows
+        self._blocks.take(int(counts[layout.BLOCKS]))
+        self._gaps.take(int(counts[layout.GAPS]))
+        blocks = self._blocks.rows()
+        ends = blocks["first_row"] + blocks["n_samples"]
+        # Samples and blocks end together, even if a crash left one of the two numbers behind.
+        n_whole = int(np.searchsorted(ends, int(counts[layout.ROWS]), side="right"))
+        n_samples = int(ends[n_whole - 1]) if n_whole else 0
+        if n_samples > self.n_samples:
+            self._samples.id.refresh()
+            if self._instants is not None:
+                self._instants.id.refresh()
+            self.n_samples = n_samples
+        return before != (self.n_samples, self._blocks.n_rows, self._gaps.n_rows)
+
+
+class Recording:
+    """A recording that is open for reading."""
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self._file = file
+        attributes = file.attrs
+        self.run_id: str = attributes["run_id"]
+        self.created = datetime.fromisoformat(attributes["created"])
+        """UTC."""
+        self.created_at = HostTime(
+            int(attributes["created_monotonic_ns"]), int(attributes["created_utc_ns"])
+        )
+        self.software: str = attributes["software"]
+        self.operator: str = attributes["operator"]
+        self.location: str = attributes["location"]
+        self.bench_text: str = attributes["bench"]
+        self.control: tuple[int, str] | None = None
+        """Port and token of the recorder that writes this file (:mod:`daq.control`)."""
+        if "control_port" in attributes:
+            self.control = int(attributes["control_port"]), attributes["control_token"]
+        self._committed: h5py.Dataset = file["committed"]
+        self.sensors = tuple(
+            SensorRecord(file["sensors"][name]) for name in self._committed.attrs["sensors"]
+        )
+        """In the order of the bench."""
+        self._events = _Rows(file["events"])
+        self.closed = False
+        """Whether it was closed properly: nothing more will come."""
+        self.refresh()
+
+    @classmethod
+    def open(cls, path: str | Path) -> Recording:
+        """Open a recording, whether it grows, was killed, or is closed.
+
+        Raises
+        ------
+        NotARecordingError
+            If it is something else, truncated, or of a newer format.
+        RecordingError
+            If it cannot be read.
+        """
+        path = Path(path)
+        check_superblock(path)
+        try:
+            file = h5py.File(path, "r", libver="latest", swmr=True)
+        except (OSError, RuntimeError) as error:
+            raise NotARecordingError(f"{path}: cannot be opened as HDF5: {error}") from error
+        try:
+            check_format(path, file)
+            return cls(path, file)
+        except (KeyError, OSError, RuntimeError, ValueError) as error:
+            file.close()
+            if isinstance(error, RecordingError):
+                raise
+            raise NotARecordingError(f"{path}: a damaged recording: {error}") from error
+
+    @property
+    def bench(self) -> Bench | None:
+        """The bench it was recorded with; None for recordings from elsewhere."""
+        if not self.bench_text:
+            return None
+        with contextlib.suppress(BenchFileError):
+            return parse(self.bench_text, str(self.path), check=False)
+        return None
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What has happened so far."""
+        return tuple(
+            Event(
+                sensor=row["sensor"].decode(),
+                kind=row["kind"].decode(),
+                text=row["text"].decode(),
+                received=HostTime(int(row["monotonic_ns"]), int(row["utc_ns"])),
+            )
+            for row in self._events.rows()
+        )
+
+    def sensor(self, name: str) -> SensorRecord:
+        """Return the sensor of this name."""
+        for sensor in self.sensors:
+            if sensor.name == name:
+                return sensor
+        raise KeyError(name)
+
+    def results(self) -> dict[str, tuple[dict[str, NDArray[Any]], dict[str, Any]]]:
+        """Return what was written when the run was closed: arrays and attributes by method."""
+        group = self._file.get("results", {})
+        return {
+            method: ({key: entry[key][...] for key in entry}, dict(entry.attrs))
+            for method, entry in group.items()
+        }
+
+    def refresh(self) -> bool:
+        """Take over what was committed since; return whether there was anything.
+
+        Raises
+        ------
+        RecordingError
+            If the file is damaged.
+        """
+        if self.closed:
+            return False
+        try:
+            self._committed.id.refresh()
+            counts: NDArray[np.int64] = self._committed[...]
+            news = [s.take(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
+            n_events = self._events.n_rows
+            self._events.take(int(counts[-1, layout.EVENTS]))
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(f"{self.path}: a damaged recording: {error}") from error
+        self.closed = bool(counts[-1, layout.CLOSED])
+        return any(news) or self._events.n_rows > n_events or self.closed
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def check_superblock(path: Path) -> None:
+    """Refuse what is no HDF5 file, or was closed and then cut short."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(48)
+        n_bytes = path.stat().st_size
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if head[:8] != b"\x89HDF\r\n\x1a\n":
+        raise NotARecordingError(f"{path}: not a huddle recording, not even an HDF5 file")
+    # Superblock version 3: consistency flags in byte 11, end of file in bytes 28 to 35.
+    if len(head) == 48 and head[8] == 3 and head[11] == 0:
+        end = struct.unpack_from("<Q", head, 28)[0]
+        if end > n_bytes:
+            raise NotARecordingError(
+                f"{path}: truncated: {n_bytes} of {end} bytes are there; fetch it again"
+            )
+
+
+def check_format(path: Path, file: h5py.File) -> None:
+    """Refuse HDF5 files that are no recordings, and formats newer than this program."""
+    found = file.attrs.get("format")
+    if found != layout.FORMAT:
+        what = "it does not say what it is" if found is None else f"it says format={found!r}"
+        raise NotARecordingError(
+            f"{path}: an HDF5 file but not a huddle recording: {what};"
+            f" expected format={layout.FORMAT!r}"
+        )
+    number = file.attrs.get("format_version")
+    if not isinstance(number, (int, np.integer)) or number < 1:
+        raise NotARecordingError(f"{path}: format_version {number!r}; expected 1")
+    if number > layout.FORMAT_VERSION:
+        raise NotARecordingError(
+            f"{path}: written by a newer huddle (format {number}); this one reads up to"
+            f" format {layout.FORMAT_VERSION}: update it"
+        )
+
+
+@contextlib.contextmanager
+def open_recording(path: str | Path) -> Iterator[Recording]:
+    """Open a recording for the time of a ``with`` block."""
+    with Recording.open(path) as recording:
+        yield recording

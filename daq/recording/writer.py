@@ -1,0 +1,505 @@
+"""Writes a recording so that what was acknowledged survives kill -9 and power loss.
+
+Theory of operation
+-------------------
+All groups, datasets and attributes are made under a temporary name; then the file becomes SWMR
+(single writer, multiple readers) and gets its own name, so a recording never exists half made.
+From then on rows are only added. Samples go to disk in whole compressed chunks, never in parts,
+which would be rewritten elsewhere and inflate the file; so a sample waits up to one chunk.
+
+``commit`` flushes and fsyncs what was added, then writes how much that is to ``/committed``,
+fsyncs again, and only then acknowledges. ``/committed`` has fixed size and place. A crash in the
+middle of writing it leaves some of its numbers old and some new, each of which counts rows that
+are safely there; readers cut all datasets of a sensor where the shortest ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import uuid
+import zlib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.recording import layout
+from daq.recording.locking import WriterLock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench_model import Bench
+    from daq.protocols.block import Block, Event, HostTime
+    from daq.recording.layout import SensorLayout
+
+LIBVER = ("v110", "v110")
+_MERGED_SECONDS = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class SensorCounts:
+    """How much of one sensor is safely on disk."""
+
+    rows: int
+    blocks: int
+    gaps: int
+
+
+@dataclass(frozen=True, slots=True)
+class Committed:
+    """What is safely on disk: the acknowledgment."""
+
+    sensors: dict[str, SensorCounts]
+    events: int
+    closed: bool = False
+
+
+class _Table:
+    """A dataset of rows that are added in small numbers; unfiltered, so written in place."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._waiting: list[NDArray[np.void]] = []
+        self.n_rows = 0
+
+    def add(self, row: NDArray[np.void]) -> None:
+        self._waiting.append(row)
+
+    def write(self) -> None:
+        if not self._waiting:
+            return
+        rows = np.concatenate(self._waiting)
+        self._dataset.resize(self.n_rows + len(rows), axis=0)
+        self._dataset[self.n_rows :] = rows
+        self.n_rows += len(rows)
+        self._waiting.clear()
+
+
+class _Chunked:
+    """A dataset that is written in whole chunks; what does not fill one waits."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._buffer = np.empty(dataset.chunks, dataset.dtype)
+        self._filled = 0
+        self.n_written = 0
+
+    def add(self, rows: NDArray[Any]) -> None:
+        length = len(self._buffer)
+        taken = min(len(rows), length - self._filled) if self._filled else 0
+        if taken:
+            self._buffer[self._filled : self._filled + taken] = rows[:taken]
+            self._filled += taken
+            if self._filled == length:
+                self._filled = 0
+                self._write(self._buffer)
+        whole = taken + (len(rows) - taken) // length * length
+        if whole > taken:
+            self._write(rows[taken:whole])
+        rest = rows[whole:]
+        if len(rest):
+            self._buffer[: len(rest)] = rest
+            self._filled = len(rest)
+
+    def finish(self) -> None:
+        """Write what waits, as a last, partial chunk."""
+        rest, self._filled = self._filled, 0
+        if rest:
+            self._write(self._buffer[:rest])
+
+    def _write(self, rows: NDArray[Any]) -> None:
+        self._dataset.resize(self.n_written + len(rows), axis=0)
+        self._dataset[self.n_written :] = rows
+        self.n_written += len(rows)
+
+
+class _SensorWriter:
+    """The rows of one sensor.
+
+    Small blocks that follow each other without a gap become one row of ``blocks`` until that is a
+    tenth of a second long: at 200 Hz a serial port hands over three or four samples at a time, and
+    their rows would be larger than they.
+    """
+
+    def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
+        self.samples = _Chunked(group["samples"])
+        self.instants = _Chunked(group["instants"]) if sensor.polled else None
+        self.blocks = _Table(group["blocks"])
+        self.gaps = _Table(group["gaps"])
+        self._layout = sensor
+        self._merged_length = max(1, round(sensor.sampling_rate * _MERGED_SECONDS))
+        self._current: NDArray[np.void] | None = None
+        self._crc32 = 0
+        self._whole: list[NDArray[np.void]] = []
+        self._n_rows = 0
+
+    def append(self, block: Block) -> None:
+        counts = self._converted(block)
+        merged = self._merge(block)
+        self._crc32 = zlib.crc32(counts.data, self._crc32 if merged else 0)
+        self._n_rows += block.n_samples
+        self.samples.add(counts)
+        if self.instants is not None:
+            if block.instants_ns is None:
+                raise RecordingError(f"sensor {block.sensor!r}: a polled block without instants")
+            self.instants.add(block.instants_ns)
+
+    def collect(self) -> None:
+        """Hand the rows of blocks whose samples are all written to their table."""
+        written = self.samples.n_written
+        if self.instants is not None:
+            written = min(written, self.instants.n_written)
+        done = 0
+        for row in self._whole:
+            if row["first_row"][0] + row["n_samples"][0] > written:
+                break
+            self.blocks.add(row)
+            done += 1
+        del self._whole[:done]
+
+    def finish(self) -> None:
+        """Write everything that waits."""
+        self._end_current()
+        self.samples.finish()
+        if self.instants is not None:
+            self.instants.finish()
+
+    @property
+    def committable_rows(self) -> int:
+        """Number of rows up to the end of the last block that was collected."""
+        if self._whole:
+            return int(self._whole[0]["first_row"][0])
+        return self._n_rows if self._current is None else int(self._current["first_row"][0])
+
+    def _merge(self, block: Block) -> bool:
+        """Continue the current block with this one, or end it and begin another."""
+        current = self._current
+        if (
+            current is not None
+            and block.first_sample == current["first_sample"][0] + current["n_samples"][0]
+            and int(block.flags) == current["flags"][0]
+            and not block.reason
+            and current["n_samples"][0] + block.n_samples <= self._merged_length
+        ):
+            current["n_samples"] += block.n_samples
+            current["monotonic_ns"] = block.received.monotonic_ns
+            current["utc_ns"] = block.received.utc_ns
+            return True
+        self._end_current()
+        counter = layout.NO_COUNTER if block.device_counter is None else block.device_counter
+        self._current = np.array(
+            [
+                (
+                    block.first_sample,
+                    self._n_rows,
+                    block.n_samples,
+                    block.received.monotonic_ns,
+                    block.received.utc_ns,
+                    counter,
+                    int(block.flags),
+                    0,
+                )
+            ],
+            layout.BLOCK_DTYPE,
+        )
+        return False
+
+    def _end_current(self) -> None:
+        if self._current is not None:
+            self._current["crc32"] = layout.block_crc32(self._current, self._crc32)
+            self._whole.append(self._current)
+            self._current = None
+
+    def _converted(self, block: Block) -> NDArray[Any]:
+        expected = len(self._layout.channels)
+        if block.counts.ndim != 2 or block.counts.shape[1] != expected:
+            raise RecordingError(
+                f"sensor {block.sensor!r}: a block of shape {block.counts.shape};"
+                f" expected (n_samples, {expected})"
+            )
+        counts: NDArray[Any] = np.ascontiguousarray(block.counts, self._layout.dtype)
+        safe = np.can_cast(block.counts.dtype, self._layout.dtype, "safe")
+        if not safe and not np.array_equal(counts, block.counts):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: counts of type {block.counts.dtype} do not fit"
+                f" {self._layout.dtype}"
+            )
+        return counts
+
+
+class RecordingWriter:
+    """The one writer of a recording; not thread-safe, but may be used from any one thread."""
+
+    def __init__(
+        self, path: Path, file: h5py.File, sensors: Sequence[SensorLayout], lock: WriterLock
+    ) -> None:
+        self.path = path
+        self._file = file
+        self._lock = lock
+        self._sensors = {s.name: _SensorWriter(file["sensors"][s.name], s) for s in sensors}
+        self._events = _Table(file["events"])
+        self._committed = file["committed"]
+        self._failed = False
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        bench: Bench | None = None,
+        *,
+        sensors: Sequence[SensorLayout],
+        created: HostTime,
+        control: tuple[int, str] | None = None,
+        attributes: dict[str, str] | None = None,
+        chunk_seconds: float = 1.0,
+    ) -> RecordingWriter:
+        """Create a recording.
+
+        Parameters
+        ----------
+        path : path
+            Must not exist; its directory is made.
+        bench : Bench, optional
+            What is recorded.
+        sensors : sequence of SensorLayout
+            In the order of the bench.
+        created : HostTime
+            Now.
+        control : (port, token), optional
+            Where the writing recorder takes commands (:mod:`daq.control`).
+        attributes : dict, optional
+            More attributes of the file, such as its origin.
+        chunk_seconds : float
+            Length of a chunk; longer ones read faster, but a sample waits that long.
+
+        Raises
+        ------
+        RecordingError
+            If the file exists or cannot be written.
+        """
+        path = Path(path)
+        if path.exists():
+            raise RecordingError(f"{path}: exists already; expected a new file")
+        temporary = path.with_name(f".{path.name}.new")
+        with _as_recording_error(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Little cache: chunks are written whole and never looked at again.
+            file = h5py.File(temporary, "w", libver=LIBVER, rdcc_nbytes=64 * 1024)
+            try:
+                _describe(file, bench, created, control, attributes or {})
+                _make_datasets(file, sensors, chunk_seconds)
+                file.swmr_mode = True
+                writer = cls(path, file, sensors, WriterLock(temporary))
+                writer._sync()
+                temporary.rename(path)
+                _sync_directory(path.parent)
+            except BaseException:
+                with contextlib.suppress(OSError, RuntimeError):
+                    file.close()
+                temporary.unlink(missing_ok=True)
+                raise
+        return writer
+
+    def append(self, block: Block) -> None:
+        """Take a block; it is safe once a later ``commit`` counts it."""
+        with self._guarded():
+            self._sensors[block.sensor].append(block)
+
+    def gap(
+        self, sensor: str, first_sample: int, missing: int, *, reason: str, estimated: bool = False
+    ) -> None:
+        """Record that samples from ``first_sample`` on are missing."""
+        row = (first_sample, missing, estimated, _fixed(reason, 100))
+        self._sensors[sensor].gaps.add(np.array([row], layout.GAP_DTYPE))
+
+    def event(self, event: Event) -> None:
+        """Record an event."""
+        row = (
+            event.received.monotonic_ns,
+            event.received.utc_ns,
+            _fixed(event.sensor, 64),
+            _fixed(event.kind, 32),
+            _fixed(event.text, 200),
+        )
+        self._events.add(np.array([row], layout.EVENT_DTYPE))
+
+    def commit(self) -> Committed:
+        """Make safe what can be made safe, then say how much that is.
+
+        Raises
+        ------
+        RecordingError
+            If it cannot be written (disk full, device gone); what earlier commits acknowledged
+            stays.
+        """
+        return self._commit(closed=False)
+
+    def close(self) -> Committed:
+        """Write everything, commit it, and close the file.
+
+        Raises
+        ------
+        RecordingError
+            If it cannot be written; the file is closed all the same.
+        """
+        try:
+            with self._guarded():
+                for sensor in self._sensors.values():
+                    sensor.finish()
+            return self._commit(closed=True)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file without writing what waits; ``commit`` has what is safe."""
+        try:
+            with contextlib.suppress(OSError, RuntimeError):
+                self._file.close()
+        finally:
+            self._lock.release()
+
+    def _commit(self, *, closed: bool) -> Committed:
+        with self._guarded():
+            counts = np.zeros(self._committed.shape, np.int64)
+            for number, sensor in enumerate(self._sensors.values()):
+                sensor.collect()
+                sensor.blocks.write()
+                sensor.gaps.write()
+                counts[number] = sensor.committable_rows, sensor.blocks.n_rows, sensor.gaps.n_rows
+            self._events.write()
+            counts[-1, : layout.CLOSED + 1] = self._events.n_rows, closed
+            self._sync()
+            self._committed[...] = counts
+            self._sync()
+        return Committed(
+            {
+                name: SensorCounts(*map(int, row))
+                for name, row in zip(self._sensors, counts[:-1], strict=True)
+            },
+            self._events.n_rows,
+            closed,
+        )
+
+    def _sync(self) -> None:
+        self._file.flush()
+        os.fsync(self._file.id.get_vfd_handle())
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Turn what HDF5 raises into RecordingError, and write nothing after a failure."""
+        if self._failed:
+            raise RecordingError(f"{self.path}: writing failed before")
+        try:
+            with _as_recording_error(self.path):
+                yield
+        except RecordingError:
+            self._failed = True
+            raise
+
+
+@contextlib.contextmanager
+def _as_recording_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except RecordingError:
+        raise
+    except (OSError, RuntimeError) as error:
+        # HDF5 reports a full disk as RuntimeError with the errno in its text.
+        raise RecordingError(f"{path}: cannot be written: {error}") from error
+
+
+def _fixed(text: str, n_bytes: int) -> bytes:
+    """Return text as UTF-8 of at most ``n_bytes``, not cut within a character."""
+    return text.encode()[:n_bytes].decode(errors="ignore").encode()
+
+
+def _describe(
+    file: h5py.File,
+    bench: Bench | None,
+    created: HostTime,
+    control: tuple[int, str] | None,
+    attributes: dict[str, str],
+) -> None:
+    utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
+    try:
+        software = f"huddle {version('huddle-bench')}"
+    except PackageNotFoundError:
+        software = "huddle"
+    file.attrs.update(
+        {
+            "format": layout.FORMAT,
+            "format_version": layout.FORMAT_VERSION,
+            "run_id": uuid.uuid4().hex,
+            "created": utc.isoformat(timespec="microseconds"),
+            "created_utc_ns": created.utc_ns,
+            "created_monotonic_ns": created.monotonic_ns,
+            "software": software,
+            "bench": "" if bench is None else bench.text,
+            "operator": "" if bench is None else bench.operator,
+            "location": "" if bench is None else bench.location,
+        }
+        | attributes
+    )
+    if control is not None:
+        file.attrs["control_port"], file.attrs["control_token"] = control
+
+
+def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
+    groups = file.create_group("sensors")
+    for sensor in sensors:
+        group = groups.create_group(sensor.name)
+        for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
+            group.attrs[key] = getattr(sensor, key)
+        n_channels = len(sensor.channels)
+        n_rows = max(4, round(sensor.sampling_rate * chunk_seconds))
+        filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+        samples = group.create_dataset(
+            "samples",
+            shape=(0, n_channels),
+            maxshape=(None, n_channels),
+            chunks=(n_rows, n_channels),
+            dtype=sensor.dtype.newbyteorder("<"),
+            fletcher32=True,
+            **filters,
+        )
+        samples.attrs.update(layout.channel_attributes(sensor.channels))
+        if sensor.polled:
+            instants = group.create_dataset(
+                "instants",
+                shape=(0,),
+                maxshape=(None,),
+                chunks=(n_rows,),
+                dtype="<i8",
+                fletcher32=True,
+                **filters,
+            )
+            instants.attrs["unit"] = "ns"
+        _make_table(group, "blocks", layout.BLOCK_DTYPE, layout.BLOCKS_PER_CHUNK)
+        _make_table(group, "gaps", layout.GAP_DTYPE, layout.GAPS_PER_CHUNK)
+    _make_table(file, "events", layout.EVENT_DTYPE, layout.EVENTS_PER_CHUNK)
+    committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
+    committed.attrs["sensors"] = [sensor.name for sensor in sensors]
+    committed.attrs["columns"] = ["rows", "blocks", "gaps"]
+    committed.attrs["last_row"] = ["events", "closed", "unused"]
+
+
+def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int) -> None:
+    group.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(n_rows,), dtype=dtype)
+
+
+def _sync_directory(path: Path) -> None:
+    """Make a new name in a directory survive a power loss."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
