@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -47,12 +48,12 @@ def start(spec: Mapping[str, Any]) -> Iterator[tuple[RunningDevice, ...]]:
     ServeError
         A device could not be served; the message holds what its process said.
     """
-    with tempfile.NamedTemporaryFile("w", prefix="huddle-", suffix=".json") as file:
-        json.dump(spec, file)
-        file.flush()
+    with tempfile.TemporaryDirectory(prefix="huddle-") as folder:
+        file = Path(folder) / "spec.json"
+        file.write_text(json.dumps(spec), encoding="utf-8")
         started: list[subprocess.Popen[str]] = []
         try:
-            started.extend(_start(Path(file.name), index) for index in range(len(spec["devices"])))
+            started.extend(_start(file, index) for index in range(len(spec["devices"])))
             yield tuple(_running(process) for process in started)
         finally:
             _stop(started)
@@ -65,6 +66,7 @@ def _start(file: Path, index: int) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env={**os.environ, "TMPDIR": str(file.parent)},  # what a killed one leaves goes too
         start_new_session=True,  # a Ctrl-C at the terminal is for the parent; it ends them
     )
 

@@ -346,7 +346,7 @@ class EpsonDriver:
                 yield EpsonSession(sensor, stream, configuration, information)
             finally:
                 with contextlib.suppress(DeviceError):
-                    await device.write(epson.MODE_CTRL, epson.CONFIGURATION, high=True)
+                    await device.stop()
 
 
 DRIVER = EpsonDriver()

@@ -1,0 +1,191 @@
+"""Driver and simulated accelerometer over a real wire."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.protocols import epson
+from daq.protocols.block import Block, BlockFlag
+from daq.transport import open_port
+from sim_devices import launch
+from sim_devices.errors import ServeError
+from sim_devices.scenario import Scenario
+from tests.sim_devices.bench import device, scenario, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench import Sensor
+    from sim_devices.launch import RunningDevice
+
+SPEED = 8.0
+DRIVER = driver_type("epson")
+TABLES = [device(name) for name in ("A", "B")]
+TABLES.append(device("C", port="tcp", settings={"first_count": 65000}, serial_number="C0000007"))
+
+
+SPEC = spec(*TABLES, speed=SPEED)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with launch.start(SPEC) as devices:
+        yield devices
+
+
+async def blocks(sensor: Sensor, n_samples: int) -> list[Block]:
+    found: list[Block] = []
+    async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+        async for item in session.read():
+            assert isinstance(item, Block), item
+            found.append(item)
+            if item.end_sample >= n_samples:
+                break
+    return found
+
+
+async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+    (sensor,) = sensors(running[2], TABLES[2], model="M-A352")
+    async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+        (information,) = session.information
+    assert information.model == "A352AD10"
+    assert information.serial_number == "C0000007"
+    assert information.sampling_rate == 200.0
+    assert information.temperature == pytest.approx(25.0, abs=0.6)
+
+
+async def test_three_devices_at_once_without_a_gap_feel_one_motion(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    n = 1000
+    # world time, and with it the index of a sample, from before anything was started
+    before = int((time.monotonic_ns() - SPEC["epoch_ns"]) * 1e-9 * SPEED * 200)
+    found = await asyncio.gather(
+        *(blocks(sensors(one, t)[0], n) for one, t in zip(running, TABLES, strict=True))
+    )
+    for some in found:
+        assert some[0].flags == BlockFlag.CLOCK_RESTART
+        ends = [0] + [block.end_sample for block in some]
+        assert [block.first_sample for block in some] == ends[:-1]  # COUNT of C wraps on the way
+    world = scenario("ABC")
+    for name, some in zip("ABC", found, strict=True):
+        counts = np.concatenate([block.counts for block in some])[:n]
+        # when exactly the device was started shows by the motion itself
+        truth = world.samples(name, before, 50 * 200) * epson.COUNTS_PER_UNIT
+        start = int(np.argmin(np.abs(truth - counts[0, :3]).max(axis=1)))
+        assert np.abs(truth[start : start + n] - counts[:, :3]).max() <= 0.5
+        assert np.all(np.abs(counts[:, 3] - 2634) < 140)
+
+
+async def test_the_device_is_left_quiet_and_found_streaming(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    (sensor,) = sensors(running[0], TABLES[0])
+    assert await blocks(sensor, 50)
+    async with open_port(sensor.port, SystemClock()) as stream:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.05):  # what was on its way may still come
+                await stream.read()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.1):
+                await stream.read()
+        await stream.write(bytes.fromhex("FE000D 83010D"))  # streams when found
+        await stream.read()
+    assert await blocks(sensor, 50)
+
+
+async def test_another_serial_number_is_refused(running: tuple[RunningDevice, ...]) -> None:
+    (sensor,) = sensors(running[2], TABLES[2], serial_number="C0000008")
+    with pytest.raises(WrongDeviceError, match=r"'C' on socket.*'C0000008', got 'C0000007'"):
+        await blocks(sensor, 1)
+    (sensor,) = sensors(running[2], TABLES[2], model="M-A370AD10")
+    with pytest.raises(WrongDeviceError, match="expected model 'M-A370AD10', got 'A352AD10'"):
+        await blocks(sensor, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sampling_rate": 128.0}, "sampling_rate = 128; the device has 1000, 500, 200, 100, 50"),
+        ({"sampling_rate": 1000.0, "settings": {"baud_rate": 115200}}, "need 240000 baud"),
+        ({"settings": {"fields": ["x"]}}, r"4 channels, but settings.fields = \['x'\]"),
+    ],
+)
+async def test_what_the_device_cannot_do(
+    running: tuple[RunningDevice, ...], changes: dict[str, object], message: str
+) -> None:
+    (sensor,) = sensors(running[0], TABLES[0], **changes)
+    with pytest.raises(BenchFileError, match=message):
+        await blocks(sensor, 1)
+
+
+async def test_other_rates_and_fields(running: tuple[RunningDevice, ...]) -> None:
+    channels = TABLES[0]["channels"]["A"][:2]
+    settings = {"fields": ["z", "x"], "filter": "K128_FC36", "flags": False}
+    (sensor,) = sensors(
+        running[0], TABLES[0], sampling_rate=500.0, settings=settings, channels=channels
+    )
+    found = await blocks(sensor, 200)
+    assert all(block.counts.shape[1] == 2 for block in found)
+
+
+async def test_silence_and_strangers_are_told_apart() -> None:
+    tasks: list[asyncio.Task[None] | None] = []
+
+    async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        tasks.append(asyncio.current_task())
+        while await reader.read(64):
+            if talks:
+                writer.write(b"login: ")
+        writer.close()
+
+    talks = False
+    async with await asyncio.start_server(stranger, "127.0.0.1", 0) as server:
+        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        table = device("A")
+        quiet = launch.RunningDevice(("A",), "epson", port, {}, None)  # type: ignore[arg-type]  # no process
+        (sensor,) = sensors(quiet, table)
+        with pytest.raises(NoAnswerError, match=r"'A' on socket://.* got nothing; check cable"):
+            await blocks(sensor, 1)
+        talks = True
+        with pytest.raises(WrongDeviceError, match=r"no Epson .* got 6c 6f 67 69 6e 3a 20"):
+            await blocks(sensor, 1)
+        await asyncio.gather(*filter(None, tasks))
+
+
+async def test_a_device_that_vanishes_ends_the_session() -> None:
+    table = device("A")
+    with launch.start(spec(table, speed=SPEED)) as (one,):
+        (sensor,) = sensors(one, table)
+        async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+            stream = session.read()
+            assert isinstance(await anext(stream), Block)
+            one.process.kill()
+            with pytest.raises(NotConnectedError, match=r"'A' on /tmp/.*: the port closed"):
+                async for _ in stream:
+                    pass
+
+
+def test_a_spec_that_cannot_be_served_says_why() -> None:
+    table = device("A")
+    wrong = spec(table)
+    wrong["scenario"]["motion"]["spectra"] = []
+    with (
+        pytest.raises(ServeError, match=r"did not start: .*spectra"),
+        launch.start(wrong),
+    ):
+        pass
+
+
+def test_the_scenario_passes_through_json() -> None:
+    table = scenario("A").to_dict()
+    assert Scenario.from_dict(table).to_dict() == table
