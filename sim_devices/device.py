@@ -87,6 +87,8 @@ class DeviceSpec:
     sampling_rate: float
     channels: Mapping[str, tuple[ChannelSpec, ...]]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    sensor_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Where the sensors of one port differ in their settings (slaves on one bus)."""
     model: str = ""
     serial_number: str = ""
 

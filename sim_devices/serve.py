@@ -11,6 +11,7 @@ The specification is one JSON object::
         "port": "pty",             or "tcp", "udp"
         "sampling_rate": 200.0,    Hz
         "settings": {...},         as the driver's settings in the bench file
+        "sensor_settings": {"A": {...}},      where its sensors' settings differ
         "model": "", "serial_number": "",     what it says it is; the family's own if empty
         "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
 
@@ -172,6 +173,7 @@ def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
             for sensor, channels in table["channels"].items()
         },
         settings=table.get("settings", {}),
+        sensor_settings=table.get("sensor_settings", {}),
         model=table.get("model", ""),
         serial_number=table.get("serial_number", ""),
     )
