@@ -14,6 +14,7 @@ the reading is cut. Memory is that of the piece asked for.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -88,7 +89,7 @@ class _Source:
             self.runs[-1] = _Run(
                 run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
             )
-        for start, end in zip(starts, np.append(starts[1:], len(blocks)), strict=True):
+        for start, end in itertools.pairwise([*starts.tolist(), len(blocks)]):
             n_samples = int(length[start:end].sum())
             self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
         self.n_blocks += len(blocks)

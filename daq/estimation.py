@@ -424,14 +424,15 @@ class Estimation:
         refused: dict[str, str] = {}
         for method in wanted:
             try:
-                results[method] = self_noise(
-                    method,
-                    csm,
-                    dims=self._passes[0].aligned.dims,
-                    n_effective=n_effective,
-                    correct=self.settings.correct,
-                    **self.settings.options,
-                )
+                with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
+                    results[method] = self_noise(
+                        method,
+                        csm,
+                        dims=self._passes[0].aligned.dims,
+                        n_effective=n_effective,
+                        correct=self.settings.correct,
+                        **self.settings.options,
+                    )
             except InsufficientDataError as error:
                 refused[method] = str(error)
         return results, refused

@@ -1,0 +1,1 @@
+"""Alignment: clocks, resampling, the common grid."""

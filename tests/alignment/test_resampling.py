@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
 from daq.resampling import SPAN, are_whole, reach, resample
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-def error_db(frequency: float, positions: np.ndarray, n: int, ratio: float = 1.0) -> float:
+    FloatArray = NDArray[np.float64]
+
+
+def error_db(frequency: float, positions: FloatArray, n: int, ratio: float = 1.0) -> float:
     """Power of the error against a tone of `frequency` cycles per input sample, in dB."""
     phase = 2 * np.pi * frequency
     tone = np.stack([np.cos(phase * np.arange(n)), np.sin(phase * np.arange(n))], axis=1)
@@ -17,7 +24,7 @@ def error_db(frequency: float, positions: np.ndarray, n: int, ratio: float = 1.0
     return float(10 * np.log10(2 * np.mean(error**2)))
 
 
-def inner(n: int, step: float, ratio: float = 1.0) -> np.ndarray:
+def inner(n: int, step: float, ratio: float = 1.0) -> FloatArray:
     margin = reach(ratio)
     return np.arange(margin + 0.37, n - margin - 1, step)
 
@@ -48,13 +55,14 @@ def test_samples_on_whole_positions_come_out_bit_exact() -> None:
     samples = np.random.default_rng(1).standard_normal((3000, 3))
     assert np.array_equal(resample(samples, np.arange(100.0, 2900.0)), samples[100:2900])
     assert are_whole(np.arange(7.0, 1e7, 1000.0)[:1])
-    assert not are_whole(np.arange(100) + 0.001)
+    assert not are_whole(np.arange(100.0) + 0.001)
 
 
 def test_pieces_cut_at_spans_join_without_a_seam() -> None:
     rng = np.random.default_rng(2)
     samples = rng.standard_normal((8 * SPAN, 2))
-    positions = 60.4 + np.arange(7 * SPAN) * (1 + 18e-6)
+    # From 8 to 28 ppm: two, three and four delays a span.
+    positions = 60.4 + np.arange(7 * SPAN) * (1 + 8e-6 + 20e-6 * np.arange(7 * SPAN) / (14 * SPAN))
     whole = resample(samples, positions)
     pieces = np.concatenate(
         [resample(samples, positions[a : a + 2 * SPAN]) for a in range(0, 7 * SPAN, 2 * SPAN)]

@@ -1,0 +1,161 @@
+"""The common grid: what passes, what is interpolated, what is invalid."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.alignment import AlignedRecording
+from daq.errors import CannotAlignError
+from daq.recording.reader import Recording
+from daq.resampling import reach
+from tests.alignment.recordings import Sensor, blocks, counts, create, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+def test_sensors_of_one_clock_pass_bit_exact_however_the_reading_is_cut(tmp_path: Path) -> None:
+    raw = {name: counts(5000, 2, seed) for seed, name in enumerate("abc")}
+    path = write(tmp_path / "r.h5", {n: Sensor(c, clock="one") for n, c in raw.items()})
+    with Recording.open(path) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        assert aligned.n_available == 5000
+        assert aligned.dims == (2, 2, 2)
+        whole, valid = aligned.read(0, 5000)
+        assert valid.all()
+        assert np.array_equal(whole, np.hstack([*raw.values()]).astype(float))
+        assert np.array_equal(aligned.read(1234, 4321)[0], whole[1234:4321])
+
+
+def test_exact_times_align_whole_samples_and_name_the_start(tmp_path: Path) -> None:
+    raw = {name: counts(3000, 1, seed) for seed, name in enumerate("abc")}
+    starts = {"a": 0.0055, "b": 0.1255, "c": 0.0355}  # 12 and 3 samples later
+    sensors = {n: Sensor(c, utc=True, start=starts[n]) for n, c in raw.items()}
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert len(samples) == 3000 - 12
+        assert valid.all()
+        expected = [raw["a"][12:, 0], raw["b"][:2988, 0], raw["c"][9:2997, 0]]
+        assert np.array_equal(samples, np.stack(expected, axis=1).astype(float))
+        assert aligned.start_utc_ns == 1_468_458_000_125_500_000
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_gap_is_invalid_for_all_and_nothing_else_is(tmp_path: Path, shared: bool) -> None:
+    clock = {name: "one" if shared else name for name in "abc"}
+    sensors = {n: Sensor(counts(4000, 1, ord(n)), clock=clock[n]) for n in "abc"}
+    sensors["b"].gaps = ((1530, 1571),)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        _, valid = aligned.read(0, aligned.n_available)
+        invalid = np.flatnonzero(~valid)
+        # Interpolated samples need their neighbours as well.
+        margin = 0 if shared else reach()
+        start = 0 if shared else reach()
+        assert invalid[0] + start >= 1530 - margin - 1
+        assert invalid[-1] + start <= 1570 + margin + 1
+        assert np.all(np.diff(invalid) == 1)
+        assert len(invalid) >= 41
+
+
+def _band_limited(times: NDArray[np.float64], seed: int, edge: float) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    frequency = rng.uniform(0.2, edge, 40)
+    phase = rng.uniform(0, 2 * np.pi, 40)
+    return np.asarray(np.cos(2 * np.pi * np.outer(times, frequency) + phase).sum(axis=1))
+
+
+def test_free_running_sensors_meet_on_the_grid(tmp_path: Path) -> None:
+    sensors = {}
+    for name, ppm, start in (("a", 0.0, 0.0), ("b", 18.0, 0.0123), ("c", -20.0, 0.0371)):
+        rate = 100.0 * (1 + ppm * 1e-6)
+        times = start + np.arange(60_000) / rate
+        signal = np.round(1e6 * _band_limited(times, 3, 44.0)).astype(np.int32)
+        sensors[name] = Sensor(signal[:, None], rate=rate, nominal=100.0, start=start, clock=name)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert not aligned.is_exact
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert valid.all()
+        for column in (1, 2):
+            error = samples[:, column] - samples[:, 0]
+            # Arrival times to 1 ns; the interpolation's 100 dB; quantisation far below.
+            assert np.std(error) < 1e-5 * np.std(samples[:, 0])
+        for state, ppm in zip(aligned.clocks, (0.0, 18.0, -20.0), strict=True):
+            assert state.ppm == pytest.approx(ppm, abs=0.01)
+
+
+def test_unequal_rates_meet_at_the_lower_without_aliases(tmp_path: Path) -> None:
+    times = {"a": np.arange(20_000) / 100.0, "b": np.arange(50_000) / 250.0}
+    sensors = {}
+    for name, rate in (("a", 100.0), ("b", 250.0)):
+        signal = 1e6 * _band_limited(times[name], 5, 40.0)
+        if rate > 100:
+            signal += 1e6 * np.cos(2 * np.pi * 90 * times[name])
+        sensors[name] = Sensor(np.round(signal).astype(np.int32)[:, None], rate=rate, clock=name)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.sampling_rate == 100.0
+        samples, valid = aligned.read(0, aligned.n_available)
+        inner = samples[valid]
+        assert np.std(inner[:, 1] - inner[:, 0]) < 1e-5 * np.std(inner[:, 0])
+
+
+def test_a_restart_gets_a_clock_of_its_own(tmp_path: Path) -> None:
+    first = Sensor(counts(3000, 1, 1), clock="a")
+    other = Sensor(counts(3000, 1, 2), clock="b", restarts=(1500,))
+    writer = create(tmp_path / "r.h5", {"a": first, "b": other})
+    for block in blocks("a", first):
+        writer.append(block)
+    for block in blocks("b", other):
+        late = 3_700_000 if block.first_sample >= 1500 else 0  # restarted 0.37 samples later
+        at = type(block.received)(block.received.monotonic_ns + late, block.received.utc_ns + late)
+        writer.append(type(block)("b", block.first_sample, block.counts, at, flags=block.flags))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert [state.n_epochs for state in aligned.clocks] == [1, 2]
+        delays = aligned.delays(np.array([500.0, 2500.0]))
+        moved = (delays[1] - delays[0])[1] - (delays[1] - delays[0])[0]
+        assert moved == pytest.approx(3.7e-3, abs=1e-5)
+
+
+def test_a_growing_file_is_read_as_far_as_it_is_committed(tmp_path: Path) -> None:
+    sensors = {name: Sensor(counts(2000, 1, ord(name)), clock="one") for name in "abc"}
+    writer = create(tmp_path / "r.h5", sensors)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.n_available == 0
+        written = {name: blocks(name, sensor) for name, sensor in sensors.items()}
+        for some in written.values():
+            for block in some[:20]:
+                writer.append(block)
+        writer.commit()
+        aligned.refresh()
+        assert aligned.n_available == 950  # the last block may still be continued
+        with pytest.raises(CannotAlignError, match="950 available"):
+            aligned.read(900, 1100)
+        for some in written.values():
+            for block in some[20:]:
+                writer.append(block)
+        writer.close()
+        aligned.refresh()
+        assert aligned.n_available == 2000
+        assert np.array_equal(aligned.read(0, 2000)[0][:, 1], sensors["b"].counts[:, 0])
+
+
+def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
+    sensors = {name: Sensor(counts(500, 1, 1), clock="one") for name in "abc"}
+    with (
+        Recording.open(write(tmp_path / "r.h5", sensors)) as recording,
+        pytest.raises(CannotAlignError, match="ask for 100 Hz or less"),
+    ):
+        AlignedRecording(recording, sampling_rate=200.0)
