@@ -61,6 +61,8 @@ class Maximum:
         positive number at which the search stopped.
     singular : bool, shape (n_freqs,)
         Where the matrix is not positive definite, so that there is no maximum.
+    penalty : float64, shape (n_channels, n_channels)
+        What was added to the Fisher information of ln psi per average, zero if nothing.
     """
 
     psi: FloatArray
@@ -73,6 +75,7 @@ class Maximum:
     converged: BoolArray
     boundary: BoolArray
     singular: BoolArray
+    penalty: FloatArray
 
 
 @dataclass(slots=True)
@@ -109,6 +112,7 @@ def maximise(
     n_factors: int,
     *,
     start: FloatArray | None = None,
+    penalty: FloatArray | None = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> Maximum:
     """Maximum likelihood noise PSD of every channel, at all frequencies at once.
@@ -122,6 +126,9 @@ def maximise(
     start : float64, shape (n_freqs, n_channels), optional
         Noise PSD to start from; where it is not positive, and by default, the search starts
         from ``(1 - q / (2 p)) / (S^-1)_ii``.
+    penalty : float64, shape (n_channels, n_channels), optional
+        Adds ``x' penalty x / 2``, x = ln psi, to the discrepancy: the precision of a Gaussian
+        prior of x over the number of averages. Positive semidefinite, rows summing to zero.
     max_iterations : int
         After as many a frequency is reported as not converged.
 
@@ -165,6 +172,7 @@ def maximise(
         converged=np.zeros(n_freqs, np.bool_),
         boundary=np.zeros((n_freqs, p), np.bool_),
         singular=~usable,
+        penalty=np.zeros((p, p)) if penalty is None else penalty,
     )
     if usable.any():
         x0 = np.log(partial[usable] * (1 - n_factors / (2 * p)))
@@ -211,8 +219,9 @@ def _search(
     """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
     q = found.n_factors
     n = len(csm)
+    penalty = found.penalty
     best = _evaluate(csm, x0, q)
-    gradient, step, decrement, at_boundary = _newton(best, lowest, q)
+    gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
     radius = np.full(n, _MAX_STEP)
     iterations = np.ones(n, np.int64)
     converged = decrement < DECREMENT
@@ -227,6 +236,7 @@ def _search(
         iterations[going] += 1
         expected = decrement[going] * shrink * (1 - shrink / 2)
         gain = best.discrepancy[going] - trial.discrepancy
+        gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
         rounding = 1e-13 * best.eigenvalues[going, 0] + 1e-12
         accept = gain >= 1e-4 * expected - rounding
         poor = gain < 0.25 * expected - rounding
@@ -239,7 +249,7 @@ def _search(
         point = trial.take(accept)
         best.put(moved, point)
         gradient[moved], step[moved], decrement[moved], at_boundary[moved] = _newton(
-            point, lowest[moved], q
+            point, lowest[moved], q, penalty
         )
         converged[moved] = decrement[moved] < DECREMENT
         stuck = radius < _MIN_RADIUS
@@ -264,20 +274,25 @@ def _evaluate(csm: ComplexArray, x: FloatArray, q: int) -> _Point:
     return _Point(x.copy(), terms.sum(axis=1), w.copy(), u.copy())
 
 
+def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * np.einsum("fi,ij,fj->f", x, penalty, x))
+
+
 def _residual(w: FloatArray, q: int) -> BoolArray:
     """Eigenvalues no factor takes up: all but the first q, and those below one (A would vanish)."""
     return (np.arange(w.shape[1]) >= q) | (w <= 1)
 
 
 def _newton(
-    at: _Point, lowest: FloatArray, q: int
+    at: _Point, lowest: FloatArray, q: int, penalty: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
     w, u = at.eigenvalues, at.eigenvectors
     residual = _residual(w, q)
     power = np.abs(u) ** 2
     gradient = np.einsum("fik,fk->fi", power, np.where(residual, 1 - w, 0.0))
-    hessian = _hessian(w, u, residual, q)
+    gradient += at.x @ penalty
+    hessian = _hessian(w, u, residual, q) + penalty
     at_boundary = (at.x <= lowest) & (gradient > 0)
     free = ~at_boundary
     hessian *= free[:, :, None] & free[:, None, :]

@@ -20,6 +20,7 @@ from estimator.errors import InvalidMatrixError
 
 if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray
+    from estimator.factor_analysis import Maximum
 
 _LEAST_INFORMATION = 1e-12
 
@@ -186,18 +187,13 @@ def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) 
     return np.asarray(np.maximum(half + root, edge))
 
 
-def bias(
-    eigenvalues: FloatArray, eigenvectors: ComplexArray, n_factors: int, *, n_effective: float
-) -> FloatArray:
+def bias(maximum: Maximum, *, n_effective: float) -> FloatArray:
     """Fractional bias of the maximum likelihood estimate, to first order in 1 / n.
 
     Parameters
     ----------
-    eigenvalues : float64, shape (n_freqs, n_channels)
-        Of the whitened matrix at the maximum, descending.
-    eigenvectors : complex128, shape (n_freqs, n_channels, n_channels)
-        Theirs, as columns.
-    n_factors : int
+    maximum : Maximum
+        From `estimator.factor_analysis.maximise`.
     n_effective : float
         Averages.
 
@@ -220,6 +216,7 @@ def bias(
     and a covariance linear in psi, whose maximum likelihood estimate has no bias of first
     order); the second the turning of the factors by the error of psi itself.
     """
+    eigenvalues, n_factors = maximum.eigenvalues, maximum.n_factors
     n_channels = eigenvalues.shape[1]
     if n_factors == 0:
         return np.zeros_like(eigenvalues)
@@ -229,10 +226,10 @@ def bias(
         lower = np.clip(1 - taken / n_effective, 0.1, 1.0)
         w = spiked_eigenvalues(eigenvalues[:, :n_factors] * lower[:, None], n_residual, n_effective)
         taken = (w / (w - 1)).sum(axis=1)
-    motion = eigenvectors[:, :, :n_factors]
-    free = eigenvectors[:, :, n_factors:]
+    motion = maximum.eigenvectors[:, :, :n_factors]
+    free = maximum.eigenvectors[:, :, n_factors:]
     projector = free @ free.conj().swapaxes(1, 2)
-    inverse = covariance(np.abs(projector) ** 2)
+    inverse = covariance(np.abs(projector) ** 2 + maximum.penalty)
     kernel = (motion / (w - 1)[:, None, :]) @ motion.conj().swapaxes(1, 2)
     turned = projector @ (inverse * kernel) @ projector
     second = np.einsum("fij,fjj->fi", inverse, np.real(turned))

@@ -14,6 +14,8 @@ from estimator.self_noise import Flag, SelfNoise
 if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray, IntArray
 
+NOISE_SPREAD = 0.5
+
 
 def maximum_likelihood(
     csm: ComplexArray,
@@ -22,6 +24,7 @@ def maximum_likelihood(
     n_effective: float,
     correct: bool = True,
     n_factors: int | IntArray | None = None,
+    noise_spread: float = NOISE_SPREAD,
 ) -> SelfNoise:
     """Self-noise PSD of every channel of three or more collocated sensors, from all of them.
 
@@ -38,7 +41,11 @@ def maximum_likelihood(
     correct : bool
         Remove the small-sample bias, see Notes.
     n_factors : int or int64, shape (n_freqs,), optional
-        Dimension of the common motion; ``max(dims)`` by default.
+        Dimension of the common motion; ``max(dims)`` by default, `estimator.dimension` finds it.
+    noise_spread : float
+        Only where `n_factors` exceeds ``max(dims)``: standard deviation of ln psi among the
+        channels of one number in their sensors, expected beforehand. There the matrix alone
+        may not tell their noise apart (see `alike`).
 
     Returns
     -------
@@ -84,7 +91,11 @@ def maximum_likelihood(
     flags = np.zeros((n_freqs, p), np.int64)
     for q in np.unique(factors):
         here = np.flatnonzero(factors == q)
-        maximum = maximise(csm[here], int(q))
+        maximum = maximise(
+            csm[here],
+            int(q),
+            penalty=alike(dims, noise_spread, n_effective) if q > max(dims) else None,
+        )
         psi = np.where(maximum.boundary, 0.0, maximum.psi)
         error = standard_error(maximum, n_effective=n_effective)
         cov[here] = np.where(maximum.boundary, np.nan, error / maximum.psi)
@@ -100,17 +111,43 @@ def maximum_likelihood(
     return SelfNoise("maximum-likelihood", noise_psd, cov, low, high, flags)
 
 
+def alike(dims: tuple[int, ...], spread: float, n_effective: float) -> FloatArray:
+    """Return the penalty, shape (n_channels, n_channels), that keeps like channels alike.
+
+    Parameters
+    ----------
+    dims : tuple of int
+        Channels of each sensor; the first channels of all sensors are alike, and so on.
+    spread : float
+        Standard deviation of their ln psi.
+    n_effective : float
+        Averages.
+
+    Notes
+    -----
+    With gradients of the motion among the factors, sensors that point the same way see three
+    problems of N channels and three factors (the motion of one direction and its two
+    gradients) that do not mix. For five sensors the information on their noise then has rank
+    three: their mean is known, how it divides among them is not, and maximum likelihood
+    arbitrarily runs to zero in one or other channel. A prior as weak as `spread` = 0.5 (a
+    factor of 1.6) takes that freedom away and does nothing where the averages say more than it:
+    it counts as much as 4 of them.
+    """
+    position = np.concatenate([np.arange(d) for d in dims])
+    same = (position[:, None] == position[None, :]).astype(np.float64)
+    return np.asarray((np.eye(len(position)) - same / same.sum(axis=1)) / (spread**2 * n_effective))
+
+
 def small_sample_correction(maximum: Maximum, *, n_effective: float) -> FloatArray:
     """Return what to multiply psi by, shape (n_freqs, n_channels), against its bias."""
     lost = maximum.n_factors / n_effective
-    bias = fisher.bias(
-        maximum.eigenvalues, maximum.eigenvectors, maximum.n_factors, n_effective=n_effective
-    )
+    bias = fisher.bias(maximum, n_effective=n_effective)
     return (1 + np.clip(-bias - lost, 0.0, 0.5)) / (1 - lost)
 
 
 def standard_error(maximum: Maximum, *, n_effective: float) -> FloatArray:
     """Return the standard error of psi, unit**2/Hz, shape (n_freqs, n_channels), by `fisher`."""
     free = maximum.eigenvectors[:, :, maximum.n_factors :]
-    variance = np.einsum("fii->fi", fisher.covariance(fisher.information(free)))
+    known = fisher.information(free) + maximum.penalty
+    variance = np.einsum("fii->fi", fisher.covariance(known))
     return np.asarray(maximum.psi * np.sqrt(variance / (n_effective - maximum.n_factors)))

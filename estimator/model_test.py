@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special, stats
 
+from estimator import fisher
 from estimator.errors import InsufficientDataError
 from estimator.windows import get_window
 
@@ -29,14 +30,14 @@ class ModelTest:
     statistic : float64, shape (n_freqs,)
         Likelihood ratio, scaled so that its mean under the model is `degrees`; NaN where the
         matrix is singular.
-    degrees : int
+    degrees : float64, shape (n_freqs,)
         Of freedom of its chi-square.
     p_value : float64, shape (n_freqs,)
         Probability of so large a statistic if the model holds.
     """
 
     statistic: FloatArray
-    degrees: int
+    degrees: FloatArray
     p_value: FloatArray
 
 
@@ -94,13 +95,13 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     and estimating psi takes ``p (1 + 1 / (6 (n - q)))`` of it. Dividing by mean over degrees of
     freedom (Bartlett) gives false alarms of 0.9 % at the 1 % level from n = 20 on (three to
     five sensors of one to three channels). At low SNR, where q factors are more than n averages
-    can find (n SNR**2 < 100, say), the test is conservative.
+    can find (n SNR**2 < 100, say), the test is conservative. Under a penalty psi has
+    ``tr J (J + penalty)^-1`` parameters and not p, as ridge regression counts them.
     """
     p = maximum.eigenvalues.shape[1]
     q = maximum.n_factors
     order, averages = p - q, n_effective - q
-    degrees = order**2 - p
-    if degrees < 1:
+    if order**2 - p < 1:
         raise InsufficientDataError(
             f"{q} factors explain any covariance of {p} channels: nothing is left for a test"
         )
@@ -109,9 +110,21 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
             f"{n_effective:.1f} averages of {p} channels: more averages than channels are needed"
         )
     logs = special.digamma(averages - np.arange(order)).sum() - order * np.log(averages)
-    mean = -2 * averages * logs - p * (1 + 1 / (6 * averages))
+    estimated = _estimated_parameters(maximum)
+    degrees = order**2 - estimated
+    mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
     statistic = 2 * averages * maximum.discrepancy * degrees / mean
     return ModelTest(statistic, degrees, np.asarray(stats.chi2.sf(statistic, degrees)))
+
+
+def _estimated_parameters(maximum: Maximum) -> FloatArray:
+    n_freqs, p = maximum.eigenvalues.shape
+    if not maximum.penalty.any():
+        return np.full(n_freqs, float(p))
+    information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
+    inverse = fisher.covariance(information + maximum.penalty)
+    count = np.einsum("fij,fji->f", information, inverse)
+    return np.where(np.isfinite(count), count, float(p))
 
 
 def neighbour_correlation(window: FloatArray, hop: int, n_segments: int) -> FloatArray:
@@ -174,7 +187,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
     taken = band & np.isfinite(test.statistic)
     count = int(taken.sum())
     total = float(test.statistic[taken].sum())
-    degrees = float(count * test.degrees)
+    degrees = float(test.degrees[taken].sum())
     if not count:
         return BandTest(total, degrees, float("nan"), count)
     pairs = np.array([np.sum(taken[h:] & taken[:-h]) for h in range(1, len(r) + 1)])

@@ -34,7 +34,7 @@ def test_false_alarms_at_the_one_percent_level(
     n_draws = 3000
     draws = wishart(bench(dims), n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
     test = model_test(maximise(draws, max(dims)), n_effective=n_averages)
-    assert test.degrees == degrees
+    assert np.all(test.degrees == degrees)
     alarms = np.mean(test.p_value < 0.01)
     scatter = np.sqrt(0.01 * 0.99 / n_draws)
     assert 0.005 - 2 * scatter < alarms < 0.015 + 2 * scatter
@@ -72,7 +72,7 @@ def test_pooled_false_alarms_under_a_taper(overlap: float) -> None:
     runs = np.array(statistic)
     p_values = []
     for run in runs:
-        test = ModelTest(run, 10, stats.chi2.sf(run, 10))
+        test = ModelTest(run, np.full(len(run), 10.0), stats.chi2.sf(run, 10))
         for first in range(0, len(run) - 20, 20):
             band = np.zeros(len(run), np.bool_)
             band[first : first + 20] = True
@@ -111,10 +111,8 @@ def test_incoherence_that_biases_by_half_is_seen_over_an_octave() -> None:
     test = model_test(maximise(draws, 3), n_effective=1080)
     seen = 0
     for octave in range(n_octaves):
-        part = ModelTest(
-            test.statistic[octave * 35 : (octave + 1) * 35], test.degrees, test.p_value
-        )
-        seen += pool(part, np.ones(35, np.bool_)).p_value < 0.01
+        band = np.arange(n_octaves * 35) // 35 == octave
+        seen += pool(test, band).p_value < 0.01
     assert seen >= 0.99 * n_octaves
 
 
@@ -126,7 +124,7 @@ def test_a_gross_violation_is_seen_at_one_frequency() -> None:
 
 
 def test_an_unusable_frequency_is_left_out_of_the_pool() -> None:
-    test = ModelTest(np.array([10.0, np.nan, 12.0]), 10, np.array([0.5, np.nan, 0.4]))
+    test = ModelTest(np.array([10.0, np.nan, 12.0]), np.full(3, 10.0), np.array([0.5, np.nan, 0.4]))
     band = pool(test, np.ones(3, np.bool_))
     assert band.n_frequencies == 2
     assert band.statistic == 22
