@@ -25,23 +25,22 @@ if TYPE_CHECKING:
 N_LAGS = 8
 """Bins further apart than this are taken as independent."""
 NORMAL_95 = 1.959963984540054
+CERTAIN = 4.0
+"""Standard deviations above zero from which a mean has a log-normal interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class BandMeans:
     """Means of a spectrum over bands, shape (n_bands,), in the unit of the spectrum.
 
-    ``low`` and ``high`` bound the 95 % interval of the mean; NaN where a band holds no number.
+    ``spread`` is the standard deviation of the mean, ``low`` and ``high`` bound its 95 % interval;
+    NaN where a band holds no number.
     """
 
     mean: FloatArray
+    spread: FloatArray
     low: FloatArray
     high: FloatArray
-
-    @property
-    def cov(self) -> FloatArray:
-        """Coefficient of variation of the mean, from the interval."""
-        return np.log(self.high / self.low) / (2 * NORMAL_95)
 
 
 def bin_correlation(window: FloatArray, hop: int) -> FloatArray:
@@ -63,7 +62,7 @@ def bin_correlation(window: FloatArray, hop: int) -> FloatArray:
     for shift in range(0, length, hop):
         product = window[shift:] * window[: length - shift]
         total += (2 if shift else 1) * np.abs(np.fft.fft(product, length)[:N_LAGS]) ** 2
-    return total / total[0]
+    return np.asarray(total / total[0])
 
 
 def band_means(
@@ -83,8 +82,7 @@ def band_means(
     Returns
     -------
     BandMeans
-        The interval is log-normal, so it stays positive where the mean is; where the mean is
-        negative it is symmetric about it.
+        The interval is log-normal where the mean is clearly positive, and symmetric elsewhere.
     """
     first, last = int(edges[0]), int(edges[-1])
     starts = edges[:-1] - first
@@ -102,10 +100,11 @@ def band_means(
         count = np.add.reduceat(known.astype(np.float64), starts)
         mean = np.add.reduceat(psd, starts) / count
         spread = np.sqrt(variance) / count
-        factor = np.exp(NORMAL_95 * spread / mean)
-        low = np.where(mean > 0, mean / factor, mean - NORMAL_95 * spread)
-        high = np.where(mean > 0, mean * factor, mean + NORMAL_95 * spread)
-    return BandMeans(mean, low, high)
+        certain = mean > CERTAIN * spread
+        factor = np.exp(np.where(certain, NORMAL_95 * spread / mean, 0.0))
+        low = np.where(certain, mean / factor, mean - NORMAL_95 * spread)
+        high = np.where(certain, mean * factor, mean + NORMAL_95 * spread)
+    return BandMeans(mean, spread, low, high)
 
 
 def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.int64]:

@@ -74,6 +74,9 @@ def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
         "port": _kind(first.port),
         "sampling_rate": first.sampling_rate,
         "settings": first.settings,
+        "sensor_settings": {sensor.name: sensor.settings for sensor in sensors},
+        "model": first.model,
+        "serial_number": first.serial_number,
         "channels": {
             sensor.name: [
                 {

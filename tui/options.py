@@ -27,19 +27,6 @@ class Detrend(StrEnum):
     LINEAR = "linear"
 
 
-class Unit(StrEnum):
-    """The physical unit of spectra: ``unit²/Hz``."""
-
-    ACCELERATION = "m/s²"
-    VELOCITY = "m/s"
-    DISPLACEMENT = "m"
-    NATIVE = "native"
-
-    @classmethod
-    def _missing_(cls, value: object) -> "Unit | None":
-        return cls.ACCELERATION if value in {"m/s2", "m/s^2", "m/s**2"} else None
-
-
 def duration(value: str | float) -> float:
     """Read a duration from the command line, in seconds."""
     try:
@@ -48,16 +35,16 @@ def duration(value: str | float) -> float:
         raise typer.BadParameter(f"{value!r}: {error}") from None
 
 
-def band(value: str | tuple[float, float]) -> tuple[float, float]:
+def frequencies(value: str | None) -> tuple[float, float] | None:
     """Read a band of frequencies such as ``1:20``, in Hz."""
-    if isinstance(value, tuple):
-        return value
+    if value is None:
+        return None
     try:
-        low, high = (float(part) for part in value.replace("-", ":").split(":"))
+        low, high = (float(part) for part in value.split(":"))
     except ValueError:
         low, high = 0.0, 0.0
     if not 0 < low < high:
-        raise typer.BadParameter(f"{value!r}: expected two frequencies in Hz such as 1:20")
+        raise typer.BadParameter(f"--band {value!r}: expected two frequencies in Hz such as 1:20")
     return low, high
 
 
@@ -104,11 +91,12 @@ NoCorrectionOption: TypeAlias = Annotated[
     bool, typer.Option("--no-correction", help="Leave the small-sample bias in.")
 ]
 UnitOption: TypeAlias = Annotated[
-    Unit | None, typer.Option("--unit", help="Unit of the spectra, through ω² where needed.")
+    str | None,
+    typer.Option("--unit", metavar="UNIT", help="As in m/s², m/s, µg: spectra are in UNIT²/Hz."),
 ]
 BandOption: TypeAlias = Annotated[
-    tuple[float, float] | None,
-    typer.Option("--band", metavar="LOW:HIGH", parser=band, help="Band of the table, in Hz."),
+    str | None,
+    typer.Option("--band", metavar="LOW:HIGH", help="Band of the table, in Hz, as in 1:20."),
 ]
 SpeedOption: TypeAlias = Annotated[
     float | None, typer.Option("--speed", min=0.01, help="How many times as fast as life.")

@@ -17,8 +17,8 @@ def clock_time(seconds: float) -> str:
     """Return a length of time as h:mm:ss, or m:ss below an hour."""
     whole = max(0, math.floor(seconds + 0.5))
     hours, rest = divmod(whole, 3600)
-    minutes, seconds = divmod(rest, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+    minutes, left = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{left:02d}" if hours else f"{minutes}:{left:02d}"
 
 
 def time_left(seconds: float | None) -> str:
@@ -33,10 +33,26 @@ def time_left(seconds: float | None) -> str:
     return f"{math.ceil(seconds / 86400)} days left"
 
 
+def decibels(psd: float) -> float:
+    """Return 10 log10 of a PSD; NaN where it is not positive."""
+    return 10 * math.log10(psd) if psd > 0 else math.nan
+
+
 def level(psd: float) -> str:
-    """Return a PSD in dB, and say so where there is none."""
-    if not math.isfinite(psd):
+    """Return a PSD in dB, and say so where it has none."""
+    if math.isnan(psd):
         return "?"
-    if psd <= 0:
-        return "below 0"
-    return f"{10 * math.log10(psd):.2f}".replace("-", "−")
+    return "below 0" if psd <= 0 else _signed(decibels(psd))
+
+
+def interval(low: float, high: float) -> str:
+    """Return an interval of PSD in dB."""
+    if math.isnan(high):
+        return ""
+    if high <= 0:
+        return ""
+    return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "−")

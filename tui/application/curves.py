@@ -10,6 +10,8 @@ import numpy as np
 from tui.bands import band_means, log_edges
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from tui.bands import FloatArray
@@ -78,7 +80,7 @@ def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
     return np.asarray(np.log10(frequency[edges[:-1]] * frequency[edges[1:] - 1]) / 2)
 
 
-def level_limits(curves: list[Curve], step: float = 10.0) -> tuple[float, float]:
+def level_limits(curves: Sequence[Curve], step: float = 10.0) -> tuple[float, float]:
     """Return limits in dB, multiples of ``step``, that hold all curves but for lone outliers."""
     levels = np.concatenate([curve.level_db for curve in curves] or [np.array([])])
     levels = levels[np.isfinite(levels)]

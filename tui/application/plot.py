@@ -34,7 +34,7 @@ class FrequencyAxis(AxisFormatter):
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
         """Return frequencies in Hz."""
-        return [f"{10**tick:.3g}" for tick in ticks]
+        return [f"{10**tick:.3g} Hz" for tick in ticks]
 
 
 class LevelAxis(AxisFormatter):
@@ -46,8 +46,8 @@ class LevelAxis(AxisFormatter):
         return [float(t) for t in np.arange(math.ceil(min_ / step) * step, max_ + 1e-9, step)]
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
-        """Return levels in dB, with a real minus sign."""
-        return [f"{tick:.0f}".replace("-", "−") for tick in ticks]
+        """Return levels with a real minus sign."""
+        return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
 
 
 class PsdPlot(PlotWidget, can_focus=False):
@@ -55,7 +55,6 @@ class PsdPlot(PlotWidget, can_focus=False):
 
     def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
         super().__init__(id=id, allow_pan_and_zoom=False)
-        self._curves: tuple[Curve, ...] = ()
         self.set_x_formatter(FrequencyAxis())
         self.set_y_formatter(LevelAxis())
 
@@ -65,42 +64,27 @@ class PsdPlot(PlotWidget, can_focus=False):
         return max(8, self.size.width - self.margin_left - 2)
 
     def on_mount(self) -> None:
-        """Set margins and labels."""
+        """Leave room for tick labels only: they carry the units."""
         super().on_mount()
-        self.margin_left = 6
-        self.margin_top = 1
-        self.margin_bottom = 2
+        self.margin_left = 9
+        self.margin_top = 0
+        self.margin_bottom = 1
         self.show_legend(LegendLocation.TOPRIGHT)
 
-    def show(self, curves: Sequence[Curve], *, unit: str) -> None:
-        """Draw these curves and no others.
-
-        Parameters
-        ----------
-        curves : sequence of Curve
-            The last one is drawn on top.
-        unit : str
-            Of the samples, such as ``m/s²``; spectra are in its square per Hz.
-        """
-        self._curves = tuple(curves)
-        self.set_ylabel("")
-        self.set_xlabel("")
-        self._draw(unit)
-
-    def _draw(self, unit: str) -> None:
+    def show(self, curves: Sequence[Curve]) -> None:
+        """Draw these curves and no others; the last one on top."""
         self.clear()
-        if not self._curves:
+        if not curves:
             return
-        frequencies = np.concatenate([curve.log_frequency for curve in self._curves])
-        low, high = level_limits(list(self._curves))
+        frequencies = np.concatenate([curve.log_frequency for curve in curves])
+        low, high = level_limits(curves)
         self.set_xlimits(float(frequencies.min()), float(frequencies.max()))
         self.set_ylimits(low, high)
-        rows = max(4, self.size.height - self.margin_top - self.margin_bottom - 2)
+        rows = max(4, self.size.height - self.margin_bottom - 2)
         dot = (high - low) / (rows * DOTS_PER_ROW)
-        self.set_ylabel(f"dB re ({unit})²/Hz")
-        for curve in self._curves:
+        for curve in curves:
             self._draw_band(curve, dot=dot, limits=(low, high))
-        for curve in self._curves:
+        for curve in curves:
             self.plot(
                 curve.log_frequency,
                 curve.level_db,
@@ -110,24 +94,24 @@ class PsdPlot(PlotWidget, can_focus=False):
             )
 
     def _draw_band(self, curve: Curve, *, dot: float, limits: tuple[float, float]) -> None:
-        floor, ceiling = limits
+        """Fill the 95 % interval with dots, two across each column as Braille has them."""
         low = np.clip(np.where(np.isnan(curve.low_db), curve.level_db, curve.low_db), *limits)
         high = np.clip(curve.high_db, *limits)
         known = np.isfinite(low) & np.isfinite(high)
         if known.any():
             counts = np.ceil((high[known] - low[known]) / dot).astype(int) + 1
             step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            x = np.repeat(curve.log_frequency[known], counts)
+            y = np.minimum(np.repeat(low[known], counts) + step * dot, limits[1])
+            half = np.ptp(curve.log_frequency) / (2 * self.n_points)
             self.scatter(
-                np.repeat(curve.log_frequency[known], counts),
-                np.minimum(np.repeat(low[known], counts) + step * dot, ceiling),
+                np.concatenate((x, x + half)),
+                np.concatenate((y, y)),
                 marker_style=curve.band_style,
                 hires_mode=HiResMode.BRAILLE,
             )
         below = np.isfinite(curve.high_db) & np.isnan(curve.level_db)
         if below.any():  # the estimate came out negative: all that is known is an upper bound
             self.scatter(
-                curve.log_frequency[below],
-                np.maximum(high[below], floor),
-                marker="▾",
-                marker_style=curve.style,
+                curve.log_frequency[below], high[below], marker="▾", marker_style=curve.style
             )

@@ -18,6 +18,7 @@ from tui.options import (
     MethodOption,
     OutOption,
     UnitOption,
+    frequencies,
 )
 
 
@@ -79,7 +80,7 @@ def run(
         out=out,
         method=method,
         unit=unit,
-        band=band,
+        band=frequencies(band),
         json=json,
         csv=csv,
     )

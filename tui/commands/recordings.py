@@ -21,6 +21,7 @@ from tui.options import (
     SegmentOption,
     UnitOption,
     WindowOption,
+    frequencies,
 )
 
 
@@ -67,7 +68,7 @@ def estimate(
         start=start,
         end=end,
         unit=unit,
-        band=band,
+        band=frequencies(band),
         json=json,
         csv=csv,
     )

@@ -1,0 +1,89 @@
+"""What the application can do about recorders; the seam its tests stand at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from rich.text import Text
+
+from daq.errors import RecordingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rich.console import RenderableType
+
+    from daq.estimation import Settings
+
+
+class Controls(Protocol):
+    """Starts, stops, marks and finds recorders of one bench."""
+
+    @property
+    def name(self) -> str:
+        """What is worked on, for the status line."""
+        ...
+
+    @property
+    def settings(self) -> Settings | None:
+        """How to estimate; None for what the recording says."""
+        ...
+
+    @property
+    def can_start(self) -> bool:
+        """Whether a recording can be started from here."""
+        ...
+
+    def description(self) -> RenderableType:
+        """Return what to show while there is no recording."""
+        ...
+
+    def start(self) -> Path:
+        """Start a recorder; returns its file once that is there. Blocks."""
+        ...
+
+    def find_running(self) -> Path | None:
+        """Return the file of a recorder that runs already."""
+        ...
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder of a file to stop."""
+        ...
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder of a file to record a remark."""
+        ...
+
+
+@dataclass(frozen=True)
+class Onlooker:
+    """Controls of somebody who only looks at a recording."""
+
+    path: Path
+    settings: Settings | None = None
+
+    can_start = False
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    def description(self) -> Text:
+        """Nothing is to be seen yet."""
+        return Text("opening …", "#9aa5b8")
+
+    def start(self) -> Path:
+        """Refuse."""
+        raise RecordingError(f"{self.path}: a recording cannot be started again")
+
+    def find_running(self) -> Path | None:
+        """Return the recording itself."""
+        return self.path
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder to stop."""
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder to record a remark."""

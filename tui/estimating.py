@@ -1,0 +1,98 @@
+"""``huddle estimate``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from daq.bench import parse_duration
+from daq.estimation import Settings, estimate
+from daq.recording.reader import Recording
+from tui.output import for_people, notices, write_json, write_text
+from tui.results import curves_csv, document, remarks, result_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from daq.estimation import Snapshot
+
+
+def estimate_recordings(
+    files: Sequence[Path],
+    *,
+    start: str | None,
+    end: str | None,
+    json: str | None,
+    csv: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of Settings
+) -> None:
+    """Estimate, with settings from the first recording where none are given, and show the result.
+
+    ``wanted`` holds method, segment, overlap, window, detrend, correct, unit and band, each None
+    where not given.
+    """
+    with Recording.open(files[0]) as recording:
+        settings = chosen(Settings.of(recording.bench), **wanted)
+        settings = replace(
+            settings,
+            start=_instant(start, recording.created),
+            end=_instant(end, recording.created),
+        )
+    with Progress(
+        TextColumn("segments"),
+        BarColumn(),
+        TextColumn("{task.completed} of {task.total}"),
+        TimeRemainingColumn(),
+        console=notices(),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("")
+        snapshot = estimate(
+            files,
+            settings,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    show_result(snapshot, settings, json=json, csv=csv)
+
+
+def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of Settings
+    """Return settings with everything replaced that is not None."""
+    changes = {key: value for key, value in wanted.items() if value is not None}
+    if method is not None:
+        changes["methods"] = (str(method),)
+    return replace(settings, **changes)
+
+
+def show_result(
+    snapshot: Snapshot, settings: Settings, *, json: str | None, csv: str | None
+) -> None:
+    """Print the table for people, and write what programs asked for."""
+    screen = for_people(json, csv)
+    screen.print(result_table(snapshot, settings))
+    for line in remarks(snapshot):
+        screen.print(line)
+    write_json(json, document(snapshot))
+    if csv is not None:
+        write_text(csv, curves_csv(snapshot))
+
+
+def _instant(text: str | None, created: datetime) -> datetime | None:
+    """Return a UTC time, or a time after the start of the recording, as an instant."""
+    if text is None:
+        return None
+    try:
+        return created + timedelta(seconds=parse_duration(text))
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r}: expected UTC as in 2026-11-21T03:00:00, or a time after the start as in 2h"
+        ) from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

@@ -1,0 +1,186 @@
+"""A finished estimate as a table, as JSON and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, is_dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from estimator.windows import get_window
+from tui.bands import band_edges, band_means, bin_correlation
+from tui.text import clock_time, interval, level, utc
+
+if TYPE_CHECKING:
+    from daq.estimation import Settings, Snapshot
+    from estimator.self_noise import SelfNoise
+    from tui.bands import BandMeans, FloatArray
+
+_SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
+
+
+def correlation_of(settings: Settings) -> FloatArray:
+    """Return the correlation of neighbouring frequencies under these settings."""
+    window = get_window(settings.window, _SHAPE_LENGTH)
+    return bin_correlation(window, max(1, round(_SHAPE_LENGTH * (1 - settings.overlap))))
+
+
+def band_of(settings: Settings, frequency: FloatArray) -> tuple[float, float]:
+    """Return the band that was asked for, or all that is usable: up to 0.45 of the rate."""
+    return settings.band or (float(frequency[1]), 0.9 * float(frequency[-1]))
+
+
+def channel_means(
+    noise: SelfNoise, frequency: FloatArray, settings: Settings, band: tuple[float, float]
+) -> tuple[BandMeans, ...]:
+    """Return the mean noise of every channel in a band, each with its 95 % interval."""
+    edges = band_edges(frequency, band)
+    correlation = correlation_of(settings)
+    return tuple(
+        band_means(noise.noise_psd[:, column], noise.cov[:, column], edges, correlation)
+        for column in range(noise.noise_psd.shape[1])
+    )
+
+
+def result_table(snapshot: Snapshot, settings: Settings) -> Table:
+    """Return the noise of every channel in the band, by each method."""
+    band = band_of(settings, snapshot.frequency)
+    table = Table(
+        title=f"Self-noise, mean over {band[0]:.3g} to {band[1]:.3g} Hz, "
+        f"dB re 1 ({snapshot.unit})²/Hz, 95 % interval",
+        title_justify="left",
+        title_style="bold",
+        box=None,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+    )
+    table.add_column("sensor")
+    table.add_column("channel")
+    table.add_column("data", justify="right")
+    columns = []
+    for method, noise in snapshot.results.items():
+        table.add_column(method, justify="right")
+        table.add_column("95 %")
+        columns.append(channel_means(noise, snapshot.frequency, settings, band))
+    inside = slice(*band_edges(snapshot.frequency, band))
+    data = snapshot.data_psd[inside].mean(axis=0)
+    for number, label in enumerate(snapshot.channels):
+        row = [label.sensor, label.channel, level(float(data[number]))]
+        for means in columns:
+            mean = means[number]
+            row.append(level(float(mean.mean[0])))
+            row.append(interval(float(mean.low[0]), float(mean.high[0])))
+        table.add_row(*row)
+    return table
+
+
+def remarks(snapshot: Snapshot) -> list[str]:
+    """Return what must be said beside the numbers, in plain words."""
+    taken = f"{snapshot.n_segments} segments ({snapshot.n_effective:.0f} effective averages)"
+    lines = [f"{taken} from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"]
+    if snapshot.n_dropped:
+        lines.append(f"{snapshot.n_dropped} segments left out: a sensor has a gap there")
+    lines += [
+        f"{sensor.name}: {sensor.n_gaps} gaps, {sensor.n_missing} samples missing"
+        for sensor in snapshot.sensors
+        if sensor.n_gaps
+    ]
+    for method, noise in snapshot.results.items():
+        negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
+        if negative:
+            lines.append(
+                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values came out at or below "
+                "zero: noise lost in scatter, or misalignment"
+            )
+    lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
+    return lines
+
+
+def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
+    """Return one method's result as the JSON that ``--json`` writes (design.md)."""
+    noise = snapshot.results[method]
+    data = snapshot.data_psd
+    return {
+        "method": method,
+        "segments": snapshot.n_segments,
+        "effective_averages": snapshot.n_effective,
+        "frequency_hz": snapshot.frequency.tolist(),
+        "channels": [
+            {
+                "sensor": label.sensor,
+                "channel": label.channel,
+                "unit": label.unit,
+                "data_psd": data[:, column].tolist(),
+                "noise_psd": noise.noise_psd[:, column].tolist(),
+                "noise_psd_low": noise.low[:, column].tolist(),
+                "noise_psd_high": noise.high[:, column].tolist(),
+                "cov": noise.cov[:, column].tolist(),
+            }
+            for column, label in enumerate(snapshot.channels)
+        ],
+        "diagnostics": _diagnostics(snapshot),
+    }
+
+
+def document(snapshot: Snapshot) -> dict[str, Any]:
+    """Return the JSON of a result: of its one method, or of all of them under ``results``."""
+    documents = [result_document(snapshot, method) for method in snapshot.results]
+    return documents[0] if len(documents) == 1 else {"results": documents}
+
+
+def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
+    return {
+        "elapsed": snapshot.elapsed,
+        "dropped_segments": snapshot.n_dropped,
+        "start_utc_ns": snapshot.start_utc_ns,
+        "closed": snapshot.closed,
+        "refused": snapshot.refused,
+        "sensors": [asdict(sensor) for sensor in snapshot.sensors],
+        "clocks": [asdict(clock) for clock in snapshot.clocks],
+    } | {key: plain(value) for key, value in snapshot.diagnostics.items()}
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401 - any result of a diagnostic
+    """Return dataclasses and arrays as what JSON knows."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {name: getattr(value, name) for name in value.__dataclass_fields__}
+    if isinstance(value, np.ndarray | np.generic):
+        if np.iscomplexobj(value):
+            value = {"real": value.real, "imag": value.imag}
+        else:
+            return value.tolist()
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return value
+
+
+def curves_csv(snapshot: Snapshot) -> str:
+    """Return all curves as CSV: a row per frequency, a group of columns per channel and method."""
+    header = ["frequency (Hz)"]
+    columns = [snapshot.frequency]
+    for number, label in enumerate(snapshot.channels):
+        name, unit = f"{label.sensor}.{label.channel}", f"(({label.unit})²/Hz)"
+        header.append(f"{name} data {unit}")
+        columns.append(snapshot.data_psd[:, number])
+        for method, noise in snapshot.results.items():
+            header += [f"{name} {method} {what} {unit}" for what in ("noise", "low", "high")]
+            header.append(f"{name} {method} cov")
+            columns += [
+                values[:, number] for values in (noise.noise_psd, noise.low, noise.high, noise.cov)
+            ]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in np.stack(columns, axis=1):
+        writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
+    return text.getvalue()
+
+
+def with_band(settings: Settings, band: tuple[float, float] | None) -> Settings:
+    """Return settings for another band, or the same ones."""
+    return settings if band is None else replace(settings, band=band)
