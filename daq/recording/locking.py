@@ -1,8 +1,8 @@
 """Says to others that a recording is being written.
 
-HDF5 takes a ``flock`` when it opens a file and lets it go when a writer turns to SWMR. The writer
-then holds a shared one of its own: readers (shared, for an instant) pass, but whoever opens the
-file for writing, h5py included, is refused. The lock goes with the process, however that ends.
+HDF5's own lock goes when a writer turns to SWMR, so the writer holds a shared ``flock`` of its own:
+our readers take none, and other readers a shared one; but whoever opens the file for writing,
+plain h5py included, is refused. The lock goes with the process, however that ends.
 """
 
 from __future__ import annotations

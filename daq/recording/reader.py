@@ -40,7 +40,7 @@ class _Rows:
     def take(self, n_rows: int) -> None:
         """Read up to ``n_rows``."""
         if n_rows > self.n_rows:
-            self._dataset.id.refresh()
+            self._dataset.refresh()
             self._parts.append(self._dataset[self.n_rows : n_rows])
             self.n_rows = n_rows
 
@@ -75,6 +75,7 @@ class SensorRecord:
         """Rows a chunk holds: reading multiples of it is fastest."""
         self._blocks = _Rows(group["blocks"])
         self._gaps = _Rows(group["gaps"])
+        self._n_blocks = 0
         self.n_samples = 0
         """Number of committed rows of samples."""
 
@@ -84,9 +85,14 @@ class SensorRecord:
         return self._instants is not None
 
     @property
+    def n_written(self) -> int:
+        """Number of rows in the file, those never committed included."""
+        return int(self._samples.shape[0])
+
+    @property
     def blocks(self) -> NDArray[np.void]:
         """Committed blocks, dtype :data:`daq.recording.layout.BLOCK_DTYPE`."""
-        return self._blocks.rows()
+        return self._blocks.rows()[: self._n_blocks]
 
     @property
     def gaps(self) -> NDArray[np.void]:
@@ -146,7 +152,7 @@ class SensorRecord:
 
     def take(self, counts: NDArray[np.int64]) -> bool:
         """Take over what was committed (a row of ``/committed``); return whether that is news."""
-        before = self.n_samples, self._blocks.n_rows, self._gaps.n_rows
+        before = self.n_samples, self._gaps.n_rows
         self._blocks.take(int(counts[layout.BLOCKS]))
         self._gaps.take(int(counts[layout.GAPS]))
         blocks = self._blocks.rows()
@@ -155,11 +161,11 @@ class SensorRecord:
         n_whole = int(np.searchsorted(ends, int(counts[layout.ROWS]), side="right"))
         n_samples = int(ends[n_whole - 1]) if n_whole else 0
         if n_samples > self.n_samples:
-            self._samples.id.refresh()
+            self._samples.refresh()
             if self._instants is not None:
-                self._instants.id.refresh()
-            self.n_samples = n_samples
-        return before != (self.n_samples, self._blocks.n_rows, self._gaps.n_rows)
+                self._instants.refresh()
+            self._n_blocks, self.n_samples = n_whole, n_samples
+        return before != (self.n_samples, self._gaps.n_rows)
 
 
 class Recording:
@@ -207,7 +213,7 @@ class Recording:
         path = Path(path)
         check_superblock(path)
         try:
-            file = h5py.File(path, "r", libver="latest", swmr=True)
+            file = h5py.File(path, "r", libver="latest", swmr=True, locking=False)
         except (OSError, RuntimeError) as error:
             raise NotARecordingError(f"{path}: cannot be opened as HDF5: {error}") from error
         try:
@@ -267,7 +273,7 @@ class Recording:
         if self.closed:
             return False
         try:
-            self._committed.id.refresh()
+            self._committed.refresh()
             counts: NDArray[np.int64] = self._committed[...]
             news = [s.take(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
             n_events = self._events.n_rows
@@ -303,13 +309,13 @@ def check_superblock(path: Path) -> None:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     if head[:8] != b"\x89HDF\r\n\x1a\n":
         raise NotARecordingError(f"{path}: not a huddle recording, not even an HDF5 file")
-    # Superblock version 3: consistency flags in byte 11, end of file in bytes 28 to 35.
-    if len(head) == 48 and head[8] == 3 and head[11] == 0:
-        end = struct.unpack_from("<Q", head, 28)[0]
-        if end > n_bytes:
-            raise NotARecordingError(
-                f"{path}: truncated: {n_bytes} of {end} bytes are there; fetch it again"
-            )
+    # Superblock version 3: end of file in bytes 28 to 35. HDF5 itself reads what is cut short again
+    # and again, for ever, in case a writer is about to complete it.
+    end = struct.unpack_from("<Q", head, 28)[0] if len(head) == 48 and head[8] == 3 else 48
+    if end > n_bytes:
+        raise NotARecordingError(
+            f"{path}: truncated: {n_bytes} of {end} bytes are there; fetch it again"
+        )
 
 
 def check_format(path: Path, file: h5py.File) -> None:

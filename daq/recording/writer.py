@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import uuid
 import zlib
 from dataclasses import dataclass
@@ -158,6 +159,8 @@ class _SensorWriter:
         written = self.samples.n_written
         if self.instants is not None:
             written = min(written, self.instants.n_written)
+        if self._n_rows == written:
+            self._end_current()
         done = 0
         for row in self._whole:
             if row["first_row"][0] + row["n_samples"][0] > written:
@@ -293,7 +296,7 @@ class RecordingWriter:
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             # Little cache: chunks are written whole and never looked at again.
-            file = h5py.File(temporary, "w", libver=LIBVER, rdcc_nbytes=64 * 1024)
+            file = h5py.File(temporary, "w", libver=LIBVER, rdcc_nbytes=64 * 1024, locking=False)
             try:
                 _describe(file, bench, created, control, attributes or {})
                 _make_datasets(file, sensors, chunk_seconds)
@@ -301,7 +304,7 @@ class RecordingWriter:
                 writer = cls(path, file, sensors, WriterLock(temporary))
                 writer._sync()
                 temporary.rename(path)
-                _sync_directory(path.parent)
+                sync_directory(path.parent)
             except BaseException:
                 with contextlib.suppress(OSError, RuntimeError):
                     file.close()
@@ -413,8 +416,10 @@ def _as_recording_error(path: Path) -> Iterator[None]:
     except RecordingError:
         raise
     except (OSError, RuntimeError) as error:
-        # HDF5 reports a full disk as RuntimeError with the errno in its text.
-        raise RecordingError(f"{path}: cannot be written: {error}") from error
+        # HDF5 reports a full disk as RuntimeError, with the system's message within its own.
+        system = re.search(r"error message = '([^']+)'", str(error))
+        reason = system[1] if system else error
+        raise RecordingError(f"{path}: cannot be written: {reason}") from error
 
 
 def _fixed(text: str, n_bytes: int) -> bytes:
@@ -496,7 +501,7 @@ def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int)
     group.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(n_rows,), dtype=dtype)
 
 
-def _sync_directory(path: Path) -> None:
+def sync_directory(path: Path) -> None:
     """Make a new name in a directory survive a power loss."""
     handle = os.open(path, os.O_RDONLY)
     try:
