@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator import fisher
-from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.factor_analysis import Maximum, maximise
+from estimator.coherency import check_dims, coherency
+from estimator.errors import InsufficientDataError
+from estimator.factor_analysis import Maximum, max_factors, maximise
 from estimator.self_noise import Flag, SelfNoise
 
 if TYPE_CHECKING:
-    from estimator.arrays import ComplexArray, FloatArray, IntArray
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+    from estimator.coherency import Coherency
 
 NOISE_SPREAD = 0.5
 
@@ -33,7 +35,7 @@ def maximum_likelihood(
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor. A frequency that is not finite or not positive definite
-        is flagged, and NaN.
+        is flagged, and NaN; so are channels that are dead or equal, without loss to the others.
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
@@ -58,7 +60,7 @@ def maximum_likelihood(
     Raises
     ------
     InvalidMatrixError
-        If the shape does not fit `dims`.
+        As `estimator.coherency.coherency` says.
     InsufficientDataError
         If there are fewer than three sensors, fewer averages than channels, or too many
         factors for as many channels.
@@ -71,14 +73,9 @@ def maximum_likelihood(
     What then is left was measured on three equal sensors of 1, 2 and 3 channels: under 0.5 % at
     n = 20 for an SNR of 10 and more, under 0.2 % at n = 1080 for an SNR of 0.1 and more.
     """
-    n_freqs, p = csm.shape[0], sum(dims)
-    if csm.shape != (n_freqs, p, p):
-        raise InvalidMatrixError(
-            f"cross-spectral matrix of shape {csm.shape}, expected (n_freqs, {p}, {p}) "
-            f"for sensors of {dims} channels"
-        )
-    if len(dims) < 3:
-        raise InsufficientDataError(f"{len(dims)} sensors: at least three are needed")
+    check_dims(dims)
+    given = coherency(csm, dims)
+    n_freqs, p = given.psd.shape
     if n_effective < p:
         raise InsufficientDataError(
             f"{n_effective:.1f} averages of {p} channels: at least as many averages as channels "
@@ -87,12 +84,20 @@ def maximum_likelihood(
     factors = np.broadcast_to(
         np.asarray(max(dims) if n_factors is None else n_factors, np.int64), (n_freqs,)
     )
+    if factors.max() > max_factors(p):
+        raise InsufficientDataError(
+            f"{factors.max()} factors of motion cannot be told from the noise of {p} channels: "
+            f"at most {max_factors(p)} can"
+        )
+    matrix, absent = _without_dead_and_copies(given)
+    few = (p - absent.sum(axis=1) - factors) ** 2 < p - absent.sum(axis=1)
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
-    flags = np.zeros((n_freqs, p), np.int64)
-    for q in np.unique(factors):
-        here = np.flatnonzero(factors == q)
+    flags = given.flags.copy()
+    flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
+    for q in np.unique(factors[~few]):
+        here = np.flatnonzero((factors == q) & ~few)
         maximum = maximise(
-            csm[here],
+            matrix[here],
             int(q),
             penalty=alike(dims, noise_spread, n_effective) if q > max(dims) else None,
         )
@@ -106,9 +111,28 @@ def maximum_likelihood(
         flags[here] |= np.where(maximum.singular, Flag.SINGULAR, 0)[:, None]
         lost = ~maximum.converged & ~maximum.singular
         flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
-    flags |= np.where(np.isfinite(csm).all(axis=(1, 2)), 0, Flag.NOT_FINITE)[:, None]
-    flags |= np.where(np.einsum("fii->fi", csm) == 0, Flag.DEAD_CHANNEL, 0)
-    return SelfNoise("maximum-likelihood", noise_psd, cov, low, high, flags)
+    unknown = (given.flags & (Flag.NOT_FINITE | Flag.DEAD_CHANNEL | Flag.DUPLICATE)) != 0
+    for result in (noise_psd, cov, low, high):
+        result[unknown] = np.nan
+    return SelfNoise(
+        "maximum-likelihood", noise_psd * given.psd, cov, low * given.psd, high * given.psd, flags
+    )
+
+
+def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]:
+    """Put a channel of independent unit noise where one is dead or repeats an earlier one.
+
+    Such a channel takes no part in the motion, and the likelihood of the others is what it would
+    be without it.
+    """
+    p = given.psd.shape[1]
+    absent = (given.flags & Flag.DEAD_CHANNEL) != 0
+    absent |= (given.duplicates & np.tri(p, k=-1, dtype=np.bool_)).any(axis=2)
+    present = ~absent
+    matrix = given.matrix * (present[:, :, None] & present[:, None, :])
+    i = np.arange(p)
+    matrix[:, i, i] += absent
+    return matrix, absent
 
 
 def alike(dims: tuple[int, ...], spread: float, n_effective: float) -> FloatArray:

@@ -158,7 +158,7 @@ def test_precise_as_the_bound_unbiased_and_sure_of_it(geometry: str, n_averages:
     A sample c.o.v. of m draws scatters by 1/sqrt(2 m) (more for the skewed: 1.5 allows it),
     the mean by cov/sqrt(m), coverage by sqrt(.05 .95/m).
     """
-    n_draws = 2000
+    n_draws = 1500
     csm, noise_psd, dims = GEOMETRIES[geometry]
     bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=n_averages)[0]
     draws = wishart(csm, n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
@@ -187,9 +187,9 @@ def test_five_triaxial_sensors_reach_four_percent() -> None:
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
-@pytest.mark.parametrize("snr", [10.0, 1e3, 1e6])
+@pytest.mark.parametrize("snr", [10.0, 1e6])
 def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
-    n_draws = 4000
+    n_draws = 2500
     rng = np.random.default_rng(16)
     csm = equal_noise(17, dims=(d,) * 3, snr=snr)
     found = maximum_likelihood(
@@ -206,7 +206,7 @@ def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [1e-1, 1.0, 1e2, 1e6])
 def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
-    n_draws = 1500
+    n_draws = 1000
     csm = equal_noise(18, dims=(d,) * 3, snr=snr)
     draws = wishart(csm, 1080, np.random.default_rng(19), n_draws=n_draws)
     found = maximum_likelihood(draws, dims=(d,) * 3, n_effective=1080)
@@ -220,25 +220,58 @@ def test_one_bad_frequency_costs_the_others_nothing() -> None:
     csm = wishart(equal_noise(21, dims=(3, 3, 3), snr=1e2), 200, rng, n_draws=6)
     good = maximum_likelihood(csm, dims=(3, 3, 3), n_effective=200)
     csm[0, 2, 3] = np.nan
-    csm[1, 4, :] = csm[1, :, 4] = 0
-    csm[2, 5], csm[2, :, 5] = csm[2, 1], csm[2, :, 1]
-    csm[2, 5, 5] = csm[2, 1, 1]
+    csm[1] = np.ones((9, 9)) + 1e-15 * np.eye(9)
     bad = maximum_likelihood(csm, dims=(3, 3, 3), n_effective=200)
-    assert np.isnan(bad.noise_psd[:3]).all()
-    assert np.all(bad.flags[:3] & Flag.SINGULAR)
-    assert np.all(bad.flags[0] & Flag.NOT_FINITE)
-    assert bad.flags[1, 4] & Flag.DEAD_CHANNEL
-    np.testing.assert_array_equal(bad.noise_psd[3:], good.noise_psd[3:])
-    assert not bad.flags[3:].any()
+    assert np.isnan(bad.noise_psd[:2]).all()
+    assert np.all(bad.flags[0] == Flag.NOT_FINITE)
+    assert np.all(bad.flags[1] & Flag.DUPLICATE)
+    np.testing.assert_allclose(bad.noise_psd[2:], good.noise_psd[2:], rtol=1e-9)
+    assert not bad.flags[2:].any()
+
+
+def test_a_singular_frequency_is_flagged() -> None:
+    rng = np.random.default_rng(24)
+    csm = wishart(equal_noise(21, dims=(3, 3, 3), snr=1e2), 200, rng, n_draws=3)
+    segments = rng.standard_normal((5, 9)) + 1j * rng.standard_normal((5, 9))
+    csm[1] = segments.T @ segments.conj() / 5
+    found = maximum_likelihood(csm, dims=(3, 3, 3), n_effective=200)
+    assert np.all(found.flags[1] == Flag.SINGULAR)
+    assert np.isnan(found.noise_psd[1]).all()
+    assert not found.flags[[0, 2]].any()
+
+
+def test_dead_and_copied_channels_cost_the_others_nothing() -> None:
+    rng = np.random.default_rng(23)
+    csm = wishart(equal_noise(21, dims=(3, 3, 3), snr=1e2), 200, rng, n_draws=2)
+    rest = [0, 1, 2, 3, 5, 6, 7, 8]
+    without = maximise(csm[:, rest][:, :, rest], 3)
+    dead, copied = csm.copy(), csm.copy()
+    dead[:1, 4, :] = dead[:1, :, 4] = 0
+    copied[:, 4], copied[:, :, 4] = copied[:, 1], copied[:, :, 1]
+    copied[:, 4, 4] = copied[:, 1, 1]
+    for bad, flag in ((dead, Flag.DEAD_CHANNEL), (copied, Flag.DUPLICATE)):
+        found = maximum_likelihood(bad, dims=(3, 3, 3), n_effective=200, correct=False)
+        assert found.flags[0, 4] == flag
+        assert np.isnan(found.noise_psd[0, 4])
+        known = [0, 2, 3, 5, 6, 7, 8]
+        expected = without.psi[0, [rest.index(i) for i in known]]
+        np.testing.assert_allclose(found.noise_psd[0, known], expected, rtol=1e-5)
+    three = np.eye(3)[None] + 100.0
+    three[0, 2, :] = three[0, :, 2] = 0
+    lonely = np.concatenate([three, np.eye(3)[None] + 100.0])
+    found = maximum_likelihood(lonely.astype(np.complex128), dims=(1, 1, 1), n_effective=200)
+    assert found.flags[0].tolist() == [Flag.NO_COUNTERPART] * 2 + [Flag.DEAD_CHANNEL]
 
 
 def test_refuses_what_cannot_be_known() -> None:
     csm = np.eye(9)[None].astype(np.complex128)
     with pytest.raises(InsufficientDataError, match="at most 6"):
         maximise(csm, 7)
+    with pytest.raises(InsufficientDataError, match="at most 6"):
+        maximum_likelihood(csm, dims=(3, 3, 3), n_effective=100, n_factors=7)
     with pytest.raises(InsufficientDataError, match="averages"):
         maximum_likelihood(csm, dims=(3, 3, 3), n_effective=8)
-    with pytest.raises(InsufficientDataError, match="three"):
+    with pytest.raises(InsufficientDataError, match="at least 3"):
         maximum_likelihood(csm, dims=(5, 4), n_effective=100)
     with pytest.raises(InvalidMatrixError, match=r"\(1, 9, 9\)"):
         maximum_likelihood(csm, dims=(3, 3, 2), n_effective=100)
