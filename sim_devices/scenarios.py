@@ -177,7 +177,7 @@ def setup1(*, seed: int = 0) -> Scenario:
     return laboratory({"A": 60.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
 
 
-def setup2(*, seed: int = 0) -> Scenario:
+def setup2(*, seed: int = 1) -> Scenario:
     """As set-up 1, A turned back by 15°."""
     return laboratory({"A": 45.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
 

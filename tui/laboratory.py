@@ -1,0 +1,264 @@
+"""The laboratory set-ups: five triaxial sensors side by side, Table 1 and Fig. 14.
+
+Segments are 10 s with a Hann window and half overlap: the paper's rectangular ones would leak the
+motion at the structure's modes into bins where it is ten thousand times weaker. Theory is the
+estimator's limit on the true cross-spectral matrix as such segments see it, that is (13) and (30)
+with the coherence of the field and the resolution of the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.methods import self_noise
+from estimator.spectra import CrossSpectra, WelchSettings
+from estimator.windows import get_window
+from sim_devices import scenarios
+from tui.bands import bin_correlation
+from tui.studies import Curve, Panel, Point, Series, Study
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from sim_devices.scenario import Scenario
+    from tui.studies import Told
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+HANN = WelchSettings(
+    sampling_rate=scenarios.SAMPLING_RATE, segment_length=2000, overlap=0.5, window="hann"
+)
+DURATION = 3 * 3600.0
+SHOWN = slice(5, 901)
+"""0.5 to 90 Hz."""
+BANDS = ((2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, 80.0))
+FINE = 8
+"""Points of the true spectrum per bin, where the window smooths it."""
+REACH = 3
+"""Bins to each side from which a Hann window takes power."""
+PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
+BIAS_LABEL = "fractional bias (1)"
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A scenario's cross-spectral matrix, and what it would be without statistical error."""
+
+    scenario: Scenario
+    csm: ComplexArray
+    limit: ComplexArray
+    n_effective: float
+
+    def of(self, csm: ComplexArray, sensors: tuple[str, ...]) -> ComplexArray:
+        """Return the part of a matrix that belongs to some sensors, in their order."""
+        first = {name: 3 * number for number, name in enumerate(self.scenario.names)}
+        used = np.concatenate([first[name] + np.arange(3) for name in sensors])
+        return csm[:, used][:, :, used]
+
+
+class Laboratory:
+    """The set-ups' cross-spectral matrices, simulated when first wanted."""
+
+    def __init__(self, told: Told, *, length: float = 1.0) -> None:
+        self._told = told
+        self._duration = DURATION * length
+        self._measured: dict[str, Measured] = {}
+
+    def measured(self, name: str) -> Measured:
+        """Simulate a named scenario at the paper's length, and transform what its sensors read."""
+        if name not in self._measured:
+            self._measured[name] = measure(
+                scenarios.named(name),
+                duration=self._duration,
+                told=lambda share: self._told(f"{name}: five triaxial sensors", share),
+            )
+        return self._measured[name]
+
+
+def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None]) -> Measured:
+    """Simulate triaxial sensors for a duration in seconds, and transform what they read."""
+    spectra = CrossSpectra(HANN, 3 * len(scenario.names))
+    length, hop = HANN.segment_length, HANN.hop
+    n_samples = round(duration * HANN.sampling_rate)
+    at_once = 40 * hop
+    kept = np.empty((0, spectra.n_channels))
+    for first in range(0, n_samples, at_once):
+        n = min(at_once, n_samples - first)
+        samples = [scenario.samples(name, first, n) for name in scenario.names]
+        kept = np.concatenate([kept, np.concatenate(samples, axis=1)])
+        starts = np.arange(0, len(kept) - length + 1, hop)
+        spectra.add(kept, starts)
+        kept = kept[len(starts) * hop :]
+        told((first + n) / n_samples)
+    return Measured(
+        scenario=scenario,
+        csm=spectra.csm()[SHOWN],
+        limit=expected_csm(scenario, HANN)[SHOWN],
+        n_effective=spectra.n_effective,
+    )
+
+
+def expected_csm(scenario: Scenario, settings: WelchSettings) -> ComplexArray:
+    """Cross-spectral matrix that windowed segments of a scenario have on average.
+
+    Returns
+    -------
+    complex128, shape (n_freqs, n_channels, n_channels)
+        The true matrix, smoothed by the power of the window's transform.
+    """
+    window = get_window(settings.window, settings.segment_length)
+    offsets = np.arange(-REACH * FINE, REACH * FINE + 1) / FINE
+    turns = np.outer(offsets, np.arange(settings.segment_length)) / settings.segment_length
+    weights = np.abs(np.exp(-2j * np.pi * turns) @ window) ** 2
+    weights /= weights.sum()
+    bin_width = settings.sampling_rate / settings.segment_length
+    expected = np.zeros((), dtype=complex)
+    for offset, weight in zip(offsets, weights, strict=True):
+        frequency = settings.frequencies + offset * bin_width
+        folded = scenario.true_csm(scenario.names, np.abs(frequency))
+        expected = expected + weight * np.where(frequency[:, None, None] < 0, folded.conj(), folded)
+    return np.asarray(expected)
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseOfTarget:
+    """Noise of the first channel of the first sensor, measured and in the limit."""
+
+    estimate: FloatArray
+    limit: FloatArray
+    deviation: FloatArray
+    truth: FloatArray
+
+
+def estimate(measured: Measured, sensors: tuple[str, ...], method: str) -> NoiseOfTarget:
+    """Estimate the target's noise from some sensors' channels."""
+    dims, n = (3,) * len(sensors), measured.n_effective
+    limit = measured.of(measured.limit, sensors)
+    found = self_noise(method, measured.of(measured.csm, sensors), dims=dims, n_effective=n)
+    predicted = self_noise(method, limit, dims=dims, n_effective=n)
+    unbiased = self_noise(method, limit, dims=dims, n_effective=n, correct=False)
+    frequency = HANN.frequencies[SHOWN]
+    return NoiseOfTarget(
+        estimate=found.noise_psd[:, 0],
+        limit=unbiased.noise_psd[:, 0],
+        deviation=predicted.cov[:, 0] * np.abs(predicted.noise_psd[:, 0]),
+        truth=measured.scenario.true_noise_psd(sensors[0], 0, frequency),
+    )
+
+
+def bands(noise: NoiseOfTarget, *, label: str, method: str) -> Series:
+    """Mean fractional bias over each band, beside its limit."""
+    frequency = HANN.frequencies[SHOWN]
+    window = get_window(HANN.window, HANN.segment_length)
+    correlation = bin_correlation(window, HANN.hop)
+    points = []
+    for low, high in BANDS:
+        band = (frequency >= low) & (frequency < high)
+        truth = noise.truth[band]
+        spread = noise.deviation[band] / truth
+        together = np.convolve(spread, np.r_[correlation[:0:-1], correlation], "same") @ spread
+        points.append(
+            Point(
+                x=float(np.sqrt(low * high)),
+                measured=float(np.mean(noise.estimate[band] / truth - 1)),
+                theory=float(np.mean(noise.limit[band] / truth - 1)),
+                error=float(np.sqrt(together) / band.sum()),
+            )
+        )
+    return Series(label, method, "bias", tuple(points))
+
+
+def case(laboratory: Laboratory, number: str) -> tuple[Panel, Panel]:
+    """Spectra of one case of Table 1, and the bias of both methods by band."""
+    setup, sensors = scenarios.CASES[number]
+    measured = laboratory.measured(setup)
+    three_channel = estimate(measured, sensors, "three-channel")
+    three_sensor = estimate(measured, sensors, "three-sensor")
+    title = f"case {number}: {', '.join(sensors)}"
+    return (
+        Panel(
+            title,
+            FREQUENCY_LABEL,
+            PSD_LABEL,
+            curves=(
+                _record(measured, sensors[0]),
+                _curve("three-channel", three_channel.estimate, "k-"),
+                _curve("three-sensor", three_sensor.estimate, "C0-"),
+                _curve("true noise", three_sensor.truth, "r-"),
+            ),
+            log="xy",
+        ),
+        Panel(
+            f"{title}: bias",
+            FREQUENCY_LABEL,
+            BIAS_LABEL,
+            series=(
+                bands(three_channel, label=f"case {number}", method="three-channel"),
+                bands(three_sensor, label=f"case {number}", method="three-sensor"),
+            ),
+            log="x",
+        ),
+    )
+
+
+def setup1(laboratory: Laboratory) -> Study:
+    """Cases 0, 1 and 2 of Table 1 (Figs. 7 and 10, a to c)."""
+    panels = tuple(panel for number in "012" for panel in case(laboratory, number))
+    return Study("setup1", "Set-up 1: A and B turned by 60°", panels)
+
+
+def setup2(laboratory: Laboratory) -> Study:
+    """Case 3 of Table 1 (Figs. 7d and 10d)."""
+    return Study("setup2", "Set-up 2: A, B and E all turned", case(laboratory, "3"))
+
+
+def fig14(laboratory: Laboratory) -> Study:
+    """Wider triangles, where coherence fails; and what all five sensors make of it."""
+    measured = laboratory.measured("setup1")
+    panels = []
+    for letter, sensors in (("a", ("E", "A", "C")), ("b", ("E", "A", "D"))):
+        found = estimate(measured, sensors, "three-sensor")
+        label = ", ".join(sensors)
+        panels += [
+            Panel(
+                f"({letter}) {label}",
+                FREQUENCY_LABEL,
+                PSD_LABEL,
+                curves=(
+                    _record(measured, "E"),
+                    _curve("three-sensor", found.estimate, "C0-"),
+                    _curve("true noise", found.truth, "r-"),
+                ),
+                log="xy",
+            ),
+            Panel(
+                f"({letter}) {label}: bias",
+                FREQUENCY_LABEL,
+                BIAS_LABEL,
+                series=(bands(found, label=label, method="three-sensor"),),
+                log="x",
+            ),
+        ]
+    return Study("fig14", "Wider triangles: spatial incoherence", tuple(panels))
+
+
+def _record(measured: Measured, sensor: str) -> Curve:
+    power = measured.of(measured.csm, (sensor,))[:, 0, 0].real
+    return _curve("motion and noise", power, "k:")
+
+
+def _curve(label: str, psd: FloatArray, style: str) -> Curve:
+    return Curve(label, HANN.frequencies[SHOWN], np.where(psd > 0, psd, np.nan), style)
+
+
+LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
+    "setup1": setup1,
+    "setup2": setup2,
+    "fig14": fig14,
+}
