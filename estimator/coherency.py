@@ -143,15 +143,15 @@ def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
         Zero where the matrix is singular.
     regular : bool, shape (n,)
     """
+    regular = np.ones(len(matrices), dtype=bool)
     inverses: ComplexArray
     try:
         inverses = np.asarray(np.linalg.inv(matrices), dtype=np.complex128)
     except np.linalg.LinAlgError:  # raised for the whole batch when one of it is singular
-        zero = np.linalg.det(matrices) == 0
+        regular = np.linalg.det(matrices) != 0
         identity = np.eye(matrices.shape[1], dtype=np.complex128)
-        regularised = np.where(zero[:, None, None], identity, matrices)
-        inverses = np.asarray(np.linalg.inv(regularised), dtype=np.complex128)
-        inverses[zero] = np.inf
+        invertible = np.where(regular[:, None, None], matrices, identity)
+        inverses = np.asarray(np.linalg.inv(invertible), dtype=np.complex128)
     condition = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
-    regular = condition < SINGULAR
-    return np.where(regular[:, None, None], inverses, 0), regular
+    regular &= condition < SINGULAR
+    return np.where(regular[:, None, None], inverses, 0j), regular

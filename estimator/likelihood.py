@@ -76,7 +76,7 @@ def maximum_likelihood(
     check_dims(dims)
     given = coherency(csm, dims)
     n_freqs, p = given.psd.shape
-    if n_effective < p:
+    if not n_effective >= p:  # NaN included
         raise InsufficientDataError(
             f"{n_effective:.1f} averages of {p} channels: at least as many averages as channels "
             "are needed"

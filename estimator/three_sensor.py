@@ -23,7 +23,7 @@ import numpy as np
 
 from estimator.coherency import check_averages, check_dims, coherency, inverse
 from estimator.self_noise import Flag, SelfNoise
-from estimator.uncertainty import delta_variance, score_interval
+from estimator.uncertainty import moments, score_interval
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -141,11 +141,11 @@ def _estimate(
             (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
         )
         mean = gain * np.einsum("tf,tfr->fr", weights, [pair.cross.real for pair in pairs])
-        variance, slope = _moments(given.matrix, rows, pairs, weights)
-        variance, slope = gain**2 * np.maximum(variance, 0), gain * slope
+        traces = _traces(given.matrix, rows, pairs, weights)
+        traces *= gain ** np.arange(2, 5)[:, None, None]
         noise[:, rows] = mean
-        deviation[:, rows] = np.sqrt(variance / averages)
-        low[:, rows], high[:, rows] = score_interval(mean, variance, slope, averages=averages)
+        deviation[:, rows] = np.sqrt(np.maximum(traces[0], 0) / averages)
+        low[:, rows], high[:, rows] = score_interval(mean, traces, averages=averages)
     return noise, deviation, low, high, flags
 
 
@@ -171,13 +171,11 @@ def _pair(given: Coherency, i: slice, others: tuple[slice, slice], inverse_jk: _
     return _Pair(j, k, P, Q, cross, regular)
 
 
-def _moments(
-    S: ComplexArray, i: slice, pairs: list[_Pair], weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """``v0`` and ``m`` of `estimator.uncertainty` for the weighted mean of the pairs' estimates.
+def _traces(S: ComplexArray, i: slice, pairs: list[_Pair], weights: FloatArray) -> FloatArray:
+    """`estimator.uncertainty.moments` of the weighted mean of the pairs' estimates.
 
     With W the rows a, b of all pairs, M = W^H omega W, where omega holds half of each pair's
-    weight; so ``tr(M S M S) = tr(omega G omega G)``, where G = W S W^H are the residuals' spectra.
+    weight; so ``tr((M S)**k) = tr((omega G)**k)``, where G = W S W^H are the residuals' spectra.
     """
     n_freqs, n_rows = pairs[0].cross.shape
     n = 2 * len(pairs)
@@ -190,7 +188,4 @@ def _moments(
         W[:, :, b, pair.k] = -pair.Q
         omega[:, 0, a, b] = omega[:, 0, b, a] = weight
     WS = (W.reshape(n_freqs, n_rows * n, -1) @ S).reshape(W.shape)
-    G = WS @ W.conj().swapaxes(-1, -2)
-    row = omega.sum(axis=2, keepdims=True)
-    slope = (row @ G @ row.swapaxes(-1, -2))[:, :, 0, 0].real
-    return delta_variance(G, omega), slope
+    return moments(WS @ W.conj().swapaxes(-1, -2), omega)

@@ -1,11 +1,14 @@
 """How sure a self-noise estimate is.
 
-An estimate of the form ``S_rr - f(the rest of S)`` that scales with S is, to first order, the
-linear function ``tr(M S)`` of the cross-spectral matrix, with a Hermitian M whose ``M_rr`` is 1 and
-which does not depend on ``S_rr``. For a complex Wishart matrix of n averages its variance is
-``tr(M S M S) / n``. As a function of the noise sought, all else the same, this is the quadratic
-``(v0 + 2 m delta + delta**2) / n`` with ``v0 = tr(M S M S)``, ``m = (M S M)_rr``, and ``delta`` the
-distance from the estimate.
+An estimate that scales with the cross-spectral matrix S is, to first order, a linear function
+``tr(M S)`` of it, with a Hermitian differential M. For a complex Wishart matrix of n averages its
+cumulants are those of ``tr(M S)`` with M fixed: variance ``t2 / n`` and third cumulant
+``2 t3 / n**2``, where ``t_k = tr((M S)**k)``.
+
+An interval needs the variance at *other* values of the noise than the one found. Along the least
+favourable direction, ``S + delta S M S / t2``, in which the noise changes by delta and the data can
+tell least, it is ``(t2 + 2 (t3 / t2) delta + (t4 / t2**2) delta**2) / n``: the square of the noise
+for a mere PSD, and constant where leaking motion swamps it.
 """
 
 from __future__ import annotations
@@ -20,50 +23,69 @@ if TYPE_CHECKING:
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
 
-def delta_variance(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
-    """Variance of an estimate times the number of averages.
+def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
+    """Traces from which the scatter of an estimate follows.
 
     Parameters
     ----------
     csm : complex128, shape (..., p, p)
         Cross-spectral matrix S.
-    differential : complex128, shape (..., p, p)
+    differential : complex128 or float64, shape (..., p, p)
         Hermitian M: a small change E of S changes the estimate by ``tr(M E)``.
 
     Returns
     -------
-    float64, shape (...)
-        ``tr(M S M S)``.
+    float64, shape (3, ...)
+        ``tr((M S)**k)`` for k = 2, 3, 4; the first is n times the variance of the estimate.
     """
-    product = differential @ csm
-    return np.asarray(np.einsum("...pq,...qp->...", product, product).real)
+    once = differential @ csm
+    twice = once @ once
+    return np.stack(
+        [
+            np.einsum("...pp->...", twice).real,
+            np.einsum("...pq,...qp->...", once, twice).real,
+            np.einsum("...pq,...qp->...", twice, twice).real,
+        ]
+    )
 
 
 def score_interval(
-    noise: FloatArray, variance: FloatArray, slope: FloatArray, *, averages: float
+    noise: FloatArray, traces: FloatArray, *, averages: float
 ) -> tuple[FloatArray, FloatArray]:
     """95 % interval of an estimate whose variance depends on the value sought.
 
     Parameters
     ----------
-    noise : float64
+    noise : float64, shape (...)
         The estimate.
-    variance, slope : float64
-        ``v0`` and ``m`` of this module's introduction, in the square and the unit of `noise`.
+    traces : float64, shape (3, ...)
+        What `moments` returns, in the square, cube and fourth power of the unit of `noise`.
     averages : float
         Effective averages less those that the estimate has used up.
 
     Returns
     -------
-    low, high : float64
-        All values that lie within 1.96 of *their own* standard deviations of the estimate
-        (Wilson's construction): not symmetric, close to the chi-squared interval where the
-        estimate is a mere PSD, and just as good where it is negative. `high` is infinite for
-        3.84 averages or fewer.
+    low, high : float64, shape (...)
+        The values that lie within 1.96 of *their own* standard deviations of the estimate
+        (Wilson's construction), 1.96 being corrected for skewness (Cornish and Fisher): not
+        symmetric, the chi-squared interval where the estimate is a mere PSD, and just as good
+        where it is negative. `high` is infinite where averages are too few to bound it.
     """
-    kappa = Z95**2 / averages
-    root = np.sqrt(np.maximum((kappa * slope) ** 2 + (1 - kappa) * kappa * variance, 0.0))
-    low = noise - kappa * variance / (root + kappa * slope)
-    if kappa >= 1:
-        return low, np.full_like(noise, np.inf)
-    return low, noise + (root + kappa * slope) / (1 - kappa)
+    t2, t3, t4 = traces
+    certain = t2 <= 0
+    t2 = np.where(certain, 1.0, t2)
+    slope, curvature = t3 / t2, t4 / t2**2
+    skewness = 2 * t3 / np.sqrt(t2**3 * averages)
+    ends = []
+    for side in (-1, 1):
+        z = Z95 - side * skewness * (Z95**2 - 1) / 6
+        kappa = z**2 / averages
+        # delta**2 = kappa (t2 + 2 slope delta + curvature delta**2), solved without cancellation
+        square = 1 - kappa * curvature
+        root = np.sqrt(np.maximum((kappa * slope) ** 2 + square * kappa * t2, 0.0))
+        reach = root - side * kappa * slope
+        bounded = (reach > 0) & ((side < 0) | (square > 0))
+        distance = np.full_like(t2, np.inf)
+        np.divide(kappa * t2, reach, out=distance, where=bounded)
+        ends.append(noise + side * np.where(certain, 0.0, distance))
+    return ends[0], ends[1]
