@@ -4,11 +4,6 @@ Theory of operation
 -------------------
 Nothing here changes a recording in place. A copy beside it is changed, fsynced and renamed over the
 original, so that at any instant there is one good file under its name.
-
-A killed SWMR writer leaves flags in the superblock that forbid a plain open, and an end-of-file
-address that is too small: clearing the flags alone lets HDF5 cut the file there. So flags,
-end-of-file and checksum of the superblock (version 3, HDF5 file format specification II.A) are
-rewritten together.
 """
 
 from __future__ import annotations
@@ -16,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +24,7 @@ from daq.errors import RecordingError
 from daq.recording import layout
 from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording, SensorRecord
+from daq.recording.superblock import Superblock
 from daq.recording.writer import LIBVER, sync_directory
 
 if TYPE_CHECKING:
@@ -40,8 +35,6 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 _ROWS_AT_ONCE = 1 << 18
-_SUPERBLOCK = struct.Struct("<8sBBBBQQQQ")
-_MASK = 0xFFFFFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +106,8 @@ def heal(path: str | Path, *, now: HostTime | None = None) -> Report:
         )
     now = SystemClock().now() if now is None else now
     with _replaced(path) as copy:
-        clear_superblock(copy)
+        with copy.open("r+b") as raw:
+            raw.write(Superblock.of(path).cleared())
         with h5py.File(copy, "r+", libver=LIBVER) as file:
             _cut_to_committed(file, report)
             _add_last_events(file, report, now)
@@ -145,49 +139,6 @@ def write_results(
         for name, values in arrays.items():
             group.create_dataset(name, data=values)
         group.attrs.update(attributes or {})
-
-
-def clear_superblock(path: Path) -> None:
-    """Make a killed file fit for a plain open; what its writer had not finished stays as it is.
-
-    Raises
-    ------
-    RecordingError
-        If the superblock is not of version 3, as all recordings have.
-    """
-    with path.open("r+b") as file:
-        fields = list(_SUPERBLOCK.unpack(file.read(_SUPERBLOCK.size)))
-        if fields[1] != 3:
-            raise RecordingError(f"{path}: superblock version {fields[1]}; expected 3")
-        fields[4] = 0
-        fields[7] = path.stat().st_size
-        head = _SUPERBLOCK.pack(*fields)
-        file.seek(0)
-        file.write(head + struct.pack("<I", lookup3(head)))
-
-
-def lookup3(key: bytes) -> int:
-    """Return Bob Jenkins' lookup3 checksum of a few bytes, with initial value 0 as in HDF5."""
-    a = b = c = (0xDEADBEEF + len(key)) & _MASK
-    if not key:
-        return c
-    padded = key + bytes(-len(key) % 12)
-    words = struct.unpack(f"<{len(padded) // 4}I", padded)
-    for start in range(0, len(words) - 3, 3):
-        a, b, c = ((x + y) & _MASK for x, y in zip((a, b, c), words[start:], strict=False))
-        for rotation in (4, 6, 8, 16, 19, 4):
-            # The roles of a, b and c move on from round to round.
-            a = ((a - c) & _MASK) ^ _rotated(c, rotation)
-            a, b, c = b, (c + b) & _MASK, a
-    a, b, c = ((x + y) & _MASK for x, y in zip((a, b, c), words[-3:], strict=True))
-    for rotation in (14, 11, 25, 16, 4, 14, 24):
-        c = ((c ^ b) - _rotated(b, rotation)) & _MASK
-        a, b, c = b, c, a
-    return b
-
-
-def _rotated(value: int, bits: int) -> int:
-    return ((value << bits) | (value >> (32 - bits))) & _MASK
 
 
 def _verify_sensor(sensor: SensorRecord) -> SensorReport:

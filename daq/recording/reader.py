@@ -7,7 +7,6 @@ what there is; longer datasets are a tail that was never acknowledged.
 from __future__ import annotations
 
 import contextlib
-import struct
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -19,6 +18,8 @@ from daq.bench import parse
 from daq.errors import BenchFileError, NotARecordingError, RecordingError
 from daq.protocols.block import Event, HostTime
 from daq.recording import layout
+from daq.recording.locking import is_being_written
+from daq.recording.superblock import ClearedFile, Superblock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -211,11 +212,7 @@ class Recording:
             If it cannot be read.
         """
         path = Path(path)
-        check_superblock(path)
-        try:
-            file = h5py.File(path, "r", libver="latest", swmr=True, locking=False)
-        except (OSError, RuntimeError) as error:
-            raise NotARecordingError(f"{path}: cannot be opened as HDF5: {error}") from error
+        file = _open_file(path)
         try:
             check_format(path, file)
             return cls(path, file)
@@ -299,23 +296,22 @@ class Recording:
         self.close()
 
 
-def check_superblock(path: Path) -> None:
-    """Refuse what is no HDF5 file, or was closed and then cut short."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(48)
-        n_bytes = path.stat().st_size
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if head[:8] != b"\x89HDF\r\n\x1a\n":
-        raise NotARecordingError(f"{path}: not a huddle recording, not even an HDF5 file")
-    # Superblock version 3: end of file in bytes 28 to 35. HDF5 itself reads what is cut short again
-    # and again, for ever, in case a writer is about to complete it.
-    end = struct.unpack_from("<Q", head, 28)[0] if len(head) == 48 and head[8] == 3 else 48
-    if end > n_bytes:
+def _open_file(path: Path) -> h5py.File:
+    superblock = Superblock.of(path)
+    cut_short = superblock.end > superblock.n_bytes and not is_being_written(path)
+    if cut_short and not superblock.is_open:
         raise NotARecordingError(
-            f"{path}: truncated: {n_bytes} of {end} bytes are there; fetch it again"
+            f"{path}: truncated: {superblock.n_bytes} of {superblock.end} bytes are there;"
+            " fetch it again"
         )
+    try:
+        if cut_short:
+            # A killed file that lost its end. A SWMR reader would try to read that again and again,
+            # in case the writer is about to complete it.
+            return h5py.File(ClearedFile(path, superblock), "r")
+        return h5py.File(path, "r", libver="latest", swmr=True, locking=False)
+    except (OSError, RuntimeError) as error:
+        raise NotARecordingError(f"{path}: cannot be opened as HDF5: {error}") from error
 
 
 def check_format(path: Path, file: h5py.File) -> None:

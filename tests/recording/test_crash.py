@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from daq.bench import Channel
-from daq.errors import RecordingError
+from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, HostTime
-from daq.recording.healing import heal, lookup3, verify, write_results
+from daq.recording.healing import heal, verify, write_results
 from daq.recording.layout import SensorLayout
 from daq.recording.reader import Recording
+from daq.recording.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ from daq.bench import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.layout import SensorLayout
+from daq.recording.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 path, limit = sys.argv[1], int(sys.argv[2])
 if limit:
@@ -117,6 +119,22 @@ def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
         assert [event.kind for event in recording.events] == ["stopped"]
     assert heal(path) == healed
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+@pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])
+def test_a_killed_file_that_lost_its_end(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "r.h5"
+    killed(path, 40)
+    with path.open("r+b") as raw:
+        raw.truncate(int(kept * path.stat().st_size))
+    if kept < 0.5:
+        with pytest.raises(NotARecordingError):
+            verify(path)
+    else:
+        # What came first is there and said to be right; what is cut off is said to be missing.
+        for sensor in verify(path).sensors:
+            assert sensor.bad_blocks
+            assert sensor.bad_blocks == tuple(range(sensor.bad_blocks[0], sensor.n_blocks))
 
 
 def test_full_disk_is_said_and_nothing_committed_is_lost(tmp_path: Path) -> None:

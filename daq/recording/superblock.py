@@ -1,0 +1,144 @@
+"""The first 48 bytes of a recording, which say where it ends and whether somebody writes it.
+
+A killed SWMR writer leaves flags in the superblock that forbid a plain open, and an end-of-file
+address that may be too small or, on a full disk, too large. Clearing the flags alone lets HDF5 cut
+the file there; so flags, end-of-file and checksum are rewritten together. (Version 3 of the
+superblock, HDF5 file format specification II.A; all recordings have it.)
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.errors import NotARecordingError, RecordingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_FIELDS = struct.Struct("<8sBBBBQQQQ")
+_VERSION, _FLAGS, _END = 1, 4, 7
+_SIZE = 48
+_MASK = 0xFFFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Superblock:
+    """What a file's first bytes say, and how long it is."""
+
+    head: bytes
+    n_bytes: int
+
+    @classmethod
+    def of(cls, path: Path) -> Superblock:
+        """Read it.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be read.
+        NotARecordingError
+            If it is no HDF5 file, or shorter than any.
+        """
+        try:
+            with path.open("rb") as file:
+                head = file.read(_SIZE)
+            n_bytes = path.stat().st_size
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+        if head[: len(SIGNATURE)] != SIGNATURE:
+            raise NotARecordingError(f"{path}: not a huddle recording, not even an HDF5 file")
+        if n_bytes < _SIZE:
+            raise NotARecordingError(f"{path}: truncated: only {n_bytes} bytes are there")
+        return cls(head, n_bytes)
+
+    @property
+    def version(self) -> int:
+        """3 for recordings; foreign HDF5 files have others."""
+        return self.head[8]
+
+    @property
+    def end(self) -> int:
+        """How long the file should be, in bytes; 0 where this version does not say it here."""
+        return int(_FIELDS.unpack_from(self.head)[_END]) if self.version == 3 else 0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it was not closed by who wrote it."""
+        return self.version == 3 and _FIELDS.unpack_from(self.head)[_FLAGS] != 0
+
+    def cleared(self) -> bytes:
+        """Return the first bytes of the same file, closed, as long as it is."""
+        fields = list(_FIELDS.unpack_from(self.head))
+        if fields[_VERSION] != 3:
+            raise NotARecordingError(f"superblock version {fields[_VERSION]}; expected 3")
+        fields[_FLAGS], fields[_END] = 0, self.n_bytes
+        head = _FIELDS.pack(*fields)
+        return head + struct.pack("<I", lookup3(head))
+
+
+class ClearedFile(io.RawIOBase):
+    """A file to read, with its superblock cleared."""
+
+    def __init__(self, path: Path, superblock: Superblock) -> None:
+        self._file = path.open("rb")
+        self._head = superblock.cleared()
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Go to a place of the file."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Return where the next byte comes from."""
+        return self._file.tell()
+
+    def readinto(self, buffer: memoryview, /) -> int:  # type: ignore[override]  # HDF5 gives this
+        """Fill a buffer as far as the file goes."""
+        start = self._file.tell()
+        n_bytes = self._file.readinto(buffer)
+        if start < _SIZE and n_bytes:
+            head = self._head[start : start + n_bytes]
+            buffer[: len(head)] = head
+        return n_bytes
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
+
+
+def lookup3(key: bytes) -> int:
+    """Return Bob Jenkins' lookup3 checksum of a few bytes, with initial value 0 as in HDF5."""
+    a: int = (0xDEADBEEF + len(key)) & _MASK
+    b, c = a, a
+    if not key:
+        return c
+    padded = key + bytes(-len(key) % 12)
+    words: tuple[int, ...] = struct.unpack(f"<{len(padded) // 4}I", padded)
+    *whole, last = (words[start : start + 3] for start in range(0, len(words), 3))
+    for triple in whole:
+        a, b, c = (a + triple[0]) & _MASK, (b + triple[1]) & _MASK, (c + triple[2]) & _MASK
+        for rotation in (4, 6, 8, 16, 19, 4):
+            # The roles of a, b and c move on from round to round.
+            a = ((a - c) & _MASK) ^ _rotated(c, rotation)
+            a, b, c = b, (c + b) & _MASK, a
+    a, b, c = (a + last[0]) & _MASK, (b + last[1]) & _MASK, (c + last[2]) & _MASK
+    for rotation in (14, 11, 25, 16, 4, 14, 24):
+        c = ((c ^ b) - _rotated(b, rotation)) & _MASK
+        a, b, c = b, c, a
+    return b
+
+
+def _rotated(value: int, bits: int) -> int:
+    return ((value << bits) | (value >> (32 - bits))) & _MASK
