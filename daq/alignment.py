@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.clock_model import ArrivalTimes, Clock, ClockState, from_instants, nominal
+from daq.clock_model import (
+    ArrivalTimes,
+    Clock,
+    ClockState,
+    MeasuredDelays,
+    from_instants,
+    nominal,
+)
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.resampling import SPAN, reach, resample
@@ -35,6 +42,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
 
+_GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
 _SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
 
 
@@ -51,6 +59,16 @@ class _Run:
         return self.first_row + self.n_samples
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Learnt:
+    """Delays measured where a sensor's sample `index` met the reference's `at_reference`."""
+
+    index: FloatArray
+    at_reference: FloatArray
+    delay: FloatArray
+    std: FloatArray
+
+
 @dataclass(slots=True)
 class _Source:
     """One sensor of the recording: where its samples are, and when they were taken."""
@@ -63,6 +81,8 @@ class _Source:
     n_blocks: int = 0
     device_utc: bool = False
     clock: Clock | None = None
+    learnt: list[_Learnt] = field(default_factory=list)
+    frame_delay: float = 0.0
 
     @property
     def end_sample(self) -> int:
@@ -154,6 +174,7 @@ class AlignedRecording:
         self._sources: list[_Source] = []
         self._origin = (0, 0)
         self._start: float | None = None
+        self._set_at = (0, 0)
         self._end = math.inf
         self.refresh()
 
@@ -200,15 +221,64 @@ class AlignedRecording:
             In seconds; only differences mean anything.
         """
         seconds = (self._start or 0.0) + at / self.sampling_rate
-        delays = np.empty((len(at), len(self._sources)))
-        for column, source in enumerate(self._sources):
-            epochs = _known(source).epochs
-            which = np.searchsorted([epoch.start for epoch in epochs[1:]], seconds, side="right")
-            for number in np.unique(which):
-                mine = which == number
-                index = epochs[number].position(seconds[mine])
-                delays[mine, column] = seconds[mine] - index / source.record.sampling_rate
-        return delays
+        columns = [
+            seconds - _known(source).position(seconds) / source.record.sampling_rate
+            for source in self._sources
+        ]
+        return np.stack(columns, axis=1)
+
+    @property
+    def measurable(self) -> tuple[int, ...]:
+        """Sensors whose delay the samples could tell: the reference, then one of each free clock.
+
+        Empty where no clock has to be estimated. Sensors are numbered in order.
+        """
+        if self.is_exact:
+            return ()
+        reference = self._reference
+        seen = {_clock_name(self._sources[reference])}
+        free = []
+        for number, source in enumerate(self._sources):
+            stated = source.device_utc or source.record.polled
+            if not stated and _clock_name(source) not in seen:
+                free.append(number)
+                seen.add(_clock_name(source))
+        return (reference, *free) if free else ()
+
+    def learn(self, at: FloatArray, delays: FloatArray, std: FloatArray) -> None:
+        """Take delays that have been measured from what was read.
+
+        Parameters
+        ----------
+        at : float64, shape (n,)
+            Grid positions in samples, increasing from call to call.
+        delays, std : float64, shape (n, n_measurable - 1)
+            By how much each sensor that is `measurable` lags the reference, in seconds; an
+            infinite standard deviation where that is not known.
+        """
+        seconds = (self._start or 0.0) + at / self.sampling_rate
+        at_reference = _known(self._sources[self._reference]).position(seconds)
+        for column, number in enumerate(self.measurable[1:]):
+            source = self._sources[number]
+            index = _known(source).position(seconds)
+            source.learnt.append(_Learnt(index, at_reference, delays[:, column], std[:, column]))
+
+    def forget(self) -> None:
+        """Drop what was learnt; the clocks stay as they are until they are set again."""
+        for source in self._sources:
+            source.learnt.clear()
+
+    def set_clocks(self, frame_delays: FloatArray) -> None:
+        """Set every clock by all that is known now.
+
+        Parameters
+        ----------
+        frame_delays : float64, shape (n_measurable - 1,)
+            The constant part of the delays that were learnt.
+        """
+        for number, delay in zip(self.measurable[1:], frame_delays, strict=True):
+            self._sources[number].frame_delay = float(delay)
+        self._set_clocks()
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""
@@ -221,7 +291,14 @@ class AlignedRecording:
             self._sources = [_source(record, *self._origin) for record in self._records]
         for source in self._sources:
             source.refresh()
-        self._set_clocks()
+        n_samples = sum(source.end_sample for source in self._sources)
+        n_runs = sum(len(source.runs) for source in self._sources)
+        if n_runs > self._set_at[1] or n_samples > (1 + _GROWTH) * self._set_at[0]:
+            self._set_at = (n_samples, n_runs)
+            self._set_clocks()
+        else:
+            for source in self._sources:
+                source.clock = _known(source).extended(source.end_sample)
         if self._start is None:
             self._set_start()
 
@@ -290,28 +367,40 @@ class AlignedRecording:
         return samples, valid
 
     def _set_clocks(self) -> None:
-        names = {source.record.clock or source.record.name for source in self._sources}
-        together = len(names) == 1 and not any(
-            source.device_utc or source.record.polled for source in self._sources
+        sources = self._sources
+        together = len({_clock_name(source) for source in sources}) == 1 and not any(
+            source.device_utc or source.record.polled for source in sources
         )
-        rates = {source.record.sampling_rate for source in self._sources}
-        first_of: dict[str, Clock] = {}
-        for source in self._sources:
-            name = source.record.clock or source.record.name
-            if source.record.polled:
-                source.clock = self._polled(source)
-            elif together and len(rates) == 1:
+        if together and len({source.record.sampling_rate for source in sources}) == 1:
+            for source in sources:
                 source.clock = nominal(
                     source.record.name,
-                    name,
+                    _clock_name(source),
                     end_sample=source.end_sample,
                     sampling_rate=source.record.sampling_rate,
                 )
-            elif name in first_of and not source.device_utc:
-                source.clock = first_of[name]
-            else:
-                source.clock = source.arrivals.solve(source.record.name)
-                first_of[name] = source.clock
+            return
+        reference = sources[self._reference]
+        solved: dict[str, Clock] = {}
+        for source in [reference, *sources]:
+            name = source.record.name
+            known = solved.get(_clock_name(source))
+            if source.record.polled:
+                source.clock = self._polled(source)
+            elif known is None or source.device_utc:
+                measured = None if source is reference else _measured(source, _known(reference))
+                source.clock = source.arrivals.solve(name, measured)
+                solved[_clock_name(source)] = source.clock
+            elif known.state.sensor != name:
+                source.clock = known.shared_by(name).extended(source.end_sample)
+
+    @property
+    def _reference(self) -> int:
+        """The sensor others are measured against: one with its own UTC, else the first."""
+        for number, source in enumerate(self._sources):
+            if source.device_utc:
+                return number
+        return 0
 
     def _polled(self, source: _Source) -> Clock:
         instants = source.record.instants_ns(0, source.runs[-1].last_row)
@@ -361,6 +450,22 @@ def _known(source: _Source) -> Clock:
     if source.clock is None:
         raise CannotAlignError(f"sensor {source.record.name!r}: no block recorded yet")
     return source.clock
+
+
+def _clock_name(source: _Source) -> str:
+    return source.record.clock or source.record.name
+
+
+def _measured(source: _Source, reference: Clock) -> MeasuredDelays | None:
+    """When a sensor's samples were taken, from the delays learnt against the reference."""
+    if not source.learnt:
+        return None
+    index = np.concatenate([each.index for each in source.learnt])
+    at_reference = np.concatenate([each.at_reference for each in source.learnt])
+    delay = np.concatenate([each.delay for each in source.learnt])
+    seconds = reference.at(at_reference) - delay - source.frame_delay
+    std = np.concatenate([each.std for each in source.learnt])
+    return MeasuredDelays(index, seconds, std)
 
 
 def _main(record: SensorRecord) -> list[int]:

@@ -5,16 +5,18 @@ Theory of operation
 The last sample of a block cannot have been taken after the block had been received, and latency
 only adds. So the instants of the samples, plus a constant (the shortest latency), are the *lower
 envelope* of the arrival times: late blocks, however late and however many, do not move it. Times
-are on the host's monotonic clock, in seconds from the recording's first block; a host whose UTC is
+are on the host's monotonic clock, in seconds from the recording's creation; a host whose UTC is
 stepped in the middle of a run changes nothing.
 
-Arrival times are thinned to the earliest (relative to the nominal rate) in each second, so that
-memory and work do not grow with the block rate. A line is then laid under them: the edge of their
-lower convex hull below their mean, which is the highest line under all points.
+Arrival times are thinned to the earliest in each second, so that memory and work do not grow with
+the block rate. A line under all of them (the edge of their lower convex hull below their mean)
+takes out what is common; the earliest in each stretch of `_NODE` seconds then is one observation
+for the filter of :mod:`daq.clock_filter`, which follows a rate that wanders. Delays measured from
+the samples (:mod:`daq.refinement`) join there.
 
 A stretch between restarts of the device's clock is an :class:`Epoch`; within one, the sample index
 counts without error. A block that says ``CLOCK_RESTART`` or ``MISSING_ESTIMATED`` begins a new
-one.
+one, and so does a block far earlier than possible: then the host's clock has been asleep.
 
 Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
@@ -23,15 +25,17 @@ its nominal rate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import itertools
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.clock_filter import Observations, smooth
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,7 +43,14 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 _NANO = 1e-9
-_FAR = 1e10  # seconds; nodes stand so far out that interpolation extrapolates
+_NODE = 10.0  # seconds of arrival times that make one observation
+_MOST_NODES = 3000
+_FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
+_CONSTANT_KNOWN = 0.02  # samples
+_ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
+_RATE_OFF = 0.02  # share by which a rate may be off
+_LEVEL = 10  # groups over which a slope can be told from jitter
+_UTC_JUMP = 0.01  # samples
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
 _HULL_POINTS = 512
@@ -143,6 +154,59 @@ class Clock:
         """Time of the last sample."""
         return self.epochs[-1].end
 
+    def at(self, index: FloatArray) -> FloatArray:
+        """Return the time in seconds of (fractional) sample indices."""
+        starts = [epoch.first_sample for epoch in self.epochs[1:]]
+        return self._by_epoch(np.searchsorted(starts, index, side="right"), index, Epoch.at)
+
+    def position(self, seconds: FloatArray) -> FloatArray:
+        """Return the (fractional) sample index at times in seconds."""
+        starts = [epoch.start for epoch in self.epochs[1:]]
+        return self._by_epoch(
+            np.searchsorted(starts, seconds, side="right"), seconds, Epoch.position
+        )
+
+    def extended(self, end_sample: int) -> Clock:
+        """Return the same clock for a recording that has grown to `end_sample`."""
+        last = replace(self.epochs[-1], end_sample=end_sample)
+        return replace(self, epochs=(*self.epochs[:-1], last))
+
+    def shared_by(self, sensor: str) -> Clock:
+        """Return the same clock for another sensor."""
+        state = replace(self.state, sensor=sensor, source=f"clock of {self.state.sensor}")
+        return replace(self, state=state)
+
+    def _by_epoch(
+        self,
+        which: NDArray[np.intp],
+        values: FloatArray,
+        evaluate: Callable[[Epoch, FloatArray], FloatArray],
+    ) -> FloatArray:
+        out = np.empty(len(values))
+        for number in np.unique(which):
+            mine = which == number
+            out[mine] = evaluate(self.epochs[number], values[mine])
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredDelays:
+    """When samples were taken, as measured from the motion, up to one constant.
+
+    Attributes
+    ----------
+    index : float64, shape (n,)
+        (Fractional) sample indices, increasing.
+    seconds : float64, shape (n,)
+        When they were taken.
+    std : float64, shape (n,)
+        Standard deviation of `seconds`.
+    """
+
+    index: FloatArray
+    seconds: FloatArray
+    std: FloatArray
+
 
 @dataclass(slots=True)
 class ArrivalTimes:
@@ -164,7 +228,7 @@ class ArrivalTimes:
     _late: FloatArray = field(default_factory=lambda: np.empty(0))
     _epoch: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _end_sample: int = 0
-    _device_utc: bool = True
+    _device_utc: bool = False
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -180,21 +244,25 @@ class ArrivalTimes:
         flags = blocks["flags"]
         first = blocks["first_sample"].astype(np.int64)
         length = blocks["n_samples"].astype(np.int64)
-        if not self._epoch_starts:
+        begins = not self._epoch_starts
+        if begins:
             self._device_utc = bool(flags[0] & BlockFlag.DEVICE_UTC)
         if self._device_utc:
             index = first
             elapsed = (blocks["device_counter"].astype(np.int64) - self.origin_utc_ns) * _NANO
-            late = elapsed - index / self.sampling_rate
-            previous = np.append(self._late[-1:] if self._epoch_starts else late[:1], late[:-1])
-            breaks = np.abs(late - previous) > 0.01 / self.sampling_rate
         else:
             index = first + length - 1
             elapsed = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
-            late = elapsed - index / self.sampling_rate
-            breaks = (flags & int(_BREAKS)) != 0
-        if not self._epoch_starts:
-            breaks[0] = True
+        late = elapsed - index / self.sampling_rate
+        before = late[:1] if begins else self._late[-1:]
+        earlier = np.concatenate([before, late[:-1]]) - late
+        if self._device_utc:
+            breaks = np.abs(earlier) > _UTC_JUMP / self.sampling_rate
+        else:
+            since = np.diff(index, prepend=index[:1] if begins else self._index[-1:])
+            asleep = earlier > _ASLEEP + _RATE_OFF * since / self.sampling_rate
+            breaks = ((flags & int(_BREAKS)) != 0) | asleep
+        breaks[0] |= begins
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
         self._end_sample = int(first[-1] + length[-1])
@@ -202,68 +270,148 @@ class ArrivalTimes:
         index = np.concatenate([self._index[-1:], index])
         late = np.concatenate([self._late[-1:], late])
         epoch = np.concatenate([self._epoch[-1:], epoch])
-        second = (index / self.sampling_rate).astype(np.int64)
-        order = np.lexsort((late, second, epoch))
-        keep = np.ones(len(order), dtype=bool)
-        keep[1:] = (np.diff(second[order]) != 0) | (np.diff(epoch[order]) != 0)
-        order = order[keep]
-        self._index = np.concatenate([self._index[:-1], index[order]])
-        self._late = np.concatenate([self._late[:-1], late[order]])
-        self._epoch = np.concatenate([self._epoch[:-1], epoch[order]])
+        kept = _earliest(index, late, epoch, self.sampling_rate)
+        self._index = np.concatenate([self._index[:-1], index[kept]])
+        self._late = np.concatenate([self._late[:-1], late[kept]])
+        self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
 
-    def solve(self, sensor: str) -> Clock:
-        """Return the clock, from everything taken so far."""
-        bounds = [*self._epoch_starts, self._end_sample]
-        lines = [self._line(number) for number in range(len(self._epoch_starts))]
-        weight = np.array([line[2] for line in lines])
-        rate = float(np.sum(weight * np.array([line[1] for line in lines])) / weight.sum())
+    def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:
+        """Return the clock, from everything taken so far.
+
+        Parameters
+        ----------
+        sensor : str
+            Its name.
+        measured : MeasuredDelays, optional
+            What the samples say.
+        """
+        if self._device_utc:
+            return self._stated(sensor)
+        slope, anchors = self._lines()
+        return self._filtered(sensor, slope, anchors, measured)
+
+    def _bounds(self) -> list[tuple[int, int]]:
+        """First sample of each epoch, and the one after its last."""
+        return list(itertools.pairwise([*self._epoch_starts, self._end_sample]))
+
+    def _stated(self, sensor: str) -> Clock:
+        """Follow the device's own statements; at the nominal rate, if they agree with it."""
         epochs = []
-        for number, (late, own, span) in enumerate(lines):
-            # Too short a stretch says little about the rate, which the device has kept.
-            short = span <= 0.1 * weight.max()
-            slope = rate if short else own
-            anchor = self._anchor(number, slope) if short else late
-            index = np.array([bounds[number], max(bounds[number + 1], bounds[number] + 1)], float)
-            seconds = index / self.sampling_rate + anchor + slope * index
-            epochs.append(Epoch(bounds[number], bounds[number + 1], index, seconds))
-        residual = np.concatenate(
-            [
-                self._late[self._epoch == n]
-                + self._index[self._epoch == n] / self.sampling_rate
-                - epoch.at(self._index[self._epoch == n].astype(float))
-                for n, epoch in enumerate(epochs)
-            ]
-        )
-        scatter = float(np.sqrt(np.mean(residual**2)))
-        duration = max(float(weight.sum()) / self.sampling_rate, 1 / self.sampling_rate)
-        ppm = -rate * self.sampling_rate / (1 + rate * self.sampling_rate) * 1e6
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = self._epoch == number
+            index, late = self._index[mine].astype(float), self._late[mine]
+            if np.ptp(late) < _UTC_TOLERANCE:
+                index = np.array([first, max(end, first + 1)], dtype=float)
+                late = np.full(2, late[0])
+            epochs.append(Epoch(first, end, index, index / self.sampling_rate + late))
+        ppm, wander = 0.0, 0.0
+        if any(len(epoch.index) > 2 for epoch in epochs):
+            longest = max(epochs, key=lambda epoch: epoch.end_sample - epoch.first_sample)
+            rates = np.diff(longest.index) / np.diff(longest.seconds) / self.sampling_rate
+            ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
         state = ClockState(
-            sensor=sensor,
-            source="device UTC" if self._device_utc else "arrival times",
-            offset=epochs[0].start,
-            ppm=ppm,
-            ppm_std=float(np.sqrt(12 / max(len(residual), 1))) * scatter / duration * 1e6,
-            wander_ppm=0.0,
-            residual=scatter,
-            n_epochs=len(epochs),
+            sensor, "device UTC", epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
         )
         return Clock(tuple(epochs), state)
 
-    def _line(self, number: int) -> tuple[float, float, float]:
-        """Lateness at index 0, its slope per sample, and samples covered, of one epoch."""
-        mine = self._epoch == number
-        index, late = self._index[mine].astype(float), self._late[mine]
-        span = float(np.ptp(index)) + 1.0
-        if self._device_utc and np.ptp(late) < _UTC_TOLERANCE:
-            return float(late[0]), 0.0, span
-        if len(index) < 2:
-            return float(late[0]), 0.0, 1.0
-        intercept, slope = supporting_line(index, late)
-        return intercept, slope, span
+    def _lines(self) -> tuple[float, list[float]]:
+        """One slope (lateness per sample) for all epochs, and the lateness at index 0 of each."""
+        slopes, weights = [0.0], [0.0]
+        for number in range(len(self._epoch_starts)):
+            mine = self._epoch == number
+            if np.count_nonzero(mine) > 1:
+                index, late = self._index[mine].astype(float), self._late[mine]
+                slopes.append(supporting_line(index, late)[1])
+                weights.append(float(index[-1] - index[0]) ** 2)
+        total = sum(weights)
+        slope = float(np.dot(slopes, weights) / total) if total else 0.0
+        late = self._late - slope * self._index
+        return slope, [
+            float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
+        ]
 
-    def _anchor(self, number: int, slope: float) -> float:
-        mine = self._epoch == number
-        return float(np.min(self._late[mine] - slope * self._index[mine]))
+    def _filtered(
+        self,
+        sensor: str,
+        slope: float,
+        anchors: list[float],
+        measured: MeasuredDelays | None,
+    ) -> Clock:
+        left = self._late - slope * self._index - np.array(anchors)[self._epoch]
+        duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
+        node = max(_NODE, duration / _MOST_NODES)
+        kept = _earliest(self._index, left, self._epoch, self.sampling_rate * node)
+        index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
+        variance = np.zeros(len(index))
+        if measured is not None:
+            known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
+            at = measured.index[known]
+            which = np.searchsorted(self._epoch_starts, at, side="right") - 1
+            lateness = measured.seconds[known] - at / self.sampling_rate
+            lateness -= slope * at + np.array(anchors)[which]
+            index, late = np.concatenate([index, at]), np.concatenate([late, lateness])
+            epoch = np.concatenate([epoch, which])
+            variance = np.concatenate([variance, measured.std[known] ** 2 + _FLOOR**2])
+            order = np.lexsort((index, epoch))
+            index, late, epoch = index[order], late[order], epoch[order]
+            variance = variance[order]
+        observations = Observations(
+            seconds=index / self.sampling_rate,
+            lateness=late,
+            variance=variance,
+            from_samples=variance > 0,
+            restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
+        )
+        smoothed = smooth(observations)
+        curve = smoothed.lateness
+        # The constant is worth following only where it is known to a small part of a sample.
+        refined = bool(observations.from_samples.any())
+        if refined and smoothed.constant_std < _CONSTANT_KNOWN / self.sampling_rate:
+            curve = curve + smoothed.constant
+        epochs = []
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = np.flatnonzero(epoch == number)
+            nodes, late = index[mine], curve[mine]
+            # Straight on at both ends, at the rate the filter has there.
+            low, high = min(float(first), nodes[0]) - 1.0, max(float(end), nodes[-1]) + 1.0
+            nodes = np.concatenate([[low], nodes, [high]])
+            ends = smoothed.rate[mine[[0, -1]]] / self.sampling_rate
+            late = np.concatenate(
+                [
+                    [late[0] - ends[0] * (nodes[1] - low)],
+                    late,
+                    [late[-1] + ends[1] * (high - nodes[-2])],
+                ]
+            )
+            seconds = nodes / self.sampling_rate + late + slope * nodes + anchors[number]
+            increasing = np.concatenate([[True], np.diff(nodes) > 0])
+            epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
+        drift = slope * self.sampling_rate + float(smoothed.rate.mean())
+        residual = float(np.sqrt(np.mean(smoothed.std**2)))
+        state = ClockState(
+            sensor=sensor,
+            source="arrival times",
+            offset=epochs[0].start,
+            ppm=-drift / (1 + drift) * 1e6,
+            ppm_std=float(np.sqrt(2)) * residual / duration * 1e6,
+            wander_ppm=float(smoothed.rate.std()) * 1e6,
+            residual=residual,
+            n_epochs=len(epochs),
+            refined=refined,
+        )
+        return Clock(tuple(epochs), state)
+
+
+def _earliest(index: IntArray, late: FloatArray, epoch: IntArray, length: float) -> IntArray:
+    """Return, in order, the row of least lateness in every `length` samples of each epoch."""
+    group = (index / length).astype(np.int64)
+    # A sensor whose rate is off by per cent would otherwise keep each group's last, or first.
+    if len(index) > 2 and np.ptp(index) > _LEVEL * length:
+        late = late - np.polynomial.polynomial.polyfit(index - index[0], late, 1)[1] * index
+    order = np.lexsort((late, group, epoch))
+    kept = np.ones(len(order), dtype=bool)
+    kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)
+    return order[kept]
 
 
 def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:

@@ -23,6 +23,7 @@ import numpy as np
 from daq.alignment import AlignedRecording
 from daq.errors import CannotAlignError
 from daq.recording.reader import Recording
+from daq.refinement import DelayMeter
 from daq.units import canonical, conversion
 from estimator.errors import InsufficientDataError
 from estimator.methods import METHODS, self_noise
@@ -47,7 +48,9 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 _VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
-_MATERIAL = 1e-6  # seconds; clocks that move less than this change nothing one could see
+_MATERIAL = 3e-7  # seconds rms; clocks that move less than this change nothing one could see
+_MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
+_MOST_PASSES = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,8 @@ class Settings:
         Wanted coefficient of variation.
     sampling_rate : float or None
         Of the common grid in Hz; the lowest of the sensors' where not given.
+    refine : bool
+        Whether clocks are refined by the motion the sensors share.
     options : dict
         Further options of the methods.
     """
@@ -90,6 +95,7 @@ class Settings:
     band: tuple[float, float] | None = None
     target_cov: float | None = None
     sampling_rate: float | None = None
+    refine: bool = True
     options: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -209,9 +215,16 @@ class _Pass:
             detrend=settings.detrend,
         )
         self.n_channels = len(self.aligned.channels)
+        self.refine = settings.refine
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again, with the clocks as they are now."""
         self.spectra = CrossSpectra(self.welch, self.n_channels)
         self.n_seen = 0
         self.taken_at: list[FloatArray] = []
+        self.aligned.forget()
+        self._meter: DelayMeter | None = None
 
     @property
     def n_complete(self) -> int:
@@ -241,9 +254,15 @@ class _Pass:
             starts = starts[missing[starts + length] == missing[starts]]
             self.spectra.add(samples, starts)
             self.taken_at.append(self._positions(self.n_seen + np.arange(count)))
+            self._measure(samples, starts, first)
             self.n_seen += count
             if progress is not None:
                 progress(count)
+
+    def set_clocks(self) -> None:
+        """Set the clocks by what the segments taken say."""
+        if self._meter is not None:
+            self.aligned.set_clocks(self._meter.frame_delays())
 
     def is_outdated(self) -> bool:
         """Whether the clocks, as known now, differ materially from those segments were taken by."""
@@ -252,7 +271,25 @@ class _Pass:
         before = np.concatenate(self.taken_at)
         moved = self._positions(np.arange(len(before))) - before
         moved -= moved.mean(axis=1, keepdims=True)  # all sensors alike: no delay between them
-        return bool(np.sqrt(np.mean(moved**2)) > _MATERIAL)
+        constant = moved.mean(axis=0)
+        varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
+        return varying > _MATERIAL or bool(
+            np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
+        )
+
+    def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
+        """Measure what delays are left, for the clocks' next setting."""
+        measurable = self.aligned.measurable if self.refine else ()
+        if not measurable:
+            return
+        if self._meter is None:
+            edges = np.cumsum([0, *self.aligned.dims])
+            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in measurable)
+            window = get_window(self.welch.window, self.welch.segment_length)
+            self._meter = DelayMeter(self.welch.sampling_rate, window, columns)
+        delays, std = self._meter.measure(samples, starts)
+        at = first + starts + self.welch.segment_length / 2
+        self.aligned.learn(np.asarray(at, dtype=np.float64), delays, std)
 
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
         middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
@@ -312,6 +349,11 @@ class Estimation:
         """Segments taken so far."""
         return sum(each.spectra.n_segments for each in self._passes)
 
+    @property
+    def n_seen(self) -> int:
+        """Segments looked at so far, those left out for gaps included."""
+        return sum(each.n_seen for each in self._passes)
+
     def update(self) -> bool:
         """Take what has been committed since; return whether there was a new segment.
 
@@ -320,17 +362,18 @@ class Estimation:
         RecordingError
             If a file is damaged.
         """
-        before = sum(each.n_seen for each in self._passes)
+        before = self.n_seen
         for each in self._passes:
             each.aligned.refresh()
             each.advance()
-        seen = sum(each.n_seen for each in self._passes)
+        seen = self.n_seen
         if seen >= self._next_review:
             self._next_review = 2 * seen
-            for number, each in enumerate(self._passes):
+            for each in self._passes:
+                each.set_clocks()
                 if each.is_outdated():
-                    self._passes[number] = again = _Pass(each.recording, self.settings)
-                    again.advance()
+                    each.restart()
+                    each.advance()
         return seen > before
 
     def finish(self, progress: Progress | None = None) -> Snapshot:
@@ -346,13 +389,12 @@ class Estimation:
         InsufficientDataError
             If no method can say anything; the message says why.
         """
-        total = 0
         for number, each in enumerate(self._passes):
             each.aligned.refresh()
             if each.n_seen and not each.aligned.is_exact:
                 self._passes[number] = _Pass(each.recording, self.settings)
-            total += self._passes[number].n_complete
-        done = sum(each.n_seen for each in self._passes)
+        total = sum(each.n_complete for each in self._passes)
+        done = self.n_seen
 
         def count(n: int) -> None:
             nonlocal done
@@ -362,6 +404,13 @@ class Estimation:
 
         for each in self._passes:
             each.advance(count)
+            for _ in range(_MOST_PASSES - 1):
+                each.set_clocks()
+                if not each.is_outdated():
+                    break
+                total += each.n_seen
+                each.restart()
+                each.advance(count)
         snapshot = self.snapshot()
         if not snapshot.results:
             raise InsufficientDataError(self._why_nothing(snapshot))
@@ -398,7 +447,7 @@ class Estimation:
             dims=first.aligned.dims,
             unit=self._unit,
             n_segments=n_segments,
-            n_dropped=sum(each.n_seen for each in self._passes) - n_segments,
+            n_dropped=self.n_seen - n_segments,
             n_effective=n_effective,
             elapsed=sum(each.elapsed for each in self._passes),
             time_left=self._time_left(results, n_effective),

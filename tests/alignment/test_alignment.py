@@ -138,10 +138,10 @@ def test_a_growing_file_is_read_as_far_as_it_is_committed(tmp_path: Path) -> Non
         for some in written.values():
             for block in some[:20]:
                 writer.append(block)
-        writer.commit()
+        committed = min(each.rows for each in writer.commit().sensors.values())
         aligned.refresh()
-        assert aligned.n_available == 950  # the last block may still be continued
-        with pytest.raises(CannotAlignError, match="950 available"):
+        assert aligned.n_available == committed >= 900
+        with pytest.raises(CannotAlignError, match=f"{committed} available"):
             aligned.read(900, 1100)
         for some in written.values():
             for block in some[20:]:

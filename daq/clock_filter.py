@@ -1,0 +1,197 @@
+"""A slowly varying clock from what is observed of it, however irregularly.
+
+Theory of operation
+-------------------
+A clock is its *lateness* (time of a sample minus its index over the nominal rate), whose rate
+does a random walk. Two kinds of observations inform it: the lower envelope of block arrival
+times, and, where the sensors share a motion, the delay against a reference sensor measured from
+the samples. The latter know the lateness up to one constant (latencies differ), so the state is (lateness, rate,
+constant).
+
+A Kalman filter runs for a grid of strengths of the random walk and of arrival noise at once; the
+most likely pair is smoothed backwards (Rauch, Tung, Striebel 1965). An innovation beyond four
+standard deviations counts as four: an outlier cannot pull, a change that stays is followed.
+A restart of the device's clock forgets the lateness and keeps the rate.
+
+Why a filter, and not a line or pieces of lines: docs/decisions/0007-clock-model.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+_WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
+_NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
+_START = np.array([1e-2, 1e-4, 1e-1])  # what is not known at first: s, s/s, s
+_RESTART_RATE = 1e-6
+_HUBER = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Lateness observed, in order of time.
+
+    Attributes
+    ----------
+    seconds : float64, shape (n,)
+        When, on the sensor's own count, increasing.
+    lateness : float64, shape (n,)
+        In seconds, within some 10 ms of zero.
+    variance : float64, shape (n,)
+        Of observations from the samples, in s²; that of arrivals is estimated.
+    from_samples : bool, shape (n,)
+        Whether the observation is from the samples, and so up to a constant.
+    restarts : bool, shape (n,)
+        Whether the clock has started anew between the one before and this one.
+    """
+
+    seconds: FloatArray
+    lateness: FloatArray
+    variance: FloatArray
+    from_samples: BoolArray
+    restarts: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """The clock at the instants of the observations.
+
+    Attributes
+    ----------
+    lateness, rate, std : float64, shape (n,)
+        Lateness in s, its rate in s/s, and the lateness's standard deviation in s.
+    constant, constant_std : float
+        By how much observations from the samples lie above those from arrivals, in s.
+    walk, noise : float
+        Most likely strength of the random walk (s/s per √s), and of arrival noise (s).
+    """
+
+    lateness: FloatArray
+    rate: FloatArray
+    std: FloatArray
+    constant: float
+    constant_std: float
+    walk: float
+    noise: float
+
+
+def smooth(observations: Observations) -> Smoothed:
+    """Return the most likely clock.
+
+    Parameters
+    ----------
+    observations : Observations
+        At least one.
+    """
+    walks, noises = (grid.ravel() for grid in np.meshgrid(_WALKS, _NOISES, indexing="ij"))
+    likelihood = _filter(observations, walks, noises, None)
+    best = int(np.argmax(likelihood))
+    walk, noise = float(walks[best]), float(noises[best])
+    track = _Track.empty(len(observations.seconds))
+    _filter(observations, walks[best : best + 1], noises[best : best + 1], track)
+    state, covariance = _backwards(track)
+    return Smoothed(
+        lateness=state[:, 0],
+        rate=state[:, 1],
+        std=np.sqrt(np.maximum(covariance[:, 0, 0], 0.0)),
+        constant=float(state[-1, 2]),
+        constant_std=float(np.sqrt(max(covariance[-1, 2, 2], 0.0))),
+        walk=walk,
+        noise=noise,
+    )
+
+
+@dataclass(slots=True, eq=False)
+class _Track:
+    """Predicted and filtered states of one run of the filter."""
+
+    predicted: FloatArray
+    predicted_covariance: FloatArray
+    filtered: FloatArray
+    filtered_covariance: FloatArray
+    transition: FloatArray
+
+    @classmethod
+    def empty(cls, n: int) -> _Track:
+        square = (n, 3, 3)
+        return cls(
+            np.empty((n, 3)), np.empty(square), np.empty((n, 3)), np.empty(square), np.empty(square)
+        )
+
+
+def _filter(
+    observations: Observations, walks: FloatArray, noises: FloatArray, track: _Track | None
+) -> FloatArray:
+    """Return the log-likelihood of every pair; `track` takes the states of the first."""
+    n_pairs = len(walks)
+    power, arrival = walks**2, noises**2
+    x = np.zeros((3, n_pairs))
+    p = np.zeros((3, 3, n_pairs))
+    p[0, 0], p[1, 1], p[2, 2] = _START[:, None] ** 2
+    likelihood = np.zeros(n_pairs)
+    transition = np.eye(3)
+    before = float(observations.seconds[0])
+    rows = zip(
+        observations.seconds.tolist(),
+        observations.lateness.tolist(),
+        observations.variance.tolist(),
+        observations.from_samples.tolist(),
+        observations.restarts.tolist(),
+        strict=True,
+    )
+    for number, (now, lateness, variance, from_samples, restart) in enumerate(rows):
+        step, before = now - before, now
+        # Predict: lateness grows by its rate, the rate walks.
+        transition[0, 1] = 0.0 if restart else step
+        if restart:
+            x[0] = 0.0
+            p[0] = p[:, 0] = 0.0
+            p[0, 0] = _START[0] ** 2
+            p[1, 1] += _RESTART_RATE**2
+            transition[0, 0] = 0.0
+        else:
+            x[0] += step * x[1]
+            p[0, 0] += step * (2 * p[0, 1] + step * p[1, 1]) + power * (step**3 / 3)
+            p[0, 1] += step * p[1, 1] + power * (step**2 / 2)
+            p[0, 2] += step * p[1, 2]
+            p[1, 0], p[2, 0] = p[0, 1], p[0, 2]
+        p[1, 1] += power * step
+        if track is not None:
+            track.predicted[number] = x[:, 0]
+            track.predicted_covariance[number] = p[:, :, 0]
+            track.transition[number] = transition
+            transition[0, 0] = 1.0
+        # Update.
+        gain = p[0] + p[2] if from_samples else p[0].copy()
+        spread = gain[0] + gain[2] + variance if from_samples else gain[0] + arrival
+        innovation = lateness - x[0] - (x[2] if from_samples else 0.0)
+        spread = np.maximum(spread, innovation**2 / _HUBER**2)
+        weight = gain / spread
+        x += weight * innovation
+        p -= weight[:, None] * gain[None, :]
+        likelihood -= 0.5 * (np.log(spread) + innovation**2 / spread)
+        if track is not None:
+            track.filtered[number] = x[:, 0]
+            track.filtered_covariance[number] = p[:, :, 0]
+    return likelihood
+
+
+def _backwards(track: _Track) -> tuple[FloatArray, FloatArray]:
+    """Rauch-Tung-Striebel: what later observations say about earlier states."""
+    state, covariance = track.filtered.copy(), track.filtered_covariance.copy()
+    for number in range(len(state) - 2, -1, -1):
+        following = track.predicted_covariance[number + 1]
+        crossed = track.transition[number + 1] @ track.filtered_covariance[number]
+        gain = np.linalg.solve(following, crossed).T
+        state[number] += gain @ (state[number + 1] - track.predicted[number + 1])
+        covariance[number] += gain @ (covariance[number + 1] - following) @ gain.T
+    return state, covariance

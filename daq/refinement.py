@@ -1,0 +1,236 @@
+"""Delays between sensors from the motion they share, segment by segment.
+
+Theory of operation
+-------------------
+What sensor j reads is predicted from the reference sensor's channels by the averaged relative
+response ``P = S_j0 S_00^-1`` (any orientation, gain and response is in it; the convention is
+``S_pq = E[X_p conj(X_q)]``). Within one segment, sensor j lags that prediction by the one delay τ
+that maximises
+
+    J(τ) = Re Σ_f  (P X_0)^H  R^-1  X_j  exp(iωτ),      R = S_jj - P S_0j,
+
+which is least squares weighted by what the prediction leaves over: frequencies without coherent
+signal do not count. The maximum is searched for on a grid and polished by Newton's method. Its
+variance is ``κ / (2 Σ ω² (P X_0)^H R^-1 P X_0)``, with κ for the correlation of neighbouring
+frequencies under the window.
+
+P is averaged over segments already freed of their delays. The first batch does so by iteration and
+thereby defines a frame; later batches are measured in that frame, which makes the delays of a whole
+recording comparable. The frame's own delay is the slope of P's phase.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.fft
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+    ComplexArray = NDArray[np.complex128]
+
+USABLE = 0.45
+"""Share of the sampling rate up to which the resampler is flat."""
+
+_FIRST_ITERATIONS = 5
+_NEWTON_STEPS = 3
+_FEWEST_SEGMENTS = 12  # in the first batch, per channel of the reference: P is a mean of those
+_SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
+_LONGEST = 32.0  # samples either way
+_RIDGE = 1e-10  # of the mean power: keeps a dead channel from stopping everything
+
+
+@dataclass(slots=True, eq=False)
+class _Frame:
+    """Spectral sums of one sensor and the reference, freed of delays."""
+
+    reference: ComplexArray
+    crossed: ComplexArray
+    own: ComplexArray
+    n_segments: int = 0
+
+    def add(self, x0: ComplexArray, xj: ComplexArray) -> None:
+        """Add spectra, shape (n_freqs, n_segments, n_channels)."""
+        self.reference += _products(x0, x0)
+        self.crossed += _products(xj, x0)
+        self.own += _products(xj, xj)
+        self.n_segments += x0.shape[1]
+
+
+@dataclass(slots=True, eq=False)
+class DelayMeter:
+    """Measures each sensor's delay against the first of `columns`.
+
+    Attributes
+    ----------
+    sampling_rate : float
+    window : float64, shape (segment_length,)
+    columns : tuple of slice
+        Which columns of the samples belong to the reference, and to each sensor to be measured.
+    """
+
+    sampling_rate: float
+    window: FloatArray
+    columns: tuple[slice, ...]
+    _frames: list[_Frame] = field(default_factory=list)
+
+    @property
+    def omega(self) -> FloatArray:
+        """Angular frequencies that are looked at, from the first above zero."""
+        length = len(self.window)
+        count = int(USABLE * length)
+        return np.arange(1.0, count + 1.0) * (2 * np.pi * self.sampling_rate / length)
+
+    def measure(self, samples: FloatArray, starts: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return each segment's delays and their standard deviations.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+        starts : int64, shape (n_segments,)
+            Rows at which segments begin.
+
+        Returns
+        -------
+        delays, std : float64, shape (n_segments, n_sensors - 1)
+            In seconds; positive if the sensor lags the reference. NaN and infinite where the
+            coherent motion is too weak to tell.
+        """
+        shape = (len(starts), len(self.columns) - 1)
+        delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
+        d = self.columns[0].stop - self.columns[0].start
+        if len(starts) == 0 or (not self._frames and len(starts) < _FEWEST_SEGMENTS * d):
+            return delays, std
+        spectra = self._spectra(samples, starts)
+        x0 = spectra[:, :, self.columns[0]]
+        first = not self._frames
+        for number, columns in enumerate(self.columns[1:]):
+            xj = spectra[:, :, columns]
+            if first:
+                frame, tau = _empty(x0, xj), np.zeros(len(starts))
+                for _ in range(_FIRST_ITERATIONS):
+                    frame = _empty(x0, xj)
+                    frame.add(x0, self._advanced(xj, tau))
+                    tau, spread = self._delays(frame, x0, xj)
+                    tau = np.where(np.isfinite(spread), tau, 0.0)
+                    tau -= tau.mean()
+                self._frames.append(_empty(x0, xj))
+            else:
+                tau, spread = self._delays(self._frames[number], x0, xj)
+            known = np.isfinite(spread)
+            if first or known.any():
+                used = known if known.any() else np.ones(len(starts), dtype=bool)
+                self._frames[number].add(
+                    x0[:, used], self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
+                )
+            delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
+        return delays, std
+
+    def frame_delays(self) -> FloatArray:
+        """Return the delay of each frame, from the slope of its phase, in seconds."""
+        step = self.omega[0]
+        delays = np.zeros(len(self.columns) - 1)
+        for number, frame in enumerate(self._frames):
+            response, left = _prediction(frame)
+            # How much of the sensor is predicted, as a weight that noise cannot raise.
+            predicted = np.einsum("fpp->f", frame.own).real - np.einsum("fpp->f", left).real
+            weight = np.maximum(predicted, 0) / np.einsum("fpp->f", frame.own).real
+            weight = np.minimum(weight[1:], weight[:-1])
+            turn = np.einsum("fpq,fpq->f", response[1:], response[:-1].conj())
+            size = np.abs(turn)
+            turn = np.sum(weight * turn / np.where(size > 0, size, 1.0))
+            delays[number] = -np.angle(turn) / step
+        return delays
+
+    def _spectra(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
+        """Spectra of shape (n_freqs, n_segments, n_channels)."""
+        length = len(self.window)
+        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
+        frames = (frames - frames.mean(axis=-1, keepdims=True)) * self.window
+        spectra = scipy.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1]
+        return np.ascontiguousarray(spectra.transpose(2, 0, 1))
+
+    def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
+        return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])
+
+    def _delays(
+        self, frame: _Frame, x0: ComplexArray, xj: ComplexArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Measure delays in a frame, shapes (n_segments,): where J is largest."""
+        omega = self.omega
+        response, left = _prediction(frame)
+        weight = np.linalg.inv(left)
+        predicted = np.matmul(x0, response.transpose(0, 2, 1))
+        weighted = np.matmul(predicted.conj(), weight)
+        crossed = np.einsum("fsp,fsp->fs", weighted, xj)
+        energy = np.einsum("fsp,fsp->fs", weighted, predicted).real
+        tau = self._search(crossed)
+        for _ in range(_NEWTON_STEPS):
+            turned = crossed * _turn(omega, tau)
+            curvature = omega**2 @ turned.real
+            step = (omega @ turned.imag) / np.where(curvature > 0, curvature, np.inf)
+            tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
+        # Neighbouring frequencies share samples of the window: κ of them count as one.
+        w2 = self.window**2
+        kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
+        total = energy.sum(axis=0)
+        met = (crossed * _turn(omega, tau)).real.sum(axis=0)
+        with np.errstate(divide="ignore"):
+            std = np.sqrt(kappa / (2 * (omega**2 @ energy)))
+        known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
+        return tau, np.where(known, std, np.inf)
+
+    def _search(self, crossed: ComplexArray) -> FloatArray:
+        """Return the best delay on a grid of a fraction of a period of the highest frequency."""
+        n = scipy.fft.next_fast_len(4 * len(self.window), real=True)
+        padded = np.zeros((crossed.shape[1], n // 2 + 1), dtype=np.complex128)
+        padded[:, 1 : len(crossed) + 1] = crossed.T
+        height = scipy.fft.irfft(padded, n=n, axis=-1)
+        step = 2 * np.pi / self.omega[0] / n
+        reach = min(n // 2 - 1, int(_LONGEST / self.sampling_rate / step))
+        near = np.concatenate([height[:, -reach:], height[:, : reach + 1]], axis=1)
+        return np.asarray((np.argmax(near, axis=1) - reach) * step)
+
+
+def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:
+    """Return exp(iωτ), shape (n_freqs, n_segments)."""
+    # Frequencies are evenly spaced: powers of one factor, sixteen at a time.
+    block = 16
+    count = -(-len(omega) // block)
+    fine = np.exp(1j * omega[0] * np.outer(np.arange(1, block + 1), tau))
+    coarse = np.exp(1j * omega[0] * block * np.outer(np.arange(count), tau))
+    turned = coarse[:, None] * fine[None]
+    return np.asarray(turned.reshape(count * block, len(tau))[: len(omega)])
+
+
+def _products(a: ComplexArray, b: ComplexArray) -> ComplexArray:
+    return np.asarray(np.matmul(a.transpose(0, 2, 1), b.conj()))
+
+
+def _empty(x0: ComplexArray, xj: ComplexArray) -> _Frame:
+    n_freqs, d0, dj = x0.shape[0], x0.shape[2], xj.shape[2]
+
+    def zeros(*shape: int) -> ComplexArray:
+        return np.zeros((n_freqs, *shape), dtype=np.complex128)
+
+    return _Frame(zeros(d0, d0), zeros(dj, d0), zeros(dj, dj))
+
+
+def _prediction(frame: _Frame) -> tuple[ComplexArray, ComplexArray]:
+    """Relative response P, shape (n_freqs, dj, d0), and what it leaves over, per segment."""
+    reference = _ridged(frame.reference)
+    response = np.linalg.solve(reference.transpose(0, 2, 1), frame.crossed.transpose(0, 2, 1))
+    response = response.transpose(0, 2, 1)
+    left = frame.own - response @ frame.crossed.conj().transpose(0, 2, 1)
+    return np.asarray(response), np.asarray(_ridged(left, frame.own) / frame.n_segments)
+
+
+def _ridged(matrix: ComplexArray, scale: ComplexArray | None = None) -> ComplexArray:
+    power = np.einsum("fpp->f", matrix if scale is None else scale).real / matrix.shape[1]
+    ridge = _RIDGE * power + np.finfo(np.float64).tiny
+    return np.asarray(matrix + ridge[:, None, None] * np.eye(matrix.shape[1]))
