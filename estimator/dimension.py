@@ -1,0 +1,249 @@
+"""How many dimensions the common motion has, band by band: the fewest that the model test accepts.
+
+Fewer than a sensor has channels where the motion lacks a dimension; more where the sensors do
+not quite feel one motion, and there are enough of them: its rotation and its gradients are
+then further factors of the same model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.coherency import check_dims, coherency
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.factor_analysis import max_factors, maximise
+from estimator.likelihood import NOISE_SPREAD, alike, standard_error
+from estimator.model_test import BandTest, model_test, pool
+
+if TYPE_CHECKING:
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+    from estimator.factor_analysis import Maximum
+
+LEVEL = 0.05
+"""A dimension is accepted when its pooled p value is above this. An unneeded factor costs
+precision, a missing one is a bias: one band in twenty pays rather than all risk it."""
+LEAST_BINS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class BandDimension:
+    """The dimension chosen for one band, and what it costs.
+
+    Attributes
+    ----------
+    low, high : float
+        Of the band's frequencies, Hz.
+    n_factors : int
+        Dimension of the common motion.
+    usual : int
+        Channels of the largest sensor, the dimension taken otherwise.
+    accepted : bool
+        False if even the most factors that can be identified do not explain the band.
+    test : BandTest
+        Of the chosen dimension.
+    tried : tuple of BandTest
+        Of 0, 1, … `n_factors` factors.
+    cov : float
+        Median c.o.v. of the noise at one frequency with `n_factors`.
+    usual_cov : float
+        The same with the usual dimension; NaN if that could not be fitted.
+    """
+
+    low: float
+    high: float
+    n_factors: int
+    usual: int
+    accepted: bool
+    test: BandTest
+    tried: tuple[BandTest, ...]
+    cov: float
+    usual_cov: float
+
+    @property
+    def text(self) -> str:
+        """The choice and its price in words."""
+        band = f"{self.low:.3g}–{self.high:.3g} Hz"
+        price = f"c.o.v. of one bin {self.cov:.2g} instead of {self.usual_cov:.2g}"
+        if not self.accepted:
+            return (
+                f"{band}: not even {self.n_factors} dimensions of motion explain the averages "
+                f"(statistic {self.test.statistic / self.test.degrees:.2g} times its expectation): "
+                "the noise estimate is biased here"
+            )
+        if self.n_factors < self.usual:
+            return f"{band}: the motion has {self.n_factors} of {self.usual} dimensions; {price}"
+        if self.n_factors > self.usual:
+            return (
+                f"{band}: the sensors do not feel one motion of {self.usual} dimensions; "
+                f"{self.n_factors} explain it; {price}"
+            )
+        return f"{band}: the motion has all {self.usual} dimensions"
+
+
+def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:
+    """Divide frequencies into bands of constant ratio, none with fewer than `least` of them.
+
+    Parameters
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz, rising; zero goes with the first band.
+    per_octave : int
+    least : int
+        Frequencies; the last band takes up what does not make one.
+
+    Returns
+    -------
+    int64, shape (n_freqs,)
+        Number of the band, from 0, never falling.
+    """
+    first = [0]
+    while True:
+        begin = first[-1]
+        f = max(float(frequency[begin]), float(frequency[min(1, len(frequency) - 1)]) / 2)
+        end = int(np.searchsorted(frequency, f * 2 ** (1 / per_octave), side="left"))
+        end = max(end, begin + least)
+        if len(frequency) - end < least:
+            break
+        first.append(end)
+    number = np.zeros(len(frequency), np.int64)
+    number[first[1:]] = 1
+    return np.cumsum(number)
+
+
+def choose_dimension(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    band: IntArray | None = None,
+    level: float = LEVEL,
+    neighbours: FloatArray | None = None,
+) -> tuple[IntArray, tuple[BandDimension, ...]]:
+    """Choose the dimension of the common motion in every band.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+        Independent averages; more than channels.
+    band : int64, shape (n_freqs,), optional
+        Number of the band of each frequency, never falling; `bands` by default.
+    level : float
+        Of the pooled model test.
+    neighbours : float64, shape (n_lags,), optional
+        From `estimator.model_test.neighbour_correlation`.
+
+    Returns
+    -------
+    n_factors : int64, shape (n_freqs,)
+        For ``maximum_likelihood(…, n_factors=n_factors)``.
+    choices : tuple of BandDimension
+        One a band.
+
+    Raises
+    ------
+    InvalidMatrixError
+        As `estimator.coherency.coherency` says, or if `frequency` or `band` do not fit.
+    InsufficientDataError
+        If there are fewer than three sensors or no more averages than channels.
+
+    Notes
+    -----
+    Beyond ``max(dims)`` factors the likelihood carries the weak prior of
+    `estimator.likelihood.alike`, in the test as in the estimate.
+    """
+    check_dims(dims)
+    matrix = coherency(csm, dims).matrix
+    if frequency.shape != (len(csm),):
+        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
+    if n_effective <= sum(dims):
+        raise InsufficientDataError(
+            f"{n_effective:.1f} averages of {sum(dims)} channels: more averages than channels "
+            "are needed"
+        )
+    number = bands(frequency) if band is None else band
+    if number.shape != frequency.shape or np.any(np.diff(number) < 0):
+        raise InvalidMatrixError("band: expected one number a frequency, never falling")
+    most = _most_testable(sum(dims))
+    search = _Search(matrix, number, dims, n_effective, neighbours)
+    usual = max(dims)
+    open_bands = list(np.unique(number))
+    tried: dict[int, list[BandTest]] = {int(b): [] for b in open_bands}
+    fitted: dict[int, float] = {}
+    usual_cov: dict[int, float] = {}
+    for q in range(most + 1):
+        needed = open_bands if q != usual else list(tried)
+        maximum, rows = search.fit(q, needed)
+        for b in needed:
+            inside = number[rows] == b
+            if q == usual:
+                usual_cov[b] = search.cov(maximum, inside)
+            if b in open_bands:
+                tried[b].append(search.test(maximum, rows, b))
+                fitted[b] = search.cov(maximum, inside)
+        open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
+        if not open_bands and q >= usual:
+            break
+    choices = tuple(
+        BandDimension(
+            low=float(frequency[number == b][0]),
+            high=float(frequency[number == b][-1]),
+            n_factors=len(tests) - 1,
+            usual=usual,
+            accepted=b not in open_bands,
+            test=tests[-1],
+            tried=tuple(tests),
+            cov=fitted[b],
+            usual_cov=usual_cov.get(b, float("nan")),
+        )
+        for b, tests in tried.items()
+    )
+    chosen = {b: len(tests) - 1 for b, tests in tried.items()}
+    return np.array([chosen[int(b)] for b in number]), choices
+
+
+def _most_testable(n_channels: int) -> int:
+    """Most factors that leave the test a degree of freedom."""
+    most = max_factors(n_channels)
+    return most if (n_channels - most) ** 2 > n_channels else most - 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """The averages in their bands, and how one dimension does in some of these."""
+
+    matrix: ComplexArray
+    number: IntArray
+    dims: tuple[int, ...]
+    n_effective: float
+    neighbours: FloatArray | None
+
+    def fit(self, q: int, some: list[int]) -> tuple[Maximum, IntArray]:
+        """Maximise the likelihood of q factors in some bands; the rows of these."""
+        rows = np.flatnonzero(np.isin(self.number, some))
+        penalty = None
+        if q > max(self.dims):
+            penalty = alike(self.dims, NOISE_SPREAD, self.n_effective)
+        return maximise(self.matrix[rows], q, penalty=penalty), rows
+
+    def test(self, maximum: Maximum, rows: IntArray, band: int) -> BandTest:
+        """Pool the model test over one band."""
+        whole = model_test(maximum, n_effective=self.n_effective)
+        return pool(whole, self.number[rows] == band, neighbours=self.neighbours)
+
+    def cov(self, maximum: Maximum, inside: BoolArray) -> float:
+        """Median c.o.v. of the noise at one frequency of a band; NaN if there is none."""
+        if (maximum.singular | ~inside).all():
+            return float("nan")
+        error = standard_error(maximum, n_effective=self.n_effective)
+        known = inside & ~maximum.singular
+        return float(np.median(error[known] / maximum.psi[known]))
