@@ -16,6 +16,11 @@ from daq.protocols.block import HostTime
 class HostClock(Protocol):
     """Where host times come from."""
 
+    @property
+    def speed(self) -> float:
+        """Host seconds that pass in one second of the system's monotonic clock."""
+        ...
+
     def now(self) -> HostTime:
         """Return the present instant."""
         ...
