@@ -174,18 +174,23 @@ def _pair(given: Coherency, i: slice, others: tuple[slice, slice], inverse_jk: _
 def _traces(S: ComplexArray, i: slice, pairs: list[_Pair], weights: FloatArray) -> FloatArray:
     """`estimator.uncertainty.moments` of the weighted mean of the pairs' estimates.
 
-    With W the rows a, b of all pairs, M = W^H omega W, where omega holds half of each pair's
-    weight; so ``tr((M S)**k) = tr((omega G)**k)``, where G = W S W^H are the residuals' spectra.
+    One residual a sensor: those of sensor j paired with different k differ by their sampling
+    error only, and their mean is taken. With W the rows of these residuals, M = W^H omega W, where
+    omega holds half of each pair's weight; so ``tr((M S)**k) = tr((omega G)**k)``, where
+    G = W S W^H are the residuals' spectra.
     """
     n_freqs, n_rows = pairs[0].cross.shape
-    n = 2 * len(pairs)
+    others = sorted({start for pair in pairs for start in (pair.j.start, pair.k.start)})
+    n = len(others)
     W = np.zeros((n_freqs, n_rows, n, S.shape[1]), dtype=np.complex128)
-    W[:, np.arange(n_rows), :, i.start + np.arange(n_rows)] = 1
     omega = np.zeros((n_freqs, 1, n, n))
-    for t, (weight, pair) in enumerate(zip(weights / 2, pairs, strict=True)):
-        a, b = 2 * t, 2 * t + 1
-        W[:, :, a, pair.j] = -pair.P
-        W[:, :, b, pair.k] = -pair.Q
-        omega[:, 0, a, b] = omega[:, 0, b, a] = weight
+    for weight, pair in zip(weights, pairs, strict=True):
+        a, b = others.index(pair.j.start), others.index(pair.k.start)
+        W[:, :, a, pair.j] -= weight[:, None, None] * pair.P
+        W[:, :, b, pair.k] -= weight[:, None, None] * pair.Q
+        omega[:, 0, a, b] = omega[:, 0, b, a] = weight / 2
+    share = 2 * omega[:, 0].sum(axis=1)[:, None, :, None]
+    np.divide(W, share, out=W, where=share > 0)
+    W[:, np.arange(n_rows), :, i.start + np.arange(n_rows)] = 1
     WS = (W.reshape(n_freqs, n_rows * n, -1) @ S).reshape(W.shape)
     return moments(WS @ W.conj().swapaxes(-1, -2), omega)

@@ -1,0 +1,63 @@
+"""`python -m benchmarks [NAME…]`: every benchmark module's rows as one table."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import benchmarks
+
+if TYPE_CHECKING:
+    from benchmarks.row import Row
+
+
+def table(rows: list[Row]) -> str:
+    """Lay rows out as text."""
+    cells = [("what", "measured", "to reach", "")]
+    for row in rows:
+        limit = row.at_most if row.at_most is not None else row.at_least
+        sign = "≤" if row.at_most is not None else "≥"
+        cells.append(
+            (
+                f"{row.what} ({row.note})" if row.note else row.what,
+                f"{row.measured:.3g} {row.unit}",
+                "" if limit is None else f"{sign} {limit:g} {row.unit}",
+                {True: "reached", False: "MISSED", None: ""}[row.reached],
+            )
+        )
+    widths = [max(len(line[column]) for line in cells) for column in range(4)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in cells
+    )
+
+
+def main(names: list[str]) -> int:
+    """Run the named benchmarks, or all; 1 if a promise is missed."""
+    modules = [
+        module.name
+        for module in pkgutil.iter_modules(benchmarks.__path__)
+        if module.name not in {"__main__", "row"} and (not names or module.name in names)
+    ]
+    unknown = set(names) - set(modules)
+    if unknown:
+        print(f"no benchmark named {', '.join(sorted(unknown))}", file=sys.stderr)
+        return 2
+    missed = False
+    for name in modules:
+        begin = time.perf_counter()
+        rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run()
+        print(f"{name} ({time.perf_counter() - begin:.0f} s)\n{table(rows)}\n", flush=True)
+        missed |= any(row.reached is False for row in rows)
+    return int(missed)
+
+
+if __name__ == "__main__":
+    # BLAS's own threads only get in the way of ours; it reads this when numpy is first imported.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,64 @@
+"""One figure of a benchmark, beside what it should reach."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A measured figure.
+
+    Attributes
+    ----------
+    what : str
+        What was measured, and against what.
+    measured : float
+    unit : str
+    at_most, at_least : float or None
+        What docs and design promise, where they do.
+    note : str
+        What limits it, or how it was measured.
+    """
+
+    what: str
+    measured: float
+    unit: str
+    at_most: float | None = None
+    at_least: float | None = None
+    note: str = ""
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the promise holds; None where there is none."""
+        if self.at_most is not None:
+            return self.measured <= self.at_most
+        if self.at_least is not None:
+            return self.measured >= self.at_least
+        return None
+
+
+def fastest(*actions: Callable[[], object], repeats: int = 5) -> list[float]:
+    """Return the least wall time in seconds of each action, taken in turns."""
+    least = [float("inf")] * len(actions)
+    for _ in range(repeats):
+        for i, action in enumerate(actions):
+            begin = time.perf_counter()
+            action()
+            least[i] = min(least[i], time.perf_counter() - begin)
+    return least
+
+
+def least_work(action: Callable[[], object], repeats: int = 5) -> float:
+    """Return the least processor time in seconds of an action, all threads together."""
+    least = float("inf")
+    for _ in range(repeats):
+        begin = time.process_time()
+        action()
+        least = min(least, time.process_time() - begin)
+    return least
