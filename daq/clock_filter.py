@@ -5,8 +5,8 @@ Theory of operation
 A clock is its *lateness* (time of a sample minus its index over the nominal rate), whose rate
 does a random walk. Two kinds of observations inform it: the lower envelope of block arrival
 times, and, where the sensors share a motion, the delay against a reference sensor measured from
-the samples. The latter know the lateness up to one constant (latencies differ), so the state is (lateness, rate,
-constant).
+the samples. The latter know the lateness up to one constant (latencies differ), so the state is
+(lateness, rate, constant).
 
 A Kalman filter runs for a grid of strengths of the random walk and of arrival noise at once; the
 most likely pair is smoothed backwards (Rauch, Tung, Striebel 1965). An innovation beyond four

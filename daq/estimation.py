@@ -167,6 +167,9 @@ class Snapshot:
     start_utc_ns : int
         UTC of the first grid sample.
     sensors, clocks : tuple
+    drift : float64, shape (n_segments, 1 + n_sensors)
+        Middle of each segment looked at, in seconds from `start_utc_ns`, and by how much each
+        sensor's own count of time then lags, in seconds: what the clocks do. Of the last recording.
     closed : bool
         Whether nothing more will come.
     """
@@ -186,6 +189,7 @@ class Snapshot:
     start_utc_ns: int
     sensors: tuple[SensorState, ...]
     clocks: tuple[ClockState, ...]
+    drift: FloatArray
     closed: bool
     diagnostics: dict[str, Any] = field(default_factory=dict)
 
@@ -276,6 +280,13 @@ class _Pass:
         return varying > _MATERIAL or bool(
             np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
         )
+
+    def drift(self) -> FloatArray:
+        """Return middles of segments in seconds, and every sensor's delay there."""
+        n_sensors = len(self.aligned.dims)
+        taken = np.concatenate(self.taken_at) if self.taken_at else np.empty((0, n_sensors))
+        middle = np.arange(len(taken)) * self.welch.hop + self.welch.segment_length / 2
+        return np.column_stack([middle / self.welch.sampling_rate, taken])
 
     def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
         """Measure what delays are left, for the clocks' next setting."""
@@ -454,6 +465,7 @@ class Estimation:
             start_utc_ns=first.aligned.start_utc_ns,
             sensors=tuple(_sensor_state(record) for record in self._recordings[-1].sensors),
             clocks=self._passes[-1].aligned.clocks,
+            drift=self._passes[-1].drift(),
             closed=all(recording.closed for recording in self._recordings),
         )
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from daq.bench_model import Channel
+from daq.estimation import Settings, estimate
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
+
+    from daq.estimation import Snapshot
 
     FloatArray = NDArray[np.float64]
 
@@ -57,6 +61,7 @@ def synthesise(
     block: float = 0.1,
     seed: int = 1,
     clock: str | None = None,
+    instants: bool = False,
 ) -> Path:
     """Write the recording that a bench of this scenario would have given.
 
@@ -73,7 +78,9 @@ def synthesise(
     seed : int
         Of the latencies.
     clock : str, optional
-        Name of the one clock they share; each has its own where not given.
+        Name of the one clock they claim to share; each has its own where not given.
+    instants : bool
+        Store when each sample was really taken, as no device could.
     """
     latency = latency or Latency()
     layouts = [
@@ -86,6 +93,7 @@ def synthesise(
             sampling_rate=scenario.sensors[name].sampling_rate,
             dtype=np.dtype(np.int32),
             clock=clock or name,
+            polled=instants,
         )
         for name in scenario.names
     ]
@@ -95,28 +103,35 @@ def synthesise(
         begin = scenario.sensors[layout.name].clock.offset
         length = max(1, round(block * layout.sampling_rate))
         n_blocks = int((duration - begin) * layout.sampling_rate) // length
-        instants = scenario.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
-        for each in _blocks(scenario, layout.name, length, latency.arrivals(instants, rng)):
+        ends = scenario.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
+        arrivals = latency.arrivals(ends, rng)
+        for each in _blocks(scenario, layout, length=length, arrivals=arrivals):
             writer.append(each)
     writer.close()
     return Path(path)
 
 
-def _blocks(scenario: Scenario, name: str, length: int, arrivals: FloatArray) -> Iterator[Block]:
+def _blocks(
+    scenario: Scenario, layout: SensorLayout, *, length: int, arrivals: FloatArray
+) -> Iterator[Block]:
     """Yield the blocks of one sensor, each `length` samples, that arrive then (world seconds)."""
     arrivals_ns = np.round(arrivals * 1e9).astype(np.int64).tolist()
     at_once = max(1, 20_000 // length)
     for first in range(0, len(arrivals_ns), at_once):
         some = arrivals_ns[first : first + at_once]
-        samples = scenario.samples(name, first * length, len(some) * length)
+        samples = scenario.samples(layout.name, first * length, len(some) * length)
         counts = np.round(samples * SENSITIVITY).astype(np.int32)
+        times = scenario.sample_times(layout.name, first * length, len(counts))
+        taken = ORIGIN.monotonic_ns + np.round(times * 1e9).astype(np.int64)
         for number, arrival in enumerate(some):
+            rows = slice(number * length, (number + 1) * length)
             yield Block(
-                name,
+                layout.name,
                 (first + number) * length,
-                counts[number * length : (number + 1) * length],
+                counts[rows],
                 HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
                 flags=BlockFlag.NONE if first + number else BlockFlag.CLOCK_RESTART,
+                instants_ns=taken[rows] if layout.polled else None,
             )
 
 
@@ -156,3 +171,109 @@ def free_running(
             "clock": clock,
         }
     return Scenario.from_dict(table, sampling_rate=200.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one way of taking the clocks gives.
+
+    Attributes
+    ----------
+    clocks : str
+    bias : float64, shape (n_bands, n_channels)
+        Mean of estimate over truth, less one.
+    against_oracle : float64, shape (n_bands, n_channels)
+        Mean of estimate over the estimate with true clocks, less one.
+    cov : float64, shape (n_channels,)
+        Coefficient of variation seen: scatter of estimate over truth between frequencies.
+    residual_us : float64, shape (n_sensors - 1,)
+        What is left between each clock and the first sensor's, in µs rms about its mean; NaN where
+        nothing was aligned.
+    """
+
+    clocks: str
+    bias: FloatArray
+    against_oracle: FloatArray
+    cov: FloatArray
+    residual_us: FloatArray
+
+
+BANDS = (0.5, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 75.0, 85.0, 90.0)
+"""Edges in Hz of the bands of the study, up to 0.45 of 200 Hz."""
+
+
+def study(
+    directory: Path,
+    *,
+    n_dims: int = 2,
+    snr: float = 1e4,
+    duration: float = 3600.0,
+    latency: Latency | None = None,
+    seed: int = 1,
+) -> list[Row]:
+    """Estimate one simulated huddle test with its clocks taken in four ways.
+
+    The same samples are recorded as they would arrive (estimated with refinement off and on), with
+    the true instant of every sample (the oracle), and as if one clock had taken them (face value).
+
+    Parameters
+    ----------
+    directory : Path
+        For the recordings, some 20 MB an hour each.
+    n_dims, snr, duration, latency, seed
+        As `free_running` and `synthesise` take them.
+    """
+    scenario = free_running(n_dims=n_dims, snr=snr, duration=duration, seed=seed)
+    settings = Settings()
+    made: dict[str, Any] = {"duration": duration, "latency": latency, "seed": seed}
+    arrived = synthesise(directory / "arrived.h5", scenario, **made)
+    oracle = synthesise(directory / "oracle.h5", scenario, instants=True, **made)
+    face = synthesise(directory / "face.h5", scenario, clock="one", **made)
+    snapshots = {
+        "face value": estimate([face], settings),
+        "arrival times": estimate([arrived], replace(settings, refine=False)),
+        "refined": estimate([arrived], settings),
+        "oracle": estimate([oracle], settings),
+    }
+    return [
+        _row(clocks, snapshot, snapshots["oracle"], scenario)
+        for clocks, snapshot in snapshots.items()
+    ]
+
+
+def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) -> Row:
+    psd = snapshot.results["three-sensor"].noise_psd
+    columns = [(name, r) for name in scenario.names for r in range(scenario.n_channels(name))]
+    frequency = snapshot.frequency
+    truth = np.stack([scenario.true_noise_psd(*c, frequency) for c in columns], axis=1)
+    bands = [(frequency >= a) & (frequency < b) for a, b in itertools.pairwise(BANDS)]
+    reference = oracle.results["three-sensor"].noise_psd
+    usable = (frequency >= BANDS[0]) & (frequency < BANDS[-1])
+    return Row(
+        clocks,
+        bias=np.stack([(psd[band] / truth[band]).mean(axis=0) - 1 for band in bands]),
+        against_oracle=np.stack(
+            [psd[band].mean(axis=0) / reference[band].mean(axis=0) - 1 for band in bands]
+        ),
+        cov=np.asarray((psd / truth)[usable].std(axis=0)),
+        residual_us=residuals(snapshot, scenario) * 1e6,
+    )
+
+
+def residuals(snapshot: Snapshot, scenario: Scenario) -> FloatArray:
+    """Return what is left between each clock and the first sensor's, in seconds rms.
+
+    A constant delay is left out: the method does not mind it, and only instruments with equal
+    responses would allow to tell it from their own.
+    """
+    start = (snapshot.start_utc_ns - ORIGIN.utc_ns) * 1e-9
+    seconds = start + snapshot.drift[:, 0]
+    errors = []
+    for name, delay in zip(scenario.names, snapshot.drift[:, 1:].T, strict=True):
+        index = (seconds - delay) * scenario.sensors[name].sampling_rate
+        whole = np.floor(index).astype(np.int64)
+        times = scenario.sample_times(name, 0, int(whole.max()) + 2)
+        true = times[whole] + (index - whole) * (times[whole + 1] - times[whole])
+        errors.append(seconds - true)
+    relative = np.stack(errors[1:]) - errors[0]
+    return np.asarray((relative - relative.mean(axis=1, keepdims=True)).std(axis=1))
