@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from sim_devices.arrays import FloatArray
 
-Kind: TypeAlias = Literal["pty", "tcp", "udp"]
+Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
+"""What a line is served on; "udp" sends, "udp-server" answers whoever spoke last."""
 
 NEVER = math.inf
 
@@ -89,6 +90,8 @@ class DeviceSpec:
     settings: Mapping[str, Any] = field(default_factory=dict)
     sensor_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Where the sensors of one port differ in their settings (slaves on one bus)."""
+    utc_ns: int = 0
+    """UTC at world time 0, for devices that know it."""
     model: str = ""
     serial_number: str = ""
 
@@ -121,6 +124,13 @@ class Source:
     def at_rate(self, sampling_rate: float) -> Source:
         """Return the same world read at another rate."""
         return Source(self._scenario, self.device, sampling_rate)
+
+    def disciplined(self, offset: float) -> Source:
+        """Return the same sensors, sampled ``offset`` s after world time 0 and without drift."""
+        table = self._scenario.to_dict()
+        for sensor in self.device.sensors:
+            table["sensors"][sensor]["clock"] = {"offset": offset}
+        return Source(Scenario.from_dict(table), self.device, self.sampling_rate)
 
     def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
         """Return the main channels in counts, not yet rounded or clipped: (n, n_channels)."""

@@ -252,8 +252,51 @@ class UdpPort:
         self._listener.disconnected()
 
 
+class UdpServer(asyncio.DatagramProtocol):
+    """A UDP port that hears requests and sends each unit to whoever spoke last."""
+
+    def __init__(self, listener: Listener, scheme: str) -> None:
+        self._listener = listener
+        self._scheme = scheme
+        self._transport: asyncio.DatagramTransport | None = None
+        self._to: tuple[str, int] | None = None
+        self.address = ""
+
+    async def open(self) -> None:
+        """Listen on a free port of this machine."""
+        self._transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: self, local_addr=("127.0.0.1", 0)
+        )
+        number = self._transport.get_extra_info("sockname")[1]
+        self.address = f"{self._scheme}://127.0.0.1:{number}"
+        self._listener.connected()
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Hand over what came."""
+        self._to = addr
+        self._listener.received(data)
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit as a datagram; whoever asked need not be there any more."""
+        if self._transport is not None and self._to is not None:
+            for unit in units:
+                self._transport.sendto(unit, self._to)
+
+    def hang_up(self) -> None:
+        """Forget who spoke last."""
+        self._to = None
+
+    async def close(self) -> None:
+        """Stop listening."""
+        if self._transport is not None:
+            self._transport.close()
+        self._listener.disconnected()
+
+
 def make_wire(kind: Kind, listener: Listener, *, scheme: str) -> Wire:
     """Return a line of this kind, not yet open."""
     if kind == "pty":
         return PseudoTerminal(listener)
+    if kind == "udp-server":
+        return UdpServer(listener, scheme)
     return TcpPort(listener, scheme) if kind == "tcp" else UdpPort(listener, scheme)

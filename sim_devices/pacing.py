@@ -30,3 +30,13 @@ class WorldClock:
     def monotonic(self, world_time: float) -> float:
         """Instant of the monotonic clock, in s, at which it is ``world_time``."""
         return self.epoch_ns / NS + world_time / self.speed
+
+
+def utc_of(monotonic_ns: int) -> int:
+    """Return the UTC of an instant of the system's monotonic clock, in ns since 1970.
+
+    The best of several looks at both clocks: processes agree to a few microseconds.
+    """
+    looks = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(20)]
+    before, utc, after = min(looks, key=lambda look: look[2] - look[0])
+    return monotonic_ns + utc - (before + after) // 2

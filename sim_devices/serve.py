@@ -35,12 +35,13 @@ import json
 import os
 import signal
 import sys
+from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sim_devices.device import NEVER, ChannelSpec, DeviceSpec, Endpoint, Line, Source
 from sim_devices.lines import Wire, make_wire
-from sim_devices.pacing import WorldClock
+from sim_devices.pacing import WorldClock, utc_of
 from sim_devices.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -49,6 +50,10 @@ if TYPE_CHECKING:
 FAMILIES = {
     "epson": "sim_devices.epson:create",
     "registers": "sim_devices.registers:create",
+    "labjack": "sim_devices.labjack:create",
+    "guralp": "sim_devices.guralp:create",
+    "fifo": "sim_devices.fifo:create",
+    "text": "sim_devices.text:create",
 }
 """Driver name → ``module:function`` that makes its simulated device."""
 
@@ -117,9 +122,10 @@ class Served:
 
 async def serve(spec: Mapping[str, Any], index: int) -> None:
     """Serve device ``index`` of a specification until told to end; print where it listens."""
-    device = device_spec(spec["devices"][index])
+    epoch_ns = int(spec["epoch_ns"])
+    device = replace(device_spec(spec["devices"][index]), utc_ns=utc_of(epoch_ns))
     scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
-    clock = WorldClock(int(spec["epoch_ns"]), float(spec.get("speed", 1.0)))
+    clock = WorldClock(epoch_ns, float(spec.get("speed", 1.0)))
     module, _, function = FAMILIES[device.driver].partition(":")
     source = Source(scenario, device)
     for sensor in device.sensors:  # the first sample takes its time: before anybody waits for it

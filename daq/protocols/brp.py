@@ -261,6 +261,17 @@ class Transmitter:
         self._sent.append(self._queue.popleft())
         return self._sent[-1][1]
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a frame to send."""
+        return bool(self._queue)
+
+    def clear(self) -> None:
+        """Forget what was to be sent and what was sent; numbering goes on."""
+        self._queue.clear()
+        self._sent.clear()
+        self._received.clear()
+
     def receive(self, data: bytes) -> bool:
         """Take replies; return whether the last frame was answered."""
         self._received += data

@@ -15,7 +15,7 @@ by more than an hour has had its clock set: its grid starts anew (``BlockFlag.CL
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -85,6 +85,7 @@ class _Sensor:
         self._name = name
         self._streams = {stream_id: _Stream() for stream_id in stream_ids}
         self._rate: Fraction | None = None
+        self.system = ""
         self._origin_ns = 0  # UTC of sample 0
         self._taken_to: int | None = None  # None until the first block is complete
         self._flags = BlockFlag.CLOCK_RESTART
@@ -106,6 +107,7 @@ class _Sensor:
         """Take a block of one of the streams."""
         if self._rate is None:
             self._rate, self._origin_ns = block.sampling_rate, block.start_ns
+            self.system = block.system.text
         if block.sampling_rate != self._rate:
             text = f"{block.stream_id} came at {block.sampling_rate} Hz; expected {self._rate} Hz"
             yield Event(self._name, "refused", text, at)
@@ -198,7 +200,7 @@ class Streams:
         ids = {name: tuple(stream_ids) for name, stream_ids in sensors.items()}
         self._sensors = {name: _Sensor(name, stream_ids) for name, stream_ids in ids.items()}
         self._owner = {stream: name for name, streams in ids.items() for stream in streams}
-        self._unknown: set[str] = set()
+        self._unknown: Counter[str] = Counter()
         self._lost = "block missing"
 
     @property
@@ -211,10 +213,23 @@ class Streams:
         """Stream IDs that came and belong to no sensor."""
         return frozenset(self._unknown)
 
+    @property
+    def repeated(self) -> bool:
+        """Whether one of these has come twice, and so all of them once, if equally long."""
+        return max(self._unknown.values(), default=0) > 1
+
     def sampling_rate(self, sensor: str) -> float | None:
         """Return the sampling rate of a sensor in Hz, once a block has said it."""
         rate = self._sensors[sensor].sampling_rate
         return None if rate is None else float(rate)
+
+    def stream_ids(self, sensor: str) -> tuple[str, ...]:
+        """Return the stream IDs of a sensor's channels."""
+        return tuple(stream for stream, owner in self._owner.items() if owner == sensor)
+
+    def system(self, sensor: str) -> str:
+        """Return the system ID a sensor's first block carried."""
+        return self._sensors[sensor].system
 
     def lost(self, reason: str) -> None:
         """Note why samples may be missing from now on."""
@@ -228,8 +243,10 @@ class Streams:
             yield from self._status(block, at)
         elif block.stream_id in self._owner:
             yield from self._sensors[self._owner[block.stream_id]].add(block, at)
-        elif block.stream_id not in self._unknown and len(self._unknown) < MAX_PENDING:
-            self._unknown.add(block.stream_id)
+        elif block.stream_id in self._unknown:
+            self._unknown[block.stream_id] += 1
+        elif len(self._unknown) < MAX_PENDING:
+            self._unknown[block.stream_id] = 1
             yield Event("", "refused", f"stream {block.stream_id} is of no sensor here", at)
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)

@@ -1,0 +1,80 @@
+"""The samples of a device's sensors as time passes, simulated a stretch at a time."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from sim_devices.arrays import FloatArray
+    from sim_devices.device import Source
+
+AHEAD = 1.0
+"""How much is simulated at a time, s of world time."""
+
+
+class Samples:
+    """Samples of sensors that one clock takes, by index, their channels side by side.
+
+    Parameters
+    ----------
+    source
+        What the sensors read. Sample times are those of the first sensor.
+    sensors
+        Their names, in the order of the columns.
+    """
+
+    def __init__(self, source: Source, sensors: Sequence[str]) -> None:
+        self._source = source
+        self._sensors = tuple(sensors)
+        self._length = max(16, math.ceil(AHEAD * source.sampling_rate))
+        self._first = 0
+        self._times: FloatArray = np.empty(0)
+        self._counts: NDArray[np.float64] = np.empty((0, 0))
+
+    def first_after(self, now: float) -> int:
+        """Index of the first sample taken at or after world time ``now``."""
+        return self._source.first_sample_after(self._sensors[0], now)
+
+    def time(self, index: int) -> float:
+        """World time at which a sample is taken, s."""
+        self._hold(index)
+        return float(self._times[index - self._first])
+
+    def end_before(self, now: float, start: int) -> int:
+        """Index after the last sample, from ``start`` on, that has been taken by ``now``."""
+        self._hold(start)
+        while self._times[-1] <= now:
+            start = self._first + len(self._times)
+            self._hold(start)
+        return self._first + int(np.searchsorted(self._times, now, side="right"))
+
+    def counts(self, first: int, n: int) -> NDArray[np.float64]:
+        """Return samples in counts, neither rounded nor clipped, shape (n, n_channels)."""
+        pieces: list[NDArray[np.float64]] = []
+        while n > 0:
+            self._hold(first)
+            row = first - self._first
+            pieces.append(self._counts[row : row + n])
+            first += len(pieces[-1])
+            n -= len(pieces[-1])
+        return np.concatenate(pieces) if pieces else self._counts[:0]
+
+    def _hold(self, index: int) -> None:
+        """Simulate the stretch that holds a sample."""
+        if not self._first <= index < self._first + len(self._times):
+            self._first = index // self._length * self._length
+            self._times = self._source.times(self._sensors[0], self._first, self._length)
+            columns = [self._source.counts(s, self._first, self._length) for s in self._sensors]
+            self._counts = np.concatenate(columns, axis=1)
+
+
+def whole(counts: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
+    """Round counts to what a converter from ``low`` to ``high`` gives."""
+    return np.clip(np.rint(counts), low, high).astype(np.int64)

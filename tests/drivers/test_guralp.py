@@ -1,0 +1,152 @@
+"""Güralp driver and simulated digitizer over serial lines, UDP and TCP."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.protocols.block import Block, BlockFlag, Event
+from sim_devices import launch
+from tests.sim_devices.bench import device, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench import Sensor
+    from sim_devices.launch import RunningDevice
+
+SPEED = 8.0
+RATE = 200.0
+COUNTS = 1e7
+CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "ZNE"]
+DRIVER = driver_type("guralp")
+
+
+def table(name: str, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
+    return device(name, "guralp", channels={name: CHANNELS}, **changes)
+
+
+TABLES = [
+    table("A", settings={"system_id": "GURA", "width": 24}, serial_number="DEMO"),
+    table("B", port="tcp", settings={"streams": ["B2Z", "B2N", "B2E"]}),
+    table("C", port="tcp", settings={"link": "scream"}),
+    table("D", port="udp", settings={"version": 31}),
+]
+SETTINGS: list[dict[str, Any]] = [{}, {"streams": ["B2Z", "B2N", "B2E"]}, {"link": "scream"}, {}]
+SPEC = spec(*TABLES, speed=SPEED)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with launch.start(SPEC) as devices:
+        yield devices
+
+
+def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Sensor:  # noqa: ANN401
+    settings = {**SETTINGS[index], **running[index].settings, **changes.pop("settings", {})}
+    return sensors(running[index], TABLES[index], settings=settings, **changes)[0]
+
+
+async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]:
+    blocks: list[Block] = []
+    events: list[Event] = []
+    async with DRIVER.open([one], SystemClock(SPEED)) as session:
+        async for item in session.read():
+            if isinstance(item, Event):
+                events.append(item)
+                continue
+            blocks.append(item)
+            if item.end_sample >= n_samples:
+                break
+    return blocks, events
+
+
+@pytest.mark.parametrize("index", range(4))
+async def test_every_link_gives_what_the_sensor_felt(
+    running: tuple[RunningDevice, ...], index: int
+) -> None:
+    blocks, events = await record(sensor(running, index), 1200)
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[0].flags == BlockFlag.DEVICE_UTC | BlockFlag.CLOCK_RESTART
+    assert {b.flags for b in blocks[1:]} == {BlockFlag.DEVICE_UTC}
+    assert all((b.device_counter or 0) % 1_000_000_000 == 0 for b in blocks)
+    assert np.ptp([(b.device_counter or 0) - b.first_sample * 5_000_000 for b in blocks]) == 0
+    counts = np.concatenate([b.counts for b in blocks])
+    assert counts.dtype == np.int32
+    assert counts.std(axis=0) == pytest.approx(np.full(3, COUNTS * 1e-2 * 0.9), rel=0.3)
+    assert {e.kind for e in events} <= {"status"}
+    assert any("GPS" in e.text for e in events)
+
+
+async def test_the_streams_feel_one_motion_at_the_utc_they_state(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    """Two digitizers at once: the same instants of UTC hold the same motion."""
+    found = await asyncio.gather(record(sensor(running, 0), 3000), record(sensor(running, 3), 3000))
+    start = [blocks[0].device_counter or 0 for blocks, _ in found]
+    counts = [np.concatenate([b.counts for b in blocks]) for blocks, _ in found]
+    late = (start[1] - start[0]) // 5_000_000
+    first, second = (counts[0], counts[1]) if late >= 0 else (counts[1], counts[0])
+    n = min(len(first) - abs(late), len(second))
+    assert n > 1000
+    # a sample of either is the motion, its own noise (1e-5 m/s²) and rounding
+    apart = (first[abs(late) :][:n] - second[:n]) / COUNTS
+    assert apart.std() < 5e-5 < first.std() / COUNTS / 50
+
+
+async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+    one = sensor(running, 0, settings={"system_id": "GURA"}, serial_number="DEMO")
+    async with DRIVER.open([one], SystemClock(SPEED)) as session:
+        (information,) = session.information
+    assert information.serial_number == "DEMO"
+    assert information.sampling_rate == RATE
+    assert information.details == {"system ID": "GURA", "streams": "DEMOZ2, DEMON2, DEMOE2"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"serial_number": "OTHR"}, WrongDeviceError, "expected serial number 'OTHR', got 'DEMO'"),
+        ({"settings": {"system_id": "X"}}, WrongDeviceError, "expected system ID 'X', got 'GURA'"),
+        ({"sampling_rate": 100.0}, WrongDeviceError, "expected 100 Hz, got 200 Hz"),
+        ({"settings": {"streams": ["DEMOZ2"]}}, BenchFileError, "for each of its 3 channels"),
+        (
+            {"settings": {"streams": ["DEMOZ2", "DEMON2", "OTHER"], "patience": 1.0}},
+            NoAnswerError,
+            "streams OTHER did not come within 1 s; heard DEMOE2",
+        ),
+        (
+            {"settings": {"patience": 1.0}, "channels": ({"name": "Z", "sensitivity": 1.0},)},
+            NoAnswerError,
+            "expected 1 streams of one digitizer, heard DEMOE2, DEMON2, DEMOZ2",
+        ),
+    ],
+)
+async def test_what_does_not_fit_is_named(
+    running: tuple[RunningDevice, ...], changes: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        await record(sensor(running, 0, **changes), 1)
+
+
+async def test_nothing_listens() -> None:
+    gone = launch.RunningDevice(("D",), "guralp", "udp://127.0.0.1:9", {}, None)  # type: ignore[arg-type]  # no process
+    with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: nothing listens"):
+        await record(sensors(gone, TABLES[3])[0], 1)
+
+
+async def test_a_digitizer_that_vanishes_ends_the_session() -> None:
+    with launch.start(spec(TABLES[0], speed=SPEED)) as (one,):
+        async with DRIVER.open(sensors(one, TABLES[0]), SystemClock(SPEED)) as session:
+            stream = session.read()
+            assert isinstance(await anext(stream), (Block, Event))
+            one.process.kill()
+            with pytest.raises(NotConnectedError, match="the port closed"):
+                async for _ in stream:
+                    pass
