@@ -104,8 +104,8 @@ RASPBERRY_SHAKE = TextFormat(
     prefix="{",
     channel_names=("EHZ",),
     whole=True,
-    device_time=True,
 )
+"""Its times are NTP's, rounded to 1 ms: good for gaps, too coarse to be the clock."""
 LILY = TextFormat(
     tag="LILY", columns=(2, 3), time_column=1, time_format="%Y/%m/%d %H:%M:%S", terminator="\r\n"
 )

@@ -78,7 +78,7 @@ def test_raspberry_shake() -> None:
     assert block.counts[:, 0].tolist() == counts
     assert block.counts.dtype == np.int32
     assert block.device_counter == 1_582_315_130_292_000_000
-    assert block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.DEVICE_UTC
+    assert block.flags == BlockFlag.CLOCK_RESTART
 
 
 def datacast(channel: str, packet: int) -> bytes:
