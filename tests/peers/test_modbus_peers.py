@@ -1,0 +1,203 @@
+"""libmodbus, mbpoll and minimalmodbus against our slaves; our driver against libmodbus."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench import Channel, Sensor
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.protocols.block import Block
+from sim_devices import launch
+from tests.sim_devices.bench import device, scenario, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sim_devices.launch import RunningDevice
+
+pytestmark = pytest.mark.peer
+
+RATE = 50.0
+STILL = 1e-6  # a world so slow that every reading is the same
+AGE = 5.01
+COUNTS_PER_UNIT = 1e5
+CHANNELS = [{"name": axis, "sensitivity": COUNTS_PER_UNIT} for axis in "xyz"]
+SLAVE = 0x50
+
+
+@pytest.fixture(scope="module")
+def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compile the libmodbus program."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler to build the libmodbus peer with")
+    program = tmp_path_factory.mktemp("libmodbus") / "peer"
+    source = Path(__file__).with_name("libmodbus_peer.c")
+    built = subprocess.run(
+        [compiler, "-I/usr/include/modbus", str(source), "-lmodbus", "-o", str(program)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if built.returncode and "modbus.h" in built.stderr:
+        pytest.skip("libmodbus (Debian: libmodbus-dev) is not installed")
+    assert built.returncode == 0, built.stderr
+    return program
+
+
+@pytest.fixture(scope="module", params=["tcp", "rtu"])
+def slave(request: pytest.FixtureRequest) -> Iterator[tuple[str, RunningDevice]]:
+    """Serve one simulated slave whose readings stand still."""
+    table = device(
+        "A",
+        "registers",
+        port="tcp" if request.param == "tcp" else "pty",
+        sampling_rate=RATE,
+        settings={"address": 0x34, "device_id": SLAVE},
+        channels={"A": CHANNELS},
+    )
+    with launch.start(spec(table, speed=STILL, age=AGE, sampling_rate=RATE)) as (one,):
+        yield request.param, one
+
+
+@pytest.fixture(scope="module")
+def reading() -> list[int]:
+    """Return what the slave's registers hold, from the world itself."""
+    row = scenario("A", sampling_rate=RATE).samples("A", int(AGE * RATE), 1)[0]
+    counts: list[int] = np.rint(row * COUNTS_PER_UNIT).astype(np.int16).astype(int).tolist()
+    return counts
+
+
+def signed(registers: list[int]) -> list[int]:
+    return [value - 65536 * (value > 32767) for value in registers]
+
+
+def test_libmodbus_reads_our_slave(
+    peer: Path, slave: tuple[str, RunningDevice], reading: list[int]
+) -> None:
+    kind, one = slave
+    where = one.port.rpartition(":")[2] if kind == "tcp" else one.port
+    said = subprocess.run(
+        [str(peer), "read", kind, where, str(SLAVE), "3", str(0x34), "3"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert signed([int(word) for word in said.stdout.split()]) == reading
+    refused = subprocess.run(
+        [str(peer), "read", kind, where, str(SLAVE), "3", "900", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "Illegal data address" in refused.stderr
+
+
+def test_mbpoll_reads_our_slave(slave: tuple[str, RunningDevice], reading: list[int]) -> None:
+    program = shutil.which("mbpoll")
+    if program is None:
+        pytest.skip("mbpoll (Debian: mbpoll) is not installed")
+    kind, one = slave
+    where = ["-m", "rtu", "-b", "9600", "-P", "none", one.port]
+    if kind == "tcp":
+        where = ["-m", "tcp", "-p", one.port.rpartition(":")[2], "127.0.0.1"]
+    asked = ["-a", str(SLAVE), "-0", "-r", str(0x34), "-c", "3", "-t", "4", "-1"]
+    said = subprocess.run([program, *asked, *where], capture_output=True, text=True, check=True)
+    values = re.findall(r"^\[\d+\]:\s+(\d+)", said.stdout, re.MULTILINE)
+    assert signed([int(value) for value in values]) == reading
+
+
+def test_minimalmodbus_reads_our_slave(
+    slave: tuple[str, RunningDevice], reading: list[int]
+) -> None:
+    minimalmodbus = pytest.importorskip(
+        "minimalmodbus", reason="minimalmodbus (PyPI) is not installed"
+    )
+    kind, one = slave
+    if kind == "tcp":
+        pytest.skip("minimalmodbus speaks RTU only")
+    instrument = minimalmodbus.Instrument(one.port, SLAVE)
+    instrument.serial.baudrate = 9600
+    instrument.serial.timeout = 1.0
+    try:
+        assert signed(instrument.read_registers(0x34, 3)) == reading
+        assert instrument.read_register(0x34, signed=True) == reading[0]
+        with pytest.raises(minimalmodbus.IllegalRequestError):
+            instrument.read_register(900)
+    finally:
+        instrument.serial.close()
+
+
+@contextmanager
+def running(*command: str) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        try:
+            yield program
+        finally:
+            program.terminate()
+
+
+@contextmanager
+def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
+    """Two pseudo-terminals joined by socat."""
+    if shutil.which("socat") is None:
+        pytest.skip("socat (Debian: socat) is not installed")
+    ends = (str(folder / "one"), str(folder / "other"))
+    with running("socat", *(f"pty,raw,echo=0,link={end}" for end in ends)):
+        deadline = time.monotonic() + 5
+        while not all(Path(end).exists() for end in ends):
+            assert time.monotonic() < deadline, "socat made no pseudo-terminals"
+        yield ends
+
+
+async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
+    sensor = Sensor(
+        name="A",
+        driver="registers",
+        port=port,
+        sampling_rate=100.0,
+        settings=settings,
+        channels=tuple(Channel(name=name, sensitivity=1.0) for name in ("n", "a", "b")),
+    )
+    rows: list[list[int]] = []
+    async with driver_type("registers").open([sensor], SystemClock()) as session:
+        async for item in session.read():
+            assert isinstance(item, Block), item
+            rows += item.counts.tolist()
+            if len(rows) >= 100:
+                return rows
+    return rows
+
+
+@pytest.mark.parametrize("function", [3, 4])
+async def test_our_driver_reads_a_libmodbus_server_over_tcp(peer: Path, function: int) -> None:
+    with running(str(peer), "serve", "tcp") as server:
+        port = server.stdout.readline().strip() if server.stdout else ""
+        settings = {"function": function, "addresses": [0, 7, 9], "device_id": 255}
+        rows = await _polled(f"modbus-tcp://127.0.0.1:{port}", settings)
+    counts = [row[0] for row in rows]
+    assert counts == list(range(counts[0], counts[0] + len(rows)))  # every request once
+    assert {tuple(row[1:]) for row in rows} == {(21, 27)}
+
+
+async def test_our_driver_reads_a_libmodbus_server_over_rtu(peer: Path, tmp_path: Path) -> None:
+    with (
+        serial_cable(tmp_path) as (ours, theirs),
+        running(str(peer), "serve", "rtu", theirs) as server,
+    ):
+        assert server.stdout is not None
+        assert server.stdout.readline() == "ready\n"
+        rows = await _polled(ours, {"addresses": [0, 7, 9], "device_id": 5, "baud_rate": 115200})
+    counts = [row[0] for row in rows]
+    assert counts == list(range(counts[0], counts[0] + len(rows)))
+    assert {tuple(row[1:]) for row in rows} == {(21, 27)}
