@@ -66,7 +66,12 @@ def bin_correlation(window: FloatArray, hop: int) -> FloatArray:
 
 
 def band_means(
-    noise_psd: FloatArray, cov: FloatArray, edges: NDArray[np.int64], correlation: FloatArray
+    noise_psd: FloatArray,
+    cov: FloatArray,
+    edges: NDArray[np.int64],
+    correlation: FloatArray,
+    *,
+    quantile: float = NORMAL_95,
 ) -> BandMeans:
     """Average a noise spectrum over bands of bins.
 
@@ -78,6 +83,8 @@ def band_means(
         Band b holds bins ``edges[b]`` to ``edges[b + 1]``; increasing.
     correlation : float64, shape (N_LAGS,)
         From :func:`bin_correlation`.
+    quantile : float
+        Standard deviations to either end of the interval: 95 % unless given.
 
     Returns
     -------
@@ -101,9 +108,9 @@ def band_means(
         mean = np.add.reduceat(psd, starts) / count
         spread = np.sqrt(variance) / count
         certain = mean > CERTAIN * spread
-        factor = np.exp(np.where(certain, NORMAL_95 * spread / mean, 0.0))
-        low = np.where(certain, mean / factor, mean - NORMAL_95 * spread)
-        high = np.where(certain, mean * factor, mean + NORMAL_95 * spread)
+        factor = np.exp(np.where(certain, quantile * spread / mean, 0.0))
+        low = np.where(certain, mean / factor, mean - quantile * spread)
+        high = np.where(certain, mean * factor, mean + quantile * spread)
     return BandMeans(mean, spread, low, high)
 
 

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 LIMIT_NOT_MET, USAGE, TROUBLE, INTERRUPTED = 1, 2, 3, 130
 
 
+_OTHERS = (("estimator.errors", "EstimatorError"), ("sim_devices.errors", "ServeError"))
+"""Roots of errors that are trouble as well, where their module has been loaded at all."""
+
+
 class HuddleGroup(TyperGroup):
     """Runs a subcommand and turns what it raises into a message and an exit code."""
 
@@ -59,13 +63,16 @@ def exit_code(error: BaseException) -> int | None:
     if isinstance(error, BaseExceptionGroup):
         codes = [exit_code(inner) for inner in error.exceptions]
         return None if None in codes else max(code for code in codes if code is not None)
+    if type(error).__name__ == "RecorderFailedError":
+        return int(getattr(error, "code", TROUBLE))
     if isinstance(error, BenchFileError) or type(error).__name__ == "ScenarioError":
         return USAGE
     if isinstance(error, (HuddleError, OSError)):
         return TROUBLE
-    estimator = sys.modules.get("estimator.errors")
-    if estimator is not None and isinstance(error, estimator.EstimatorError):
-        return TROUBLE
+    for module, name in _OTHERS:
+        loaded = sys.modules.get(module)
+        if loaded is not None and isinstance(error, getattr(loaded, name)):
+            return TROUBLE
     return None
 
 

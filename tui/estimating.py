@@ -13,7 +13,7 @@ from daq.bench import parse_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
 from tui.output import for_people, notices, write_json, write_text
-from tui.results import curves_csv, document, remarks, result_table
+from tui.results import curves_csv, document, remarks, result_table, result_title
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,6 +73,7 @@ def show_result(
 ) -> None:
     """Print the table for people, and write what programs asked for."""
     screen = for_people(json, csv)
+    screen.print(result_title(snapshot, settings))
     screen.print(result_table(snapshot, settings))
     for line in remarks(snapshot):
         screen.print(line)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.dimension import choose_dimension
 from estimator.methods import self_noise
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.windows import get_window
@@ -38,12 +39,14 @@ DURATION = 3 * 3600.0
 SHOWN = slice(5, 901)
 """0.5 to 90 Hz."""
 BANDS = ((2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, 80.0))
+WAVE_BANDS = (*BANDS[:4], (45.0, 55.0))
 FINE = 8
 """Points of the true spectrum per bin, where the window smooths it."""
 REACH = 3
 """Bins to each side from which a Hann window takes power."""
 PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
 BIAS_LABEL = "fractional bias (1)"
+STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C2-"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,83 +130,130 @@ def expected_csm(scenario: Scenario, settings: WelchSettings) -> ComplexArray:
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseOfTarget:
-    """Noise of the first channel of the first sensor, measured and in the limit."""
+class Noise:
+    """Noise of some channels, shapes (n_freqs, n_channels): estimated, and what it should be."""
 
+    method: str
     estimate: FloatArray
     limit: FloatArray
     deviation: FloatArray
     truth: FloatArray
 
 
-def estimate(measured: Measured, sensors: tuple[str, ...], method: str) -> NoiseOfTarget:
-    """Estimate the target's noise from some sensors' channels."""
+def estimate(
+    measured: Measured, sensors: tuple[str, ...], method: str, *, n_channels: int = 1
+) -> Noise:
+    """Estimate the noise of the leading channels of some sensors.
+
+    What theory expects is the estimate from the cross-spectral matrix without statistical error.
+    """
     dims, n = (3,) * len(sensors), measured.n_effective
     limit = measured.of(measured.limit, sensors)
     found = self_noise(method, measured.of(measured.csm, sensors), dims=dims, n_effective=n)
     predicted = self_noise(method, limit, dims=dims, n_effective=n)
     unbiased = self_noise(method, limit, dims=dims, n_effective=n, correct=False)
-    frequency = HANN.frequencies[SHOWN]
-    return NoiseOfTarget(
-        estimate=found.noise_psd[:, 0],
-        limit=unbiased.noise_psd[:, 0],
-        deviation=predicted.cov[:, 0] * np.abs(predicted.noise_psd[:, 0]),
-        truth=measured.scenario.true_noise_psd(sensors[0], 0, frequency),
+    return Noise(
+        method=method,
+        estimate=found.noise_psd[:, :n_channels],
+        limit=unbiased.noise_psd[:, :n_channels],
+        deviation=(predicted.cov * np.abs(predicted.noise_psd))[:, :n_channels],
+        truth=_truth(measured, sensors)[:, :n_channels],
     )
 
 
-def bands(noise: NoiseOfTarget, *, label: str, method: str) -> Series:
-    """Mean fractional bias over each band, beside its limit."""
+def estimate_any_dimension(measured: Measured, *, n_channels: int) -> Noise:
+    """Estimate by maximum likelihood, with as many dimensions of motion as the test asks for.
+
+    Theory expects the true noise, though only as far as the motion has no further dimensions.
+    """
+    sensors = measured.scenario.names[::-1]  # the one in the middle comes first
+    dims, n = (3,) * len(sensors), measured.n_effective
+    csm = measured.of(measured.csm, sensors)
+    n_factors, _ = choose_dimension(csm, HANN.frequencies[SHOWN], dims=dims, n_effective=n)
+    found = self_noise("maximum-likelihood", csm, dims=dims, n_effective=n, n_factors=n_factors)
+    truth = _truth(measured, sensors)[:, :n_channels]
+    cov = np.where(np.isfinite(found.cov), found.cov, 1.0)[:, :n_channels]  # at zero: one
+    return Noise("maximum-likelihood", found.noise_psd[:, :n_channels], truth, cov * truth, truth)
+
+
+def _truth(measured: Measured, sensors: tuple[str, ...]) -> FloatArray:
     frequency = HANN.frequencies[SHOWN]
-    window = get_window(HANN.window, HANN.segment_length)
-    correlation = bin_correlation(window, HANN.hop)
+    return np.transpose(
+        [
+            measured.scenario.true_noise_psd(sensor, channel, frequency)
+            for sensor in sensors
+            for channel in range(3)
+        ]
+    )
+
+
+def band_series(
+    noise: Noise,
+    *,
+    label: str,
+    bands: tuple[tuple[float, float], ...] = BANDS,
+    allowed: Callable[[float], float] = lambda _: 0.0,
+) -> Series:
+    """Mean fractional bias over each band and all channels, beside its limit.
+
+    The error is as if the channels' estimates were wrong all in the same way, as they are where
+    the motion is what they share.
+    """
+    frequency = HANN.frequencies[SHOWN]
+    correlation = bin_correlation(get_window(HANN.window, HANN.segment_length), HANN.hop)
+    both_sides = np.concatenate([correlation[:0:-1], correlation])
     points = []
-    for low, high in BANDS:
+    for low, high in bands:
         band = (frequency >= low) & (frequency < high)
         truth = noise.truth[band]
-        spread = noise.deviation[band] / truth
-        together = np.convolve(spread, np.r_[correlation[:0:-1], correlation], "same") @ spread
+        variance = [
+            np.convolve(spread, both_sides, "same") @ spread
+            for spread in (noise.deviation[band] / truth).T
+        ]
+        centre = float(np.sqrt(low * high))
         points.append(
             Point(
-                x=float(np.sqrt(low * high)),
+                x=centre,
                 measured=float(np.mean(noise.estimate[band] / truth - 1)),
                 theory=float(np.mean(noise.limit[band] / truth - 1)),
-                error=float(np.sqrt(together) / band.sum()),
+                error=float(np.mean(np.sqrt(variance)) / band.sum()),
+                allowed=allowed(high),
             )
         )
-    return Series(label, method, "bias", tuple(points))
+    return Series(label, noise.method, "bias", tuple(points))
+
+
+def _spectra(title: str, record: Curve, noises: tuple[Noise, ...]) -> Panel:
+    """Draw a record and the noise of its first channel."""
+    frequency = HANN.frequencies[SHOWN]
+    estimates = [(noise.method, noise.estimate, STYLES[noise.method]) for noise in noises]
+    curves = [
+        Curve(label, frequency, np.where(psd[:, 0] > 0, psd[:, 0], np.nan), style)
+        for label, psd, style in (*estimates, ("true noise", noises[0].truth, "r-"))
+    ]
+    return Panel(title, FREQUENCY_LABEL, PSD_LABEL, curves=(record, *curves), log="xy")
+
+
+def _record(measured: Measured, sensor: str) -> Curve:
+    power = measured.of(measured.csm, (sensor,))[:, 0, 0].real
+    return Curve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
+
+
+def _biases(title: str, *series: Series) -> Panel:
+    return Panel(title, FREQUENCY_LABEL, BIAS_LABEL, series=series, log="x")
 
 
 def case(laboratory: Laboratory, number: str) -> tuple[Panel, Panel]:
     """Spectra of one case of Table 1, and the bias of both methods by band."""
     setup, sensors = scenarios.CASES[number]
     measured = laboratory.measured(setup)
-    three_channel = estimate(measured, sensors, "three-channel")
-    three_sensor = estimate(measured, sensors, "three-sensor")
-    title = f"case {number}: {', '.join(sensors)}"
+    noises = tuple(
+        estimate(measured, sensors, method) for method in ("three-channel", "three-sensor")
+    )
+    label = f"case {number} ({', '.join(sensors)})"
     return (
-        Panel(
-            title,
-            FREQUENCY_LABEL,
-            PSD_LABEL,
-            curves=(
-                _record(measured, sensors[0]),
-                _curve("three-channel", three_channel.estimate, "k-"),
-                _curve("three-sensor", three_sensor.estimate, "C0-"),
-                _curve("true noise", three_sensor.truth, "r-"),
-            ),
-            log="xy",
-        ),
-        Panel(
-            f"{title}: bias",
-            FREQUENCY_LABEL,
-            BIAS_LABEL,
-            series=(
-                bands(three_channel, label=f"case {number}", method="three-channel"),
-                bands(three_sensor, label=f"case {number}", method="three-sensor"),
-            ),
-            log="x",
-        ),
+        _spectra(label, _record(measured, sensors[0]), noises),
+        _biases(f"{label}: bias", *(band_series(noise, label=label) for noise in noises)),
     )
 
 
@@ -221,44 +271,51 @@ def setup2(laboratory: Laboratory) -> Study:
 def fig14(laboratory: Laboratory) -> Study:
     """Wider triangles, where coherence fails; and what all five sensors make of it."""
     measured = laboratory.measured("setup1")
-    panels = []
+    record = _record(measured, "E")
+    panels: list[Panel] = []
     for letter, sensors in (("a", ("E", "A", "C")), ("b", ("E", "A", "D"))):
-        found = estimate(measured, sensors, "three-sensor")
-        label = ", ".join(sensors)
+        noise = estimate(measured, sensors, "three-sensor")
+        label = f"({letter}) {', '.join(sensors)}"
         panels += [
-            Panel(
-                f"({letter}) {label}",
-                FREQUENCY_LABEL,
-                PSD_LABEL,
-                curves=(
-                    _record(measured, "E"),
-                    _curve("three-sensor", found.estimate, "C0-"),
-                    _curve("true noise", found.truth, "r-"),
-                ),
-                log="xy",
-            ),
-            Panel(
-                f"({letter}) {label}: bias",
-                FREQUENCY_LABEL,
-                BIAS_LABEL,
-                series=(bands(found, label=label, method="three-sensor"),),
-                log="x",
-            ),
+            _spectra(label, record, (noise,)),
+            _biases(f"{label}: bias", band_series(noise, label=label)),
         ]
-    return Study("fig14", "Wider triangles: spatial incoherence", tuple(panels))
+    noise = estimate_any_dimension(measured, n_channels=1)
+    label = "all five"
+    panels += [
+        _spectra(label, record, (noise,)),
+        _biases(f"{label}: bias", band_series(noise, label=label, allowed=_goal)),
+    ]
+    return Study("fig14", "Wider triangles are less coherent; five sensors know", tuple(panels))
 
 
-def _record(measured: Measured, sensor: str) -> Curve:
-    power = measured.of(measured.csm, (sensor,))[:, 0, 0].real
-    return _curve("motion and noise", power, "k:")
+def waves(laboratory: Laboratory) -> Study:
+    """Five sensors of any direction where the motion is far from coherent: beyond the paper."""
+    measured = laboratory.measured("waves")
+    triangle = estimate(measured, ("E", "C", "D"), "three-sensor", n_channels=3)
+    five = estimate_any_dimension(measured, n_channels=15)
+    return Study(
+        "waves",
+        "Waves at 150 m/s, SNR 1000: three sensors against five",
+        (
+            _spectra("E", _record(measured, "E"), (triangle, five)),
+            _biases(
+                "bias",
+                band_series(triangle, label="E, C, D", bands=WAVE_BANDS),
+                band_series(five, label="all five", bands=WAVE_BANDS, allowed=_goal),
+            ),
+        ),
+    )
 
 
-def _curve(label: str, psd: FloatArray, style: str) -> Curve:
-    return Curve(label, HANN.frequencies[SHOWN], np.where(psd > 0, psd, np.nan), style)
+def _goal(high: float) -> float:
+    """Bias that is left to the five sensors: 5 % to 20 Hz, 20 % above."""
+    return 0.05 if high <= 20 else 0.2
 
 
 LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
     "setup1": setup1,
     "setup2": setup2,
     "fig14": fig14,
+    "waves": waves,
 }

@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 STANDARD_OUTPUT = "-"
+WIDTH_OF_FILES = 110
+"""Columns of tables that go into a file or a pipe."""
 
 
-@cache
 def console() -> Console:
     """Return standard output."""
-    return Console(highlight=False)
+    terminal = sys.stdout.isatty()
+    return Console(highlight=False, width=None if terminal else WIDTH_OF_FILES)
 
 
 @cache
@@ -46,14 +48,15 @@ def write_text(file: str, text: str) -> None:
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:
     """Write a document as one line of JSON, if a file is given; what is not finite becomes null."""
     if file is not None:
-        write_text(file, json.dumps(_finite(document), ensure_ascii=False, allow_nan=False) + "\n")
+        write_text(file, json.dumps(finite(document), ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """Return a JSON value with null for every number that is not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import asdict, is_dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from rich.table import Table
 
 from estimator.windows import get_window
 from tui.bands import band_edges, band_means, bin_correlation
-from tui.text import clock_time, interval, level, utc
+from tui.text import clock_time, level, level_with_error, utc
 
 if TYPE_CHECKING:
     from daq.estimation import Settings, Snapshot
@@ -45,25 +46,37 @@ def channel_means(
     )
 
 
+def reached_cov(snapshot: Snapshot, settings: Settings, method: str | None = None) -> float:
+    """Return the c.o.v. per frequency, median in the band, of the channel that is worst."""
+    noise = snapshot.results.get(method or next(iter(snapshot.results), ""))
+    if noise is None:
+        return math.nan
+    low, high = band_of(settings, snapshot.frequency)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    cov = noise.cov[inside]
+    usable = cov[:, np.isfinite(cov).any(axis=0)]
+    return float(np.nanmax(np.nanmedian(usable, axis=0))) if usable.size else math.nan
+
+
+def result_title(snapshot: Snapshot, settings: Settings) -> str:
+    """Return what the table of results holds."""
+    low, high = band_of(settings, snapshot.frequency)
+    return (
+        f"[b]Self-noise, mean over {low:.3g} to {high:.3g} Hz[/b], dB re 1 ({snapshot.unit})²/Hz, "
+        "with its 95 % interval"
+    )
+
+
 def result_table(snapshot: Snapshot, settings: Settings) -> Table:
     """Return the noise of every channel in the band, by each method."""
     band = band_of(settings, snapshot.frequency)
-    table = Table(
-        title=f"Self-noise, mean over {band[0]:.3g} to {band[1]:.3g} Hz, "
-        f"dB re 1 ({snapshot.unit})²/Hz, 95 % interval",
-        title_justify="left",
-        title_style="bold",
-        box=None,
-        pad_edge=False,
-        padding=(0, 2, 0, 0),
-    )
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")
     table.add_column("channel")
     table.add_column("data", justify="right")
     columns = []
     for method, noise in snapshot.results.items():
         table.add_column(method, justify="right")
-        table.add_column("95 %")
         columns.append(channel_means(noise, snapshot.frequency, settings, band))
     inside = slice(*band_edges(snapshot.frequency, band))
     data = snapshot.data_psd[inside].mean(axis=0)
@@ -71,8 +84,7 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
         row = [label.sensor, label.channel, level(float(data[number]))]
         for means in columns:
             mean = means[number]
-            row.append(level(float(mean.mean[0])))
-            row.append(interval(float(mean.low[0]), float(mean.high[0])))
+            row.append(level_with_error(float(mean.mean[0]), float(mean.high[0])))
         table.add_row(*row)
     return table
 
@@ -157,6 +169,26 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any result of a diagnostic
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return value
+
+
+def result_arrays(snapshot: Snapshot, method: str) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+    """Return one method's result as arrays and attributes for a recording's ``/results``."""
+    noise = snapshot.results[method]
+    arrays = {
+        "frequency": snapshot.frequency,
+        "data_psd": snapshot.data_psd,
+        "noise_psd": noise.noise_psd,
+        "noise_psd_low": noise.low,
+        "noise_psd_high": noise.high,
+        "cov": noise.cov,
+    }
+    attributes = {
+        "segments": snapshot.n_segments,
+        "effective_averages": snapshot.n_effective,
+        "channels": [f"{label.sensor}.{label.channel}" for label in snapshot.channels],
+        "unit": snapshot.unit,
+    }
+    return arrays, attributes
 
 
 def curves_csv(snapshot: Snapshot) -> str:

@@ -23,17 +23,23 @@ Told: TypeAlias = "Callable[[str, float], None]"
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One measured value beside its theory; `error` is the standard error of the measurement."""
+    """One measured value beside its theory.
+
+    `error` is the standard error of the measurement; `allowed` is what an approximation, which
+    has no exact theory, may be off by besides.
+    """
 
     x: float
     measured: float
     theory: float
     error: float
+    allowed: float = 0.0
 
     @property
     def deviation(self) -> float:
-        """Standard errors between measurement and theory."""
-        return (self.measured - self.theory) / self.error
+        """Standard errors between measurement and theory, beyond what is allowed."""
+        away = self.measured - self.theory
+        return float(np.sign(away) * max(abs(away) - self.allowed, 0.0) / self.error)
 
     @property
     def agrees(self) -> bool:
@@ -49,6 +55,16 @@ class Series:
     method: str
     quantity: Literal["bias", "c.o.v."]
     points: tuple[Point, ...]
+
+    @property
+    def title(self) -> str:
+        """Label and method, once where they are the same."""
+        return self.label if self.label == self.method else f"{self.label}, {self.method}"
+
+    @property
+    def telling(self) -> Point:
+        """The point where theory expects most; the last one where it expects the same of all."""
+        return max(reversed(self.points), key=lambda point: round(abs(point.theory), 9))
 
     @property
     def worst(self) -> Point:
@@ -121,6 +137,7 @@ class Study:
                             "measured": point.measured,
                             "theory": point.theory,
                             "error": point.error,
+                            "allowed": point.allowed,
                             "deviation": point.deviation,
                             "agrees": point.agrees,
                         }

@@ -45,6 +45,13 @@ def level(psd: float) -> str:
     return "below 0" if psd <= 0 else _signed(decibels(psd))
 
 
+def level_with_error(psd: float, high: float) -> str:
+    """Return a PSD in dB with half the width of its 95 % interval."""
+    if not (psd > 0 and high > psd):
+        return level(psd)
+    return f"{level(psd)} ±{decibels(high) - decibels(psd):.2f}"
+
+
 def interval(low: float, high: float) -> str:
     """Return an interval of PSD in dB."""
     if math.isnan(high):

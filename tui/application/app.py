@@ -17,9 +17,9 @@ from textual.widgets import Footer, Static
 
 from daq.errors import HuddleError
 from tui.application import view
-from tui.application.follow import follow
 from tui.application.plot import PsdPlot
 from tui.application.screens import HelpScreen, MarkScreen
+from tui.following import follow
 from tui.text import clock_time
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ class HuddleApp(App[None]):
         Starts, stops, marks and finds recorders; knows the bench.
     path : Path, optional
         Recording to follow from the start.
+    start : bool
+        Whether to start a recording at once.
     """
 
     CSS_PATH = "huddle.tcss"
@@ -87,8 +89,11 @@ class HuddleApp(App[None]):
     snapshot: reactive[Snapshot | None] = reactive(None, always_update=True)
     choice: reactive[view.Choice] = reactive(view.Choice)
 
-    def __init__(self, controls: Controls, *, path: Path | None = None) -> None:
+    def __init__(
+        self, controls: Controls, *, path: Path | None = None, start: bool = False
+    ) -> None:
         super().__init__()
+        self._start_at_once = start
         self._controls = controls
         self._path = path
         self._settings: Settings | None = None
@@ -110,6 +115,8 @@ class HuddleApp(App[None]):
         self._show()
         if self._path is not None:
             self.post_message(Following(self._path))
+        elif self._start_at_once:
+            self.action_start()
         else:
             self._find_running()
 

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
-
-from rich.text import Text
-
-from daq.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,36 +49,3 @@ class Controls(Protocol):
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
         ...
-
-
-@dataclass(frozen=True)
-class Onlooker:
-    """Controls of somebody who only looks at a recording."""
-
-    path: Path
-    settings: Settings | None = None
-
-    can_start = False
-
-    @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.path.name
-
-    def description(self) -> Text:
-        """Nothing is to be seen yet."""
-        return Text("opening …", "#9aa5b8")
-
-    def start(self) -> Path:
-        """Refuse."""
-        raise RecordingError(f"{self.path}: a recording cannot be started again")
-
-    def find_running(self) -> Path | None:
-        """Return the recording itself."""
-        return self.path
-
-    def stop(self, path: Path) -> None:
-        """Ask the recorder to stop."""
-
-    def mark(self, path: Path, text: str) -> None:
-        """Ask the recorder to record a remark."""

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tui.application.curves import data_curve, noise_curve
-from tui.results import band_of, channel_means, correlation_of
+from tui.results import band_of, channel_means, correlation_of, reached_cov
 from tui.text import clock_time, decibels, time_left
 
 if TYPE_CHECKING:
@@ -142,21 +142,10 @@ def _channel_noise(
     return Text(f"{name} {value}".replace("-", "−"), "reverse" if chosen else "")
 
 
-def reached_cov(snapshot: Snapshot, settings: Settings, choice: Choice) -> float:
-    """Return the c.o.v. per frequency, median in the band, of the channel that is worst."""
-    method = next((m for m in choice.methods if m in snapshot.results), None)
-    if method is None:
-        return math.nan
-    low, high = band_of(settings, snapshot.frequency)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    cov = snapshot.results[method].cov[inside]
-    usable = cov[:, np.isfinite(cov).any(axis=0)]
-    return float(np.nanmax(np.nanmedian(usable, axis=0))) if usable.size else math.nan
-
-
 def progress_line(snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int) -> Text:
     """Return how far the test is: a bar where there is a target, segments, c.o.v., time left."""
-    cov, target = reached_cov(snapshot, settings, choice), settings.target_cov
+    method = next((m for m in choice.methods if m in snapshot.results), None)
+    cov, target = reached_cov(snapshot, settings, method), settings.target_cov
     parts = [f"{snapshot.n_segments} segments"]
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} dropped")

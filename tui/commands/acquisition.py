@@ -35,7 +35,7 @@ def tui(
 
     Closing it does not stop a recording; opening it again finds it.
     """
-    from tui.application import open_application
+    from tui.application.main import open_application
 
     open_application(source, method=method)
 

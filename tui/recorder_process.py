@@ -1,0 +1,123 @@
+"""The recorder as a process of its own: start it, reach it, and know how it ended.
+
+It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. What
+it says on standard error goes to a file without a name, which outlives us too.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+POLL = 0.05
+STOP_TIMEOUT = 30.0
+
+
+class RecorderFailedError(HuddleError):
+    """The recorder ended in trouble; ``code`` is its exit code and the message what it said."""
+
+    def __init__(self, said: str, code: int) -> None:
+        super().__init__(said)
+        self.code = code
+
+
+class RecorderProcess:
+    """One ``huddle record``.
+
+    Parameters
+    ----------
+    bench_path : Path
+    out : Path
+        Recording it writes; must not exist.
+    duration : float, optional
+        In seconds; until it is told to stop, if not given.
+    """
+
+    def __init__(self, bench_path: Path, out: Path, *, duration: float | None = None) -> None:
+        self.out = out
+        self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
+        arguments = [sys.executable, "-m", "tui", "record", str(bench_path), "--out", str(out)]
+        if duration is not None:
+            arguments += ["--duration", repr(duration)]
+        self._process = subprocess.Popen(
+            arguments,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            **_own_session(),
+        )
+
+    def close(self) -> None:
+        """Forget the process; it goes on."""
+        self._said.close()
+        self._process.returncode = self._process.poll() or 0  # it may outlive us: that is meant
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone."""
+        return self._process.poll() is not None
+
+    def wait_for_file(self) -> None:
+        """Return when the recording is there to be followed.
+
+        Raises
+        ------
+        RecorderFailedError
+            The recorder ended before.
+        """
+        while not self.out.exists():
+            if self.ended and not self.out.exists():
+                self.check()
+                raise RecorderFailedError(f"{self.out}: the recorder ended without a recording", 3)
+            time.sleep(POLL)
+
+    def check(self) -> None:
+        """Raise what made the recorder fail, if it ended so.
+
+        Raises
+        ------
+        RecorderFailedError
+            With what it said.
+        """
+        code = self._process.poll()
+        if code in {None, 0}:
+            return
+        self._said.seek(0)
+        lines = [line.removeprefix("huddle: ").rstrip() for line in self._said]
+        said = "\n".join(line for line in lines if line) or f"the recorder was ended by {code}"
+        raise RecorderFailedError(said, code if code in {2, 3} else 3)
+
+    def interrupt(self) -> None:
+        """Ask it to stop by a signal, where the control channel does not answer."""
+        if sys.platform == "win32":
+            self._process.send_signal(signal.CTRL_BREAK_EVENT)
+        else:
+            self._process.send_signal(signal.SIGINT)
+
+    def wait(self, timeout: float = STOP_TIMEOUT) -> None:
+        """Wait until it has ended; kill it if it does not."""
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _own_session() -> dict[str, Any]:
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"start_new_session": True}

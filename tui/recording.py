@@ -1,0 +1,53 @@
+"""``huddle record``: the recorder, alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.live import Live
+
+from daq.bench import load
+from daq.clock import SystemClock
+from daq.recorder import recording_path, run
+from tui.output import notices, write_json
+from tui.text import clock_time
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.recorder import Status
+
+
+def record_bench(path: Path, *, duration: float | None, out: Path | None, json: str | None) -> None:
+    """Record a bench until the duration is over, or until SIGINT or SIGTERM.
+
+    Raises
+    ------
+    ExceptionGroup
+        Of a DeviceError for every sensor that cannot be used at the start.
+    """
+    bench = load(path)
+    if duration is None:
+        duration = bench.recording.duration
+    if out is None:
+        out = recording_path(bench, SystemClock().now())
+    screen = notices()
+    if screen.is_terminal:
+        with Live(console=screen, refresh_per_second=2, transient=True) as live:
+            status = run(
+                bench, out, duration=duration, acknowledged=lambda now: live.update(_line(now))
+            )
+    else:
+        status = run(bench, out, duration=duration)
+    screen.print(f"{_line(status)}\n{out} closed", soft_wrap=True)
+    write_json(json, status.to_dict())
+
+
+def _line(status: Status) -> str:
+    sensors = "  ".join(
+        f"{name} {sensor.samples}"
+        + (f" ({sensor.gaps} gaps, {sensor.missing} missing)" if sensor.gaps else "")
+        + (" lost" if sensor.state == "lost" else "")
+        for name, sensor in status.sensors.items()
+    )
+    return f"{clock_time(status.elapsed)}  samples safe: {sensors}"

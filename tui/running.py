@@ -1,0 +1,192 @@
+"""``huddle run``: a recorder in a process of its own, and the estimate that follows its file."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn
+
+from daq.bench import format_duration, load
+from daq.clock import SystemClock
+from daq.control import ask
+from daq.errors import HuddleError
+from daq.estimation import Estimation, Settings
+from daq.recorder import recording_path
+from daq.recording.healing import heal, write_results
+from tui.estimating import chosen, show_result
+from tui.output import notices
+from tui.recorder_process import RecorderProcess
+from tui.results import reached_cov, result_arrays
+from tui.text import clock_time, time_left
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from daq.bench import Bench
+    from daq.estimation import Snapshot
+
+INTERVAL = 0.2
+SHARE = 0.1
+"""Of the time, at most, that estimating live may take."""
+
+
+def run_test(
+    path: Path,
+    *,
+    duration: float | None,
+    until_cov: float | None,
+    out: Path | None,
+    json: str | None,
+    csv: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of Settings
+) -> None:
+    """Run one huddle test and show its result.
+
+    Raises
+    ------
+    HuddleError
+        Whatever kept the recorder from going on; the result of what was recorded is shown before.
+    typer.Exit
+        130 after Ctrl-C, when the result has been shown.
+    """
+    bench = load(path)
+    settings = chosen(Settings.of(bench), **wanted)
+    if until_cov is not None:
+        settings = replace(settings, target_cov=until_cov)
+    duration = bench.recording.duration if duration is None and until_cov is None else duration
+    refuse_hopeless(bench, settings, duration)
+    out = recording_path(bench, SystemClock().now()) if out is None else out
+    recorder = RecorderProcess(path, out, duration=duration)
+    try:
+        recorder.wait_for_file()
+        notices().print(f"recording to {out}; Ctrl-C stops and shows the result")
+        snapshot, interrupted = follow_to_end(
+            recorder, settings, duration=duration, until_cov=until_cov
+        )
+        finish_recording(out, snapshot)
+        show_result(snapshot, settings, json=json, csv=csv)
+        recorder.check()
+        if interrupted:
+            raise typer.Exit(130)
+    except KeyboardInterrupt:
+        _stop(recorder)
+        raise
+    finally:
+        recorder.close()
+
+
+def follow_to_end(
+    recorder: RecorderProcess,
+    settings: Settings,
+    *,
+    duration: float | None,
+    until_cov: float | None = None,
+) -> tuple[Snapshot, bool]:
+    """Follow a recorder's file until it is closed; Ctrl-C stops the recorder, not us.
+
+    Returns
+    -------
+    snapshot : Snapshot
+        The result, from the whole recording.
+    interrupted : bool
+        Whether Ctrl-C was pressed.
+    """
+    interrupted = False
+    with Estimation([recorder.out], settings) as estimation, _progress() as show:
+        while True:
+            try:
+                began = time.perf_counter()
+                gone = recorder.ended  # looked at first: what it wrote last is then seen
+                estimation.update()
+                snapshot = estimation.snapshot()
+                show(snapshot, settings, duration)
+                if snapshot.closed:
+                    break
+                if gone:
+                    notices().print("[red]the recorder was ended from outside")
+                    break
+                if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
+                    _stop(recorder)
+                time.sleep(max(INTERVAL, (time.perf_counter() - began) / SHARE))
+            except KeyboardInterrupt:
+                if interrupted:
+                    raise
+                interrupted = True
+                _stop(recorder)
+        recorder.wait()
+        if not snapshot.closed:
+            heal(recorder.out)
+    with Estimation([recorder.out], settings) as estimation:
+        return estimation.finish(), interrupted
+
+
+def finish_recording(path: Path, snapshot: Snapshot) -> None:
+    """Write the result into the recording."""
+    for method in snapshot.results:
+        arrays, attributes = result_arrays(snapshot, method)
+        write_results(path, method, arrays, attributes)
+
+
+def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) -> None:
+    """Say before the run that a duration is too short for any estimate.
+
+    Raises
+    ------
+    typer.BadParameter
+        With how long it must be.
+    """
+    needed = max(sensor.n_main_channels for sensor in bench.sensors) + 1
+    shortest = settings.segment * (1 + (needed - 1) * (1 - settings.overlap))
+    if duration is not None and duration < shortest:
+        raise typer.BadParameter(
+            f"{format_duration(duration)} hold fewer than {needed} segments of "
+            f"{format_duration(settings.segment)}, too few for {needed - 1} channels per sensor; "
+            f"expected {format_duration(math.ceil(shortest))} at least, or shorter segments"
+        )
+
+
+def _stop(recorder: RecorderProcess) -> None:
+    try:
+        ask(recorder.out, "stop")
+    except HuddleError:
+        with suppress(OSError):
+            recorder.interrupt()
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[Snapshot, Settings, float | None], None]]:
+    """Show a line that follows a run: time, segments, c.o.v., time left."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[state]}"),
+        console=notices(),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("0:00", total=None, state="")
+
+        def show(snapshot: Snapshot, settings: Settings, duration: float | None) -> None:
+            left = None if duration is None else max(0.0, duration - snapshot.elapsed)
+            if settings.target_cov is not None and duration is None:
+                left = snapshot.time_left
+            cov = reached_cov(snapshot, settings)
+            parts = [f"{snapshot.n_segments} segments"]
+            if not math.isnan(cov):
+                parts.append(f"c.o.v. {cov:.3f}")
+            parts.append(time_left(left))
+            total = None if left is None else snapshot.elapsed + left
+            bar.update(
+                task,
+                description=clock_time(snapshot.elapsed),
+                completed=snapshot.elapsed,
+                total=total,
+                state=" · ".join(parts),
+            )
+
+        yield show
