@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.self_noise import Flag
+from estimator.self_noise import Flag, SelfNoise
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -128,6 +128,28 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     flags[duplicates.any(axis=2)] |= Flag.DUPLICATE
     flags[~finite] = Flag.NOT_FINITE
     return Coherency(matrix, psd, flags, duplicates)
+
+
+def from_parts(
+    method: str, given: Coherency, parts: tuple[FloatArray, ...], flags: IntArray
+) -> SelfNoise:
+    """Return to units what a method found for the coherency matrix.
+
+    Parameters
+    ----------
+    method : str
+    given : Coherency
+    parts : tuple of float64, shape (n_freqs, n_channels)
+        Noise, its standard deviation, and both ends of its interval, as parts of the PSD.
+    flags : int64, shape (n_freqs, n_channels)
+        All but NEGATIVE. What is flagged becomes NaN.
+    """
+    unknown = flags != 0
+    noise, deviation, low, high = (np.where(unknown, np.nan, given.psd * part) for part in parts)
+    with np.errstate(divide="ignore"):
+        cov = deviation / np.abs(noise)
+    negative = np.where(noise <= 0, int(Flag.NEGATIVE), 0)
+    return SelfNoise(method, noise, cov, low, high, flags | negative)
 
 
 def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:

@@ -10,6 +10,7 @@ from estimator.likelihood import maximum_likelihood
 from estimator.self_noise import Flag, SelfNoise
 from estimator.three_channel import three_channel
 from estimator.three_sensor import three_sensor
+from estimator.two_channel import two_channel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -24,6 +25,7 @@ Method: TypeAlias = "Callable[..., SelfNoise]"
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
+        "two-channel": two_channel,
         "three-channel": three_channel,
         "three-sensor": three_sensor,
         "maximum-likelihood": maximum_likelihood,

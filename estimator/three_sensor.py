@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.coherency import check_averages, check_dims, coherency, inverse
-from estimator.self_noise import Flag, SelfNoise
+from estimator.coherency import check_averages, check_dims, coherency, from_parts, inverse
+from estimator.self_noise import Flag
 from estimator.uncertainty import moments, score_interval
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
     from estimator.coherency import Coherency
+    from estimator.self_noise import SelfNoise
 
     _Inverse = tuple[ComplexArray, BoolArray]
 
@@ -103,15 +104,7 @@ def estimate(
     noise, deviation, low, high, flags = (
         np.concatenate(parts) for parts in zip(*blocks, strict=True)
     )
-    flags[noise <= 0] |= Flag.NEGATIVE
-    unknown = (flags & ~Flag.NEGATIVE) != 0
-    flags[unknown] &= ~Flag.NEGATIVE
-    noise, deviation, low, high = (
-        np.where(unknown, np.nan, given.psd * part) for part in (noise, deviation, low, high)
-    )
-    with np.errstate(divide="ignore"):
-        cov = deviation / np.abs(noise)
-    return SelfNoise("three-sensor", noise, cov, low, high, flags)
+    return from_parts("three-sensor", given, (noise, deviation, low, high), flags)
 
 
 def _estimate(
