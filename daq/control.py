@@ -1,0 +1,138 @@
+"""A small channel to a running recorder: ``stop``, ``mark``, ``status``.
+
+Theory of operation
+-------------------
+The recorder listens on an ephemeral port of the local host and writes the port and a random token
+into the file's attributes: who can read the recording can stop it. A request is one line,
+``token command text``; the answer is one line of JSON, with ``"error"`` if it was refused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import secrets
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError, NoAnswerError, NotConnectedError
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+HOST = "127.0.0.1"
+COMMANDS = ("stop", "mark", "status")
+_MAX_LINE = 4096
+_IDLE_TIMEOUT = 10.0
+
+Answer = dict[str, Any]
+
+
+class ControlRefusedError(HuddleError):
+    """The recorder refused a command; the message says why."""
+
+
+@contextlib.asynccontextmanager
+async def serve(
+    answer: Callable[[str, str], Awaitable[Answer]],
+) -> AsyncIterator[tuple[int, str]]:
+    """Listen for commands while the context lasts.
+
+    Parameters
+    ----------
+    answer : coroutine function of command and text
+        Does what is asked and returns what to say.
+
+    Yields
+    ------
+    (port, token)
+        For the file's attributes.
+    """
+    token = secrets.token_hex(16)
+    conversations: set[asyncio.Task[None]] = set()
+
+    async def converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        if task is not None:
+            conversations.add(task)
+            task.add_done_callback(conversations.discard)
+        try:
+            async with asyncio.timeout(_IDLE_TIMEOUT):
+                line = await reader.readline()
+                reply = await _reply(line, token, answer)
+                writer.write(json.dumps(reply, ensure_ascii=False).encode() + b"\n")
+                await writer.drain()
+        except (TimeoutError, ConnectionError, ValueError):
+            pass  # Whoever it was has gone, or talks nonsense of any length.
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    server = await asyncio.start_server(converse, HOST, 0, limit=_MAX_LINE)
+    async with server:
+        yield int(server.sockets[0].getsockname()[1]), token
+    await asyncio.gather(*conversations, return_exceptions=True)
+
+
+async def _reply(
+    line: bytes, token: str, answer: Callable[[str, str], Awaitable[Answer]]
+) -> Answer:
+    given, _, rest = line.decode(errors="replace").strip().partition(" ")
+    command, _, text = rest.partition(" ")
+    if not hmac.compare_digest(given.encode(), token.encode()):
+        return {"error": "wrong token"}
+    if command not in COMMANDS:
+        return {"error": f"unknown command {command!r}; expected one of {', '.join(COMMANDS)}"}
+    return await answer(command, text)
+
+
+def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -> Answer:
+    """Send a command to the recorder of a recording and return its answer.
+
+    Parameters
+    ----------
+    recording : path, or (port, token)
+        The file it writes.
+    command : {"stop", "mark", "status"}
+    text : str
+        For ``mark``: what to write into the recording.
+
+    Raises
+    ------
+    NotConnectedError
+        If no recorder is writing it.
+    NoAnswerError
+        If the recorder does not answer.
+    ControlRefusedError
+        If it refuses.
+    """
+    control = recording if isinstance(recording, tuple) else _control_of(Path(recording))
+    port, token = control
+    line = f"{token} {command} {' '.join(text.split())}"
+    try:
+        with socket.create_connection((HOST, port), timeout=_IDLE_TIMEOUT) as connection:
+            connection.sendall(line.encode() + b"\n")
+            with connection.makefile("rb") as reply:
+                received = reply.readline()
+    except TimeoutError as error:
+        raise NoAnswerError(f"the recorder on port {port} does not answer") from error
+    except OSError as error:
+        raise NotConnectedError(f"no recorder is writing {recording}: {error}") from error
+    if not received:
+        raise NotConnectedError(f"the recorder on port {port} went away")
+    answer: Answer = json.loads(received)
+    if "error" in answer:
+        raise ControlRefusedError(f"the recorder refused {command!r}: {answer['error']}")
+    return answer
+
+
+def _control_of(path: Path) -> tuple[int, str]:
+    with Recording.open(path) as recording:
+        if recording.closed or recording.control is None:
+            raise NotConnectedError(f"{path}: no recorder is writing it")
+        return recording.control

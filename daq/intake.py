@@ -1,0 +1,124 @@
+"""From what ports hand over to rows of a recording: places blocks, writes gaps and events.
+
+No clock and no event loop: the recorder calls it from its writing thread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.continuity import Continuity, Gap
+from daq.protocols.block import Block, Event
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from daq.protocols.block import HostTime
+    from daq.recording.writer import Committed, RecordingWriter
+    from daq.session import Connected, Item
+
+LOST_KINDS = frozenset({"disconnected", "refused", "stalled"})
+
+
+@dataclass(frozen=True, slots=True)
+class SensorStatus:
+    """How one sensor is doing."""
+
+    state: str
+    """``waiting`` for its first block, ``recording``, or ``lost``."""
+    samples: int
+    """Safe on disk."""
+    gaps: int
+    missing: int
+    """Samples that were not received, as far as is known."""
+
+
+class _Sensor:
+    def __init__(self, sampling_rate: float) -> None:
+        self.rate = sampling_rate
+        self.continuity = Continuity(sampling_rate)
+        self.state = "waiting"
+        self.missing = 0
+        self.repeated = 0
+
+
+class Intake:
+    """The one who writes a recording's rows."""
+
+    def __init__(self, writer: RecordingWriter, sampling_rates: Mapping[str, float]) -> None:
+        self._writer = writer
+        self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
+
+    def take(self, items: Iterable[Item]) -> None:
+        """Write what came, in order.
+
+        Raises
+        ------
+        RecordingError
+            If it cannot be written.
+        """
+        for item in items:
+            if isinstance(item, Block):
+                self._block(item)
+            elif isinstance(item, Event):
+                self._writer.event(item)
+                if item.kind in LOST_KINDS and item.sensor in self._sensors:
+                    self._sensors[item.sensor].state = "lost"
+            else:
+                self._connected(item)
+
+    def commit(self) -> Committed:
+        """Make it safe."""
+        return self._writer.commit()
+
+    def close(self, now: HostTime, reason: str) -> Committed:
+        """Record what is missing of lost sensors, say why the run ended, and close the file."""
+        for name, sensor in self._sensors.items():
+            if sensor.state == "lost":
+                gap = sensor.continuity.lost_until(now, "lost at the end")
+                if gap is not None:
+                    self._gap(name, sensor, gap)
+        self._writer.event(Event("", "stopped", reason, now))
+        return self._writer.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._writer.abandon()
+
+    def status(self, committed: Committed) -> dict[str, SensorStatus]:
+        """Return how the sensors are doing."""
+        return {
+            name: SensorStatus(
+                self._sensors[name].state, counts.rows, counts.gaps, self._sensors[name].missing
+            )
+            for name, counts in committed.sensors.items()
+        }
+
+    def recorded(self) -> float:
+        """Return how much of the sensor that has least is recorded, gaps included, in s."""
+        return min(s.continuity.next_sample / s.rate for s in self._sensors.values())
+
+    def _connected(self, item: Connected) -> None:
+        if item.reason:
+            for name in item.sensors:
+                self._sensors[name].continuity.new_session(item.reason)
+
+    def _block(self, block: Block) -> None:
+        sensor = self._sensors[block.sensor]
+        placed = sensor.continuity.place(block)
+        if placed.repeated:
+            sensor.repeated += placed.repeated
+            text = f"{placed.repeated} samples were recorded already ({sensor.repeated} so far)"
+            self._writer.event(Event(block.sensor, "resynchronised", text, block.received))
+        if placed.gap is not None:
+            self._gap(block.sensor, sensor, placed.gap)
+        if placed.block is not None:
+            sensor.state = "recording"
+            self._writer.append(placed.block)
+
+    def _gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
+        sensor.missing += gap.missing
+        self._writer.gap(
+            name, gap.first_sample, gap.missing, reason=gap.reason, estimated=gap.estimated
+        )

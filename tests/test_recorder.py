@@ -1,0 +1,340 @@
+"""The recorder, with devices the test plays: what comes, what is lost, what returns."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.control import ControlRefusedError, ask
+from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDeviceError
+from daq.protocols.block import Event
+from daq.recorder import Status, record, recording_path
+from daq.recording.healing import verify
+from daq.recording.reader import Recording
+from tests.devices import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+
+class Run:
+    """A recorder in a task, its devices, and what it acknowledged."""
+
+    def __init__(self, path: Path, *names: str, **ports: str) -> None:
+        self.path = path
+        self.bench = bench(*names, **ports)
+        self.clock = ManualClock()
+        self.driver = PlayedDriver({port: PlayedDevice() for port in self.bench.ports()})
+        self.stop = asyncio.Event()
+        self.statuses: list[Status] = []
+        self.news = asyncio.Event()
+        self.duration: float | None = None
+
+    def device(self, port: str) -> PlayedDevice:
+        """Return what is on a port."""
+        return self.driver.devices[port]
+
+    async def record(self) -> Status:
+        """Run the recorder."""
+        return await record(
+            self.bench,
+            self.path,
+            duration=self.duration,
+            clock=self.clock,
+            stop=self.stop,
+            acknowledged=self._acknowledged,
+            drivers=self.driver.find,
+        )
+
+    def _acknowledged(self, status: Status) -> None:
+        self.statuses.append(status)
+        self.news.set()
+
+    @contextlib.asynccontextmanager
+    async def going(self) -> AsyncIterator[asyncio.Task[Status]]:
+        """Run it in the background until told to stop."""
+        task = asyncio.create_task(self.record())
+        try:
+            yield task
+            self.stop.set()
+            await task
+        finally:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def until(self, sensor: str, samples: int, state: str = "recording") -> None:
+        """Wait for an acknowledgment."""
+        while not self._is(sensor, samples, state):
+            self.news.clear()
+            await self.news.wait()
+
+    def _is(self, sensor: str, samples: int, state: str) -> bool:
+        if not self.statuses:
+            return False
+        now = self.statuses[-1].sensors[sensor]
+        return now.samples >= samples and now.state == state
+
+    def send(self, sensor: str, first: int, n: int) -> None:
+        """Let a device take samples and send them."""
+        self.clock.advance(n / 100.0)
+        port = self.bench.sensor(sensor).port
+        self.device(port).items.put_nowait(block(sensor, first, n, self.clock.now()))
+
+
+async def test_every_sensor_is_recorded(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        for first in range(0, 300, 30):
+            run.send("a", first, 30)
+            run.send("b", first, 30)
+        await run.until("b", 270)
+    final = run.statuses[-1]
+    assert final.closed
+    assert all(run.device(name).left_quiet for name in "ab")
+    report = verify(run.path)
+    assert report.closed
+    assert report.intact
+    with Recording.open(run.path) as recording:
+        for sensor in recording.sensors:
+            np.testing.assert_array_equal(sensor.counts(), counts(0, 300))
+            assert sensor.serial_number == "1"
+        kinds = [(event.sensor, event.kind) for event in recording.events]
+        assert kinds[0] == ("", "started")
+        assert sorted(kinds[1:3]) == [("a", "connected"), ("b", "connected")]
+        assert kinds[-1] == ("", "stopped")
+
+
+async def test_all_failures_at_the_start_come_at_once(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b", "c")
+    run.device("a").failure = NotConnectedError("sensor 'a' on a: no such port")
+    run.device("c").failure = NoAnswerError("sensor 'c' on c: no answer")
+    with pytest.RaisesGroup(
+        pytest.RaisesExc(NotConnectedError, match="'a'"),
+        pytest.RaisesExc(NoAnswerError, match="'c'"),
+    ):
+        await run.record()
+    assert not run.path.exists()
+    assert run.device("b").left_quiet
+
+
+async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 200)
+        await run.until("a", 200)
+        run.device("a").items.put_nowait(NotConnectedError("cable"))
+        await run.until("a", 200, "lost")
+        run.send("b", 0, 400)
+        await run.until("b", 400)
+        # 400 samples went by meanwhile; these come in a session of their own.
+        run.send("a", 0, 100)
+        await run.until("a", 300)
+    assert run.device("a").n_sessions == 2
+    assert run.device("b").n_sessions == 1
+    with Recording.open(run.path) as recording:
+        a, b = recording.sensors
+        (gap,) = a.gaps
+        assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (200, 400, 1)
+        assert gap["reason"] == b"disconnected"
+        assert a.blocks["first_sample"].tolist() == [0, 600]
+        assert len(b.gaps) == 0
+        said = [(e.kind, e.text) for e in recording.events if e.sensor == "a"]
+        assert [kind for kind, _ in said] == ["connected", "disconnected", "connected"]
+        assert said[1][1] == "cable"
+
+
+async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("a", 100, 100)
+        await run.until("a", 200)
+        # Nothing comes any more, and nothing says so.
+        await run.until("a", 200, "lost")
+        run.send("a", 0, 100)
+        await run.until("a", 300)
+    with Recording.open(run.path) as recording:
+        kinds = [event.kind for event in recording.events if event.sensor == "a"]
+        assert kinds == ["connected", "stalled", "connected"]
+
+
+async def test_another_device_on_the_port_is_refused(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    device = run.device("a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        device.serial_number = "2"
+        device.items.put_nowait(NotConnectedError("cable"))
+        while device.n_sessions < 3:
+            device.opened.clear()
+            await device.opened.wait()
+        device.serial_number = "1"
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        refused = [e.text for e in recording.events if e.kind == "refused"]
+        assert refused == ["sensor 'a' on a: expected serial number '1', got '2'"]
+
+
+async def test_a_wrong_rate_is_refused_at_the_start(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").sampling_rate = 200.0
+    with pytest.RaisesGroup(pytest.RaisesExc(WrongDeviceError, match="expected 100 Hz")):
+        await run.record()
+
+
+async def test_a_slightly_different_rate_is_taken_over(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").sampling_rate = 100.1
+    async with run.going():
+        run.send("a", 0, 200)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        assert recording.sensors[0].sampling_rate == 100.1
+
+
+async def test_repeated_blocks_are_recorded_once(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("a", 0, 100)
+        run.send("a", 50, 150)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        np.testing.assert_array_equal(recording.sensors[0].counts(), counts(0, 200))
+        said = [e.text for e in recording.events if e.kind == "resynchronised"]
+        assert [text.split()[0] for text in said] == ["100", "50"]
+
+
+async def test_a_fault_in_a_driver_concerns_its_device_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("a", 100)
+        run.device("a").items.put_nowait(ZeroDivisionError("a bug"))
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        assert ("disconnected", "a bug") in [(e.kind, e.text) for e in recording.events]
+
+
+async def test_the_duration_is_of_the_devices(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.duration = 2.0
+    run.send("a", 0, 200)
+    run.send("b", 0, 150)
+    run.send("b", 150, 50)
+    status = await run.record()
+    assert status.closed
+    assert [sensor.samples for sensor in status.sensors.values()] == [200, 200]
+
+
+async def test_a_lost_sensor_is_not_waited_for_beyond_the_duration(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.duration = 2.0
+    async with run.going() as task:
+        run.send("b", 0, 100)
+        run.device("b").items.put_nowait(NotConnectedError("cable"))
+        await run.until("b", 100, "lost")
+        run.device("b").failure = NotConnectedError("still away")
+        run.clock.advance(5.0)
+        status = await task
+    assert status.sensors["b"].missing == 500
+    with Recording.open(run.path) as recording:
+        (gap,) = recording.sensor("b").gaps
+        assert gap["reason"] == b"lost at the end"
+
+
+async def test_sensors_on_one_port_share_a_session(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b", a="bus", b="bus")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("b", 100)
+        await run.until("a", 100)
+    assert run.device("bus").n_sessions == 1
+
+
+async def test_commands_from_outside(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going() as task:
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        status = await asyncio.to_thread(ask, run.path, "status")
+        assert status["sensors"]["a"]["samples"] == 100
+        await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
+        with Recording.open(run.path) as recording:
+            assert recording.control is not None
+            port, token = recording.control
+        with pytest.raises(ControlRefusedError, match="wrong token"):
+            await asyncio.to_thread(ask, (port, "guess"), "stop")
+        with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
+            await asyncio.to_thread(ask, (port, token), "dance")
+        await asyncio.to_thread(ask, run.path, "stop")
+        assert (await task).closed
+    with pytest.raises(NotConnectedError, match="no recorder is writing it"):
+        ask(run.path, "stop")
+    with Recording.open(run.path) as recording:
+        marks = [event.text for event in recording.events if event.kind == "mark"]
+        assert marks == ["a door slammed"]
+        assert recording.events[-1].text == "stopped by command"
+
+
+async def test_nonsense_on_the_control_port_harms_nothing(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        with Recording.open(run.path) as recording:
+            assert recording.control is not None
+            port, _ = recording.control
+        for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            with contextlib.suppress(ConnectionError):
+                writer.write(nonsense)
+                writer.write_eof()
+                await reader.read()
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        assert (await asyncio.to_thread(ask, run.path, "status"))["closed"] is False
+
+
+async def test_stopped_before_it_began(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.stop.set()
+    status = await run.record()
+    assert not status.closed
+    assert not run.path.exists()
+
+
+async def test_a_file_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "r.h5").write_text("precious", encoding="utf-8")
+    run = Run(tmp_path / "r.h5", "a")
+    with pytest.raises(RecordingError, match="exists already"):
+        await run.record()
+    assert run.device("a").left_quiet
+
+
+async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.device("a").items.put_nowait(Event("a", "checksum", "2 frames", run.clock.now()))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        assert ("a", "checksum", "2 frames") in [
+            (e.sensor, e.kind, e.text) for e in recording.events
+        ]
+
+
+def test_the_usual_path() -> None:
+    path = recording_path(bench("a"), ManualClock(0).now())
+    assert path.as_posix() == "recordings/played-bench-20010909T014640Z.h5"
