@@ -208,11 +208,7 @@ class _Recorder:
         for connection in connections:
             information = {i.sensor: i for i in connection.information}
             for sensor in connection.sensors:
-                layout = SensorLayout.of(
-                    sensor,
-                    connection.driver,
-                    polled=bool(getattr(connection.driver, "polled", False)),
-                )
+                layout = SensorLayout.of(sensor, connection.driver)
                 said = information.get(sensor.name)
                 if said is not None:
                     layout = replace(

@@ -93,7 +93,6 @@ def synthesise(
             sampling_rate=scenario.sensors[name].sampling_rate,
             dtype=np.dtype(np.int32),
             clock=clock or name,
-            polled=instants,
         )
         for name in scenario.names
     ]

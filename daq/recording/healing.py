@@ -170,8 +170,8 @@ def _cut_to_committed(file: h5py.File, report: Report) -> None:
     for sensor in report.sensors:
         group = file["sensors"][sensor.name]
         group["samples"].resize(sensor.n_samples, axis=0)
-        if "instants" in group:
-            group["instants"].resize(sensor.n_samples, axis=0)
+        instants = group["instants"]
+        instants.resize(min(sensor.n_samples, len(instants)), axis=0)
         group["blocks"].resize(sensor.n_blocks, axis=0)
         group["gaps"].resize(sensor.n_gaps, axis=0)
 

@@ -74,8 +74,6 @@ class SensorLayout:
         Of the raw counts.
     clock : str
         Sensors of one clock name are sampled by one clock.
-    polled : bool
-        Whether the instant of every sample is stored.
     """
 
     name: str
@@ -87,10 +85,9 @@ class SensorLayout:
     serial_number: str = ""
     driver: str = ""
     port: str = ""
-    polled: bool = False
 
     @classmethod
-    def of(cls, sensor: Sensor, driver: DriverType, *, polled: bool = False) -> SensorLayout:
+    def of(cls, sensor: Sensor, driver: DriverType) -> SensorLayout:
         """Return the layout of a sensor of a bench file."""
         return cls(
             name=sensor.name,
@@ -102,7 +99,6 @@ class SensorLayout:
             serial_number=sensor.serial_number,
             driver=sensor.driver,
             port=sensor.port,
-            polled=polled,
         )
 
 

@@ -69,7 +69,7 @@ class SensorRecord:
         self.sampling_rate = float(attributes["sampling_rate"])
         """In Hz, as the device says; nominal where it does not."""
         self._samples: h5py.Dataset = group["samples"]
-        self._instants: h5py.Dataset | None = group.get("instants")
+        self._instants: h5py.Dataset = group["instants"]
         self.channels: tuple[Channel, ...] = layout.channels_of(self._samples.attrs)
         self.dtype: np.dtype[Any] = self._samples.dtype
         self.chunk_rows: int = self._samples.chunks[0]
@@ -82,8 +82,8 @@ class SensorRecord:
 
     @property
     def polled(self) -> bool:
-        """Whether the instant of every sample is known."""
-        return self._instants is not None
+        """Whether the instant of every sample is known; False as long as there are no samples."""
+        return bool(self.n_samples > 0 and self._instants.shape[0] >= self.n_samples)
 
     @property
     def n_written(self) -> int:
@@ -131,7 +131,7 @@ class SensorRecord:
         RecordingError
             If the sensor is not polled, or the file damaged.
         """
-        if self._instants is None:
+        if not self.polled:
             raise RecordingError(f"sensor {self.name!r} has no instants of single samples")
         return self._read(self._instants, first_row, last_row)
 
@@ -163,8 +163,7 @@ class SensorRecord:
         n_samples = int(ends[n_whole - 1]) if n_whole else 0
         if n_samples > self.n_samples:
             self._samples.refresh()
-            if self._instants is not None:
-                self._instants.refresh()
+            self._instants.refresh()
             self._n_blocks, self.n_samples = n_whole, n_samples
         return before != (self.n_samples, self._gaps.n_rows)
 

@@ -133,7 +133,8 @@ class _SensorWriter:
 
     def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
         self.samples = _Chunked(group["samples"])
-        self.instants = _Chunked(group["instants"]) if sensor.polled else None
+        self.instants = _Chunked(group["instants"])
+        self._polled: bool | None = None
         self.blocks = _Table(group["blocks"])
         self.gaps = _Table(group["gaps"])
         self._layout = sensor
@@ -145,19 +146,23 @@ class _SensorWriter:
 
     def append(self, block: Block) -> None:
         counts = self._converted(block)
+        if self._polled is None:
+            self._polled = block.instants_ns is not None
+        elif self._polled != (block.instants_ns is not None):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: some blocks with instants of their samples, some without"
+            )
         merged = self._merge(block)
         self._crc32 = zlib.crc32(counts.data, self._crc32 if merged else 0)
         self._n_rows += block.n_samples
         self.samples.add(counts)
-        if self.instants is not None:
-            if block.instants_ns is None:
-                raise RecordingError(f"sensor {block.sensor!r}: a polled block without instants")
+        if block.instants_ns is not None:
             self.instants.add(block.instants_ns)
 
     def collect(self) -> None:
         """Hand the rows of blocks whose samples are all written to their table."""
         written = self.samples.n_written
-        if self.instants is not None:
+        if self._polled:
             written = min(written, self.instants.n_written)
         if self._n_rows == written:
             self._end_current()
@@ -173,8 +178,7 @@ class _SensorWriter:
         """Write everything that waits."""
         self._end_current()
         self.samples.finish()
-        if self.instants is not None:
-            self.instants.finish()
+        self.instants.finish()
 
     @property
     def committable_rows(self) -> int:
@@ -477,17 +481,17 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
             **filters,
         )
         samples.attrs.update(layout.channel_attributes(sensor.channels))
-        if sensor.polled:
-            instants = group.create_dataset(
-                "instants",
-                shape=(0,),
-                maxshape=(None,),
-                chunks=(n_rows,),
-                dtype="<i8",
-                fletcher32=True,
-                **filters,
-            )
-            instants.attrs["unit"] = "ns"
+        # Stays empty unless the sensor is polled.
+        instants = group.create_dataset(
+            "instants",
+            shape=(0,),
+            maxshape=(None,),
+            chunks=(n_rows,),
+            dtype="<i8",
+            fletcher32=True,
+            **filters,
+        )
+        instants.attrs["unit"] = "ns"
         _make_table(group, "blocks", layout.BLOCK_DTYPE, layout.BLOCKS_PER_CHUNK)
         _make_table(group, "gaps", layout.GAP_DTYPE, layout.GAPS_PER_CHUNK)
     _make_table(file, "events", layout.EVENT_DTYPE, layout.EVENTS_PER_CHUNK)

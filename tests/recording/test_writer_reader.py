@@ -38,8 +38,8 @@ CHANNELS = (
 )
 
 
-def layout(name: str, *, polled: bool = False, dtype: str = "i4") -> SensorLayout:
-    return SensorLayout(name, CHANNELS, RATE, np.dtype(dtype), clock="c", polled=polled)
+def layout(name: str) -> SensorLayout:
+    return SensorLayout(name, CHANNELS, RATE, np.dtype("i4"), clock="c")
 
 
 def samples(first: int, n: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
@@ -59,7 +59,7 @@ def block(sensor: str, first: int, n: int, **rest: object) -> Block:
 def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "r.h5"
     writer = RecordingWriter.create(
-        path, sensors=[layout("b"), layout("a", polled=True)], created=NOW, control=(4711, "token")
+        path, sensors=[layout("b"), layout("a")], created=NOW, control=(4711, "token")
     )
     writer.append(block("b", 0, 130, flags=BlockFlag.CLOCK_RESTART, device_counter=7))
     writer.append(block("b", 150, 70, reason="cable"))
