@@ -1,0 +1,89 @@
+"""Planned recording lengths, against known answers and against simulated recordings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.methods import METHODS, self_noise
+from estimator.planning import BOUND, plan, planned_csm, segments_needed
+from estimator.spectra import WelchSettings
+from estimator.windows import effective_averages, get_window
+from tests.estimator.models import planar_sensors, rotation, wishart
+
+PAPER = WelchSettings(200.0, 2000, 0.0, "rectangular")
+DIMS = (2, 2, 2)
+
+
+def test_three_hours_are_what_the_paper_needed() -> None:
+    csm, noise_psd = planned_csm(planar_sensors(10), snr=1e4, motion=np.diag([1, 1.5]))
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.0481)}
+    assert list(plans) == [*METHODS, BOUND]
+    three_sensor = plans["three-sensor"]
+    assert three_sensor.n_effective[0, 0] == pytest.approx(1080, rel=0.005)
+    np.testing.assert_allclose(three_sensor.duration, 10 * three_sensor.n_segments)
+    assert three_sensor.duration[0, 0] == pytest.approx(3 * 3600, rel=0.005)
+    np.testing.assert_allclose(three_sensor.bias, 0, atol=1e-8)
+    assert plans["three-channel"].bias[0, 0] > 100
+    # orthogonal channels, three sensors: maximum likelihood cannot do better
+    needed = plans["maximum-likelihood"].n_effective
+    np.testing.assert_allclose(needed, three_sensor.n_effective, rtol=0.01)
+    np.testing.assert_allclose(plans[BOUND].n_effective, three_sensor.n_effective, rtol=0.01)
+
+
+def test_channels_at_30_degrees_cost_4_6_times_as_much_without_maximum_likelihood() -> None:
+    directions = planar_sensors(60, channel_angle_deg=30)
+    csm, noise_psd = planned_csm(directions, snr=1e4, motion=np.diag([1, 1.5]))
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)}
+    ratio = plans["three-sensor"].n_effective / plans["maximum-likelihood"].n_effective
+    assert ratio[0, 0] == pytest.approx((0.173 / 0.0804) ** 2, rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["two-channel", "three-sensor", "maximum-likelihood"])
+def test_what_is_planned_is_what_comes_out(method: str) -> None:
+    rng = np.random.default_rng(0)
+    directions = np.tile(rotation(rng, 3), (3, 1))
+    csm, noise_psd = planned_csm(directions, snr=100, noise_psd=np.linspace(0.5, 2, 9))
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 3, 3), settings=PAPER, cov=0.2)}
+    for channel in (0, 8):
+        n = round(plans[method].n_effective[0, channel])
+        sample = wishart(csm[0], n, rng, n_draws=1500)
+        found = self_noise(method, sample, dims=(3, 3, 3), n_effective=n)
+        relative = found.noise_psd[:, channel] / noise_psd[0, channel]
+        # 1.8 % standard error of the deviation; the delta method itself is good to order 1/n
+        assert relative.std() == pytest.approx(0.2, rel=0.08)
+
+
+@pytest.mark.parametrize("overlap", [0.0, 0.5, 0.75])
+def test_segments_needed_is_the_least_number_that_is_enough(overlap: float) -> None:
+    window = get_window("hann", 200)
+    hop = round(200 * (1 - overlap))
+    for wanted in (0.5, 1.0, 7.3, 1080.0):
+        n = segments_needed(window, hop, wanted)
+        assert effective_averages(window, hop, n) >= wanted
+        assert n == 1 or effective_averages(window, hop, n - 1) < wanted
+
+
+def test_the_mean_snr_is_the_one_asked_for() -> None:
+    csm, noise_psd = planned_csm(planar_sensors(10), snr=50, noise_psd=np.arange(1.0, 7.0))
+    snr = (np.diag(csm[0]).real - noise_psd[0]) / noise_psd[0]
+    assert snr.mean() == pytest.approx(50)
+
+
+def test_plans_that_make_no_sense_are_refused() -> None:
+    directions = planar_sensors(10)
+    csm, noise_psd = planned_csm(directions, snr=10)
+    with pytest.raises(EstimatorError, match=r"c\.o\.v\."):
+        plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0)
+    with pytest.raises(InsufficientDataError, match="sensors"):
+        plan(csm[:, :4, :4], noise_psd[:, :4], dims=(2, 2), settings=PAPER, cov=0.1)
+    for arguments in (
+        {"snr": 0.0},
+        {"snr": 1.0, "noise_psd": np.zeros(6)},
+        {"snr": 1.0, "noise_psd": np.ones(5)},
+        {"snr": 1.0, "motion": np.eye(3)},
+        {"snr": 1.0, "motion": np.zeros((2, 2))},
+    ):
+        with pytest.raises(EstimatorError):
+            planned_csm(directions, **arguments)
