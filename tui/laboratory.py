@@ -296,7 +296,7 @@ def waves(laboratory: Laboratory) -> Study:
     five = estimate_any_dimension(measured, n_channels=15)
     return Study(
         "waves",
-        "Waves at 150 m/s, SNR 1000: three sensors against five",
+        "Waves at 150 m/s, SNR 1000: three sensors, and five",
         (
             _spectra("E", _record(measured, "E"), (triangle, five)),
             _biases(

@@ -55,6 +55,19 @@ BIAS_LABEL, COV_LABEL = "fractional bias (1)", "coefficient of variation (1)"
 THREE_CHANNEL, THREE_SENSOR = "three-channel", "three-sensor"
 
 
+def unit_scenario(seed: int) -> Scenario:
+    """Two directions of motion and six noises, all of unit PSD."""
+    unit, rate = White(level=1.0), PAPER.sampling_rate
+    noises = SensorModel(
+        sampling_rate=rate, directions=((1.0, 0.0),) * N_NOISES, gain=0.0, noise=unit
+    )
+    return Scenario(
+        seed=seed,
+        motion=CommonMotion(spectra=(unit, unit)),
+        sensors={"motion": SensorModel(sampling_rate=rate), "noises": noises},
+    )
+
+
 class Ingredients:
     """Cross-spectral matrices of unit motions and unit noises, simulated when first wanted.
 
@@ -79,15 +92,7 @@ class Ingredients:
         return self._matrices[n_segments]
 
     def _simulate(self, n_segments: int) -> ComplexArray:
-        unit, rate, length = White(level=1.0), PAPER.sampling_rate, PAPER.segment_length
-        noises = SensorModel(
-            sampling_rate=rate, directions=((1.0, 0.0),) * N_NOISES, gain=0.0, noise=unit
-        )
-        scenario = Scenario(
-            seed=n_segments,
-            motion=CommonMotion(spectra=(unit, unit)),
-            sensors={"motion": SensorModel(sampling_rate=rate), "noises": noises},
-        )
+        scenario, length = unit_scenario(n_segments), PAPER.segment_length
         spectra = CrossSpectra(PAPER, 2 + N_NOISES)
         while spectra.n_segments < n_segments:
             first = spectra.n_segments * length
@@ -124,27 +129,20 @@ def outcome(
         Mean over the band against (13) or zero, spread over the band against the delta method.
     """
     units, n = ingredients.csm(n_segments)
-    rows = [scenario.directions(name) for name in scenario.names]
-    if method == THREE_CHANNEL:
-        rows = [row[:1] for row in rows]
-    dims = tuple(len(row) for row in rows)
-    directions = np.concatenate(rows)
-    level = np.array([scenario.noise_spectra(name)[0].psd(AT)[0] for name in scenario.names])
-    noise = np.repeat(level, dims)
-    motion = np.sqrt([spectrum.psd(AT)[0] for spectrum in _common(scenario).spectra])
-    mix = np.concatenate([directions * motion, np.diag(np.sqrt(noise))], axis=1)
-    used = [0, 1, *range(2, 2 + len(directions))]
+    mix, dims = mixture(scenario, leading=method == THREE_CHANNEL)
+    used = [0, 1, *range(2, 2 + len(mix))]
     csm = mix @ units[:, used][:, :, used] @ mix.T
     truth = (mix @ mix.T).astype(complex)[None]
+    noise = float(scenario.true_noise_psd(scenario.names[0], 0, AT)[0])
     estimate = self_noise(method, csm, dims=dims, n_effective=n).noise_psd[:, 0]
     spread = float(self_noise(method, truth, dims=dims, n_effective=n).cov[0, 0])
     limit = self_noise(method, truth, dims=dims, n_effective=n, correct=False).noise_psd[0, 0]
-    bias = float(limit / noise[0] - 1)
+    bias = float(limit / noise - 1)
     n_bins = len(estimate)
     return (
         Point(
             x=x,
-            measured=float(estimate.mean() / noise[0] - 1),
+            measured=float(estimate.mean() / noise - 1),
             theory=bias,
             error=spread * (1 + bias) / np.sqrt(n_bins),
         ),
@@ -158,10 +156,33 @@ def outcome(
     )
 
 
-def _common(scenario: Scenario) -> CommonMotion:
+def mixture(scenario: Scenario, *, leading: bool) -> tuple[FloatArray, tuple[int, ...]]:
+    """Say what a scenario's channels take of each ingredient, and how many each sensor has.
+
+    Parameters
+    ----------
+    scenario
+        Of common motion, white throughout.
+    leading
+        Of each sensor, only the first channel.
+
+    Returns
+    -------
+    mix : float64, shape (n_channels, 2 + n_channels)
+        ``samples = ingredients @ mix.T``.
+    dims : tuple of int
+    """
     if not isinstance(scenario.motion, CommonMotion):
         raise ScenarioError("a field of waves has no ingredients that all sensors share")
-    return scenario.motion
+    motion = np.sqrt([spectrum.psd(AT)[0] for spectrum in scenario.motion.spectra])
+    dims, directions, noise = [], [], []
+    for name in scenario.names:
+        n = 1 if leading else scenario.n_channels(name)
+        dims.append(n)
+        directions.append(scenario.directions(name)[:n])
+        noise += [scenario.true_noise_psd(name, channel, AT)[0] for channel in range(n)]
+    own = np.diag(np.sqrt(noise))
+    return np.concatenate([np.concatenate(directions) * motion, own], axis=1), tuple(dims)
 
 
 def _series(
