@@ -14,7 +14,7 @@ import numpy as np
 
 from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.factor_analysis import max_factors, maximise
+from estimator.factor_analysis import max_factors, maximise, testable
 from estimator.likelihood import NOISE_SPREAD, alike, standard_error
 from estimator.model_test import BandTest, model_test, pool
 
@@ -47,7 +47,8 @@ class BandDimension:
     tried : tuple of BandTest
         Of 0, 1, … `n_factors` factors.
     cov : float
-        Median c.o.v. of the noise at one frequency with `n_factors`.
+        Median c.o.v. of the noise at one frequency with `n_factors`; infinite where that many
+        leave the noise undetermined.
     usual_cov : float
         The same with the usual dimension; NaN if that could not be fitted.
     """
@@ -159,10 +160,12 @@ def choose_dimension(
     Notes
     -----
     Beyond ``max(dims)`` factors the likelihood carries the weak prior of
-    `estimator.likelihood.alike`, in the test as in the estimate.
+    `estimator.likelihood.alike`, in the test as in the estimate. Three sensors are given
+    no more than ``max(dims)``: whatever one of them feels alone is noise to the other two, so
+    further factors would take noise for motion; the test can only warn.
     """
     check_dims(dims)
-    matrix = coherency(csm, dims).matrix
+    matrix = testable(coherency(csm, dims))
     if frequency.shape != (len(csm),):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
     if n_effective <= sum(dims):
@@ -173,7 +176,7 @@ def choose_dimension(
     number = bands(frequency) if band is None else band
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number a frequency, never falling")
-    most = _most_testable(sum(dims))
+    most = _most_testable(sum(dims)) if len(dims) > 3 else min(max(dims), _most_testable(sum(dims)))
     search = _Search(matrix, number, dims, n_effective, neighbours)
     usual = max(dims)
     open_bands = list(np.unique(number))
@@ -244,6 +247,6 @@ class _Search:
         """Median c.o.v. of the noise at one frequency of a band; NaN if there is none."""
         if (maximum.singular | ~inside).all():
             return float("nan")
-        error = standard_error(maximum, n_effective=self.n_effective)
-        known = inside & ~maximum.singular
-        return float(np.median(error[known] / maximum.psi[known]))
+        cov = standard_error(maximum, n_effective=self.n_effective) / maximum.psi
+        known = cov[inside & ~maximum.singular]
+        return float(np.median(np.where(np.isfinite(known), known, np.inf)))

@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.self_noise import Flag
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+    from estimator.coherency import Coherency
 
 MAX_ITERATIONS = 200
 DECREMENT = 1e-8
@@ -105,6 +107,12 @@ class _Point:
 def max_factors(n_channels: int) -> int:
     """Largest number of factors the model can identify, ``(p - q)**2 >= p``."""
     return int(np.floor(n_channels - np.sqrt(n_channels) + 1e-12))
+
+
+def testable(given: Coherency) -> ComplexArray:
+    """Return the coherency matrix, NaN again where the averages are not finite."""
+    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1)
+    return np.where(lost[:, None, None], np.nan, given.matrix)
 
 
 def maximise(

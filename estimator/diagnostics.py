@@ -1,0 +1,270 @@
+"""What the averages say about the test itself, in numbers and in words.
+
+Coherences, conditioning, the dimension and strength of the motion, whether one motion explains
+all sensors, how these stand to each other; and section 5's recommendations of the paper where
+they apply.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+
+from estimator.advice import Advice, advise
+from estimator.coherency import check_dims, coherency
+from estimator.dimension import bands
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.factor_analysis import maximise, testable
+from estimator.model_test import BandTest, ModelTest, model_test, pool
+from estimator.response import RelativeResponse, matched_coherence, relative_response
+
+if TYPE_CHECKING:
+    from estimator.arrays import ComplexArray, FloatArray
+
+DIMENSION_LEVEL = 0.01
+"""Of the test that further dimensions have no coherence, all pairs of sensors together."""
+
+
+@dataclass(frozen=True, slots=True)
+class BandDiagnosis:
+    """One band: medians over its frequencies.
+
+    Attributes
+    ----------
+    low, high : float
+        Of its frequencies, Hz.
+    coherence : float
+        Median of the least coherence between like channels of any two sensors.
+    condition : float
+        Of the worst ``S_jk``.
+    dimension : float
+        Effective dimension of the motion.
+    snr : float64, shape (n_channels,)
+        Motion over noise, PSD by PSD.
+    test : BandTest
+        Of the common-motion model.
+    """
+
+    low: float
+    high: float
+    coherence: float
+    condition: float
+    dimension: float
+    snr: FloatArray
+    test: BandTest
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """The test as its own averages see it.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    pairs : tuple of (int, int)
+        Pairs of sensors, from 0.
+    coherence : float64, shape (n_freqs, n_pairs)
+        The least between like channels.
+    condition : float64, shape (n_freqs, n_pairs)
+        Condition number of ``S_jk`` in units of its channels' amplitudes: near-singular where
+        it exceeds the square root of the averages, say. Infinite where singular.
+    dimension : float64, shape (n_freqs,)
+        Dimensions of the motion that the averages show (canonical coherences between two
+        sensors, tested at 1 %).
+    snr : float64, shape (n_freqs, n_channels)
+        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi.
+    model : ModelTest
+        At every frequency.
+    bands : tuple of BandDiagnosis
+    responses : tuple of RelativeResponse
+        Of the pairs that can be compared.
+    advice : tuple of Advice
+        Worst first.
+    """
+
+    frequency: FloatArray
+    pairs: tuple[tuple[int, int], ...]
+    coherence: FloatArray
+    condition: FloatArray
+    dimension: FloatArray
+    snr: FloatArray
+    model: ModelTest
+    bands: tuple[BandDiagnosis, ...]
+    responses: tuple[RelativeResponse, ...]
+    advice: tuple[Advice, ...]
+
+
+def diagnose(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    neighbours: FloatArray | None = None,
+    names: tuple[str, ...] | None = None,
+    vertical: int | None = None,
+) -> Diagnostics:
+    """Diagnose a huddle test.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+        Channels of each sensor, three or more.
+    n_effective : float
+        Independent averages. With no more than channels everything that needs the likelihood
+        (SNR and model test) is NaN.
+    neighbours : float64, shape (n_lags,), optional
+        From `estimator.model_test.neighbour_correlation`.
+    names : tuple of str, optional
+        Of the sensors; "1", "2", … by default.
+    vertical : int, optional
+        Which channel of every sensor is vertical, for the horizontal angles.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InvalidMatrixError
+        As `estimator.coherency.coherency` says, or if `frequency` does not fit.
+    InsufficientDataError
+        With fewer than three sensors.
+    """
+    check_dims(dims)
+    given = coherency(csm, dims)
+    if frequency.shape != (len(csm),):
+        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
+    pairs = tuple(combinations(range(len(dims)), 2))
+    coherence = np.stack(
+        [matched_coherence(given.matrix, dims, j, k).min(axis=1) for j, k in pairs], axis=1
+    )
+    condition = np.stack([_condition(given.matrix, dims, j, k) for j, k in pairs], axis=1)
+    matrix = testable(given)
+    model, snr = _model(matrix, dims, n_effective)
+    dimension = _dimension(matrix, dims, n_effective)
+    number = bands(frequency)
+    found = tuple(
+        BandDiagnosis(
+            low=float(frequency[inside][0]),
+            high=float(frequency[inside][-1]),
+            coherence=_median(coherence[inside].min(axis=1)),
+            condition=_median(condition[inside].max(axis=1)),
+            dimension=_median(dimension[inside]),
+            snr=np.array([_median(channel) for channel in snr[inside].T]),
+            test=pool(model, inside, neighbours=neighbours),
+        )
+        for inside in (number == b for b in np.unique(number))
+    )
+    responses = _responses(csm, frequency, dims, vertical)
+    return Diagnostics(
+        frequency=frequency,
+        pairs=pairs,
+        coherence=coherence,
+        condition=condition,
+        dimension=dimension,
+        snr=snr,
+        model=model,
+        bands=found,
+        responses=responses,
+        advice=advise(
+            found,
+            responses,
+            given.flags,
+            dims=dims,
+            names=names or tuple(str(i + 1) for i in range(len(dims))),
+            n_effective=n_effective,
+            nyquist=float(frequency[-1]),
+        ),
+    )
+
+
+def _median(values: FloatArray) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
+    """Condition number of the coherency between two sensors, shape (n_freqs,)."""
+    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
+    singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
+    least = singular[:, -1]
+    return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+
+
+def _model(
+    matrix: ComplexArray, dims: tuple[int, ...], n_effective: float
+) -> tuple[ModelTest, FloatArray]:
+    """Model test and SNR at every frequency, NaN where unknown."""
+    n_freqs, p = matrix.shape[:2]
+    unknown = np.full(n_freqs, np.nan)
+    nothing = ModelTest(unknown, unknown, unknown), np.full((n_freqs, p), np.nan)
+    if n_effective <= p:
+        return nothing
+    try:
+        maximum = maximise(matrix, max(dims))
+    except InsufficientDataError:  # too few channels to tell the noise from the motion
+        return nothing
+    snr = 1 / np.maximum(maximum.psi, np.finfo(np.float64).tiny) - 1
+    try:
+        return model_test(maximum, n_effective=n_effective), snr
+    except InsufficientDataError:  # as many parameters as averages
+        return nothing[0], snr
+
+
+def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:
+    """Canonical coherences between sensors that are not zero by their sampling noise.
+
+    Bartlett's test that all but the r largest are zero, for complex averages:
+    ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
+    """
+    pairs = list(combinations(range(len(dims)), 2))
+    found = np.zeros(len(matrix))
+    usable = np.isfinite(matrix).all(axis=(1, 2))
+    if n_effective <= 2 * max(dims):
+        return np.full(len(matrix), np.nan)
+    whitened = [_whitener(matrix[usable], dims, sensor) for sensor in range(len(dims))]
+    for j, k in pairs:
+        a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
+        between = whitened[j] @ matrix[usable, a, b] @ whitened[k]
+        coherence = np.clip(np.linalg.svd(between, compute_uv=False) ** 2, 0.0, 1 - 1e-15)
+        scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
+        statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
+        r = np.arange(coherence.shape[1])
+        limit = stats.chi2.isf(DIMENSION_LEVEL / len(pairs), 2 * (dims[j] - r) * (dims[k] - r))
+        found[usable] = np.maximum(found[usable], (statistic > limit).sum(axis=1))
+    return np.where(usable, found, np.nan)
+
+
+def _whitener(matrix: ComplexArray, dims: tuple[int, ...], sensor: int) -> ComplexArray:
+    """Inverse root of one sensor's own coherency; a direction without power stays without."""
+    own = slice(sum(dims[:sensor]), sum(dims[: sensor + 1]))
+    w, u = np.linalg.eigh(matrix[:, own, own])
+    alive = w > 1e-12
+    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
+
+
+def _responses(
+    csm: ComplexArray, frequency: FloatArray, dims: tuple[int, ...], vertical: int | None
+) -> tuple[RelativeResponse, ...]:
+    found = []
+    for first, second in combinations(range(len(dims)), 2):
+        try:
+            response = relative_response(
+                csm, frequency, dims=dims, first=first, second=second, vertical=vertical
+            )
+        except InsufficientDataError:  # nothing to compare them by
+            continue
+        found.append(response)
+    return tuple(found)

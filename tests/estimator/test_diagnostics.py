@@ -1,0 +1,141 @@
+"""Diagnostics in numbers and in words, on models whose faults are known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.diagnostics import Diagnostics, diagnose
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from tests.estimator.models import pentagon, plane_waves, random_bench, wishart
+
+if TYPE_CHECKING:
+    from estimator.arrays import ComplexArray, FloatArray
+
+FREQUENCY = np.linspace(1, 20, 96)
+THREE = (3, 3, 3)
+INDEPENDENT = np.zeros(0)
+
+
+def averages(csm: ComplexArray, *, n: int = 1080, seed: int = 1) -> ComplexArray:
+    whole = np.broadcast_to(csm, (len(FREQUENCY), *csm.shape[-2:]))
+    return np.asarray(wishart(whole, n, np.random.default_rng(seed))[0])
+
+
+def bench(*sensors: FloatArray, motion: FloatArray | None = None) -> ComplexArray:
+    channels = np.concatenate(sensors)
+    strength = np.diag([100.0, 150, 80]) if motion is None else motion
+    return np.asarray(channels @ strength @ channels.T + np.eye(len(channels)), np.complex128)
+
+
+def of(csm: ComplexArray, *, dims: tuple[int, ...] = THREE, n: int = 1080) -> Diagnostics:
+    return diagnose(csm, FREQUENCY, dims=dims, n_effective=n, neighbours=INDEPENDENT)
+
+
+def test_a_good_bench_gets_no_warning() -> None:
+    found = of(averages(bench(np.eye(3), np.eye(3), np.eye(3))))
+    assert [advice for advice in found.advice if advice.level != "note"] == []
+    assert np.all(found.dimension == 3)
+    assert np.median(found.snr[:, 0]) == pytest.approx(100, rel=0.05)
+    assert np.median(found.snr[:, 1]) == pytest.approx(150, rel=0.05)
+    assert found.coherence.shape == (96, 3)
+    assert np.median(found.coherence) == pytest.approx((80 / 81) ** 2, abs=0.005)
+    assert found.condition.max() < 1.5
+    assert [band.test.p_value > 0.001 for band in found.bands].count(False) == 0
+
+
+def test_turned_sensors_are_told_with_their_angle() -> None:
+    turned = Rotation.from_euler("z", -4.1, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), turned, np.eye(3))))
+    texts = [advice for advice in found.advice if "are turned by" in advice.text]
+    assert [advice.sensors for advice in texts] == [(0, 1), (1, 2)]
+    assert texts[0].text.startswith("Sensors 1 and 2 are turned by 4.1°")
+    assert "no bias" in texts[0].text
+    assert texts[0].numbers["angle_deg"] == pytest.approx(4.1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (np.diag([1.0, 1.05, 1.0]), "Channel 2 of sensor 2 reads 1.05"),
+        (np.diag([1.0, -1.0, 1.0]), "Channel 2 of sensor 2 has the opposite polarity"),
+        (np.array([[1, 0, 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]]), "5.7° away"),
+    ],
+    ids=["gain", "polarity", "not orthogonal"],
+)
+def test_faults_of_one_sensor(fault: FloatArray, words: str) -> None:
+    found = of(averages(bench(np.eye(3), fault, np.eye(3))))
+    assert any(words in advice.text for advice in found.advice if 1 in advice.sensors)
+
+
+def test_incoherence_is_a_problem_where_it_is() -> None:
+    csm = plane_waves(FREQUENCY, pentagon()[:3], snr=400.0)
+    found = of(averages(csm))
+    (problem,) = [advice for advice in found.advice if advice.level == "problem"]
+    assert "does not explain" in problem.text
+    assert problem.band is not None
+    assert problem.band[0] > 2
+    assert problem.band[1] == FREQUENCY[-1]
+    assert found.bands[-1].test.p_value < 1e-10
+    assert "dimension auto" not in problem.text
+    five = of(averages(plane_waves(FREQUENCY, pentagon(), snr=400.0)), dims=(3,) * 5)
+    assert any("dimension auto" in advice.text for advice in five.advice)
+
+
+def test_planar_sensors_in_motion_of_three_dimensions_are_told_why() -> None:
+    tilted = Rotation.from_euler("x", 10, degrees=True).as_matrix()
+    two = [tilted[:2], np.eye(3)[:2], tilted.T[:2]]
+    found = of(averages(bench(*two)), dims=(2, 2, 2))
+    assert any("use triaxial data" in advice.text for advice in found.advice)
+
+
+def test_a_missing_dimension_is_seen() -> None:
+    flat = np.diag([100.0, 150.0, 0.0])
+    turned = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), turned, np.eye(3), motion=flat)))
+    assert np.mean(found.dimension == 2) > 0.95
+    assert any("only 2 of 3 dimensions" in advice.text for advice in found.advice)
+
+
+def test_noise_alone_is_said_to_be_so() -> None:
+    rng = np.random.default_rng(3)
+    csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
+    found = of(averages(csm))
+    assert any("weaker than the noise" in advice.text for advice in found.advice)
+
+
+def test_a_lagging_sensor() -> None:
+    phase = np.exp(-2j * np.pi * FREQUENCY[:, None] * np.repeat([0, 0.02, 0], 3))
+    csm = phase[:, :, None] * (bench(*[np.eye(3)] * 3) - np.eye(9)) * phase[:, None].conj()
+    found = of(averages(csm + np.eye(9)))
+    lags = [advice for advice in found.advice if "lags" in advice.text]
+    assert lags[0].sensors == (0, 1)
+    assert lags[0].numbers["delay_s"] == pytest.approx(0.02, rel=0.01)
+    assert lags[0].numbers["samples"] == pytest.approx(0.8, rel=0.01)
+
+
+def test_dead_copied_and_broken_channels_do_not_stop_the_report() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    csm[:, 4, :] = csm[:, :, 4] = 0
+    csm[5] = np.nan
+    found = of(csm)
+    assert any("Channel 2 of sensor 2 has no signal" in advice.text for advice in found.advice)
+    assert np.isnan(found.model.statistic[5])
+
+
+def test_early_averages_leave_the_model_open() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)), n=9)
+    found = of(csm, n=9)
+    assert np.isnan(found.model.p_value).all()
+    assert len(found.responses) == 3
+
+
+def test_refusals() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    with pytest.raises(InvalidMatrixError, match="frequency"):
+        diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
+    with pytest.raises(InsufficientDataError, match="2 sensors"):
+        diagnose(csm[:, :6, :6], FREQUENCY, dims=(3, 3), n_effective=100)
