@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim_devices.arrays import FloatArray
+    from sim_devices.faults import SampleFaults
 
 Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
 """What a line is served on; "udp" sends, "udp-server" answers whoever spoke last."""
@@ -52,6 +53,15 @@ class Endpoint(Protocol):
 
     def disconnected(self, now: float) -> None:
         """Nobody has the line open any more."""
+        ...
+
+
+@runtime_checkable
+class Faulty(Protocol):
+    """An endpoint whose device can suffer faults of its own."""
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Suffer "reset" or "overflow"; return what it sends of it at once."""
         ...
 
 
@@ -107,11 +117,19 @@ class Source:
         The device whose sensors are read.
     sampling_rate
         In Hz; the device's own when not given. The world stays the same at any rate.
+    faults
+        What goes wrong with the samples.
     """
 
     def __init__(
-        self, scenario: Scenario, device: DeviceSpec, sampling_rate: float | None = None
+        self,
+        scenario: Scenario,
+        device: DeviceSpec,
+        sampling_rate: float | None = None,
+        *,
+        faults: SampleFaults | None = None,
     ) -> None:
+        self._faults = faults
         self.sampling_rate = sampling_rate or device.sampling_rate
         self.device = device
         self._scenario = scenario
@@ -123,18 +141,22 @@ class Source:
 
     def at_rate(self, sampling_rate: float) -> Source:
         """Return the same world read at another rate."""
-        return Source(self._scenario, self.device, sampling_rate)
+        return Source(self._scenario, self.device, sampling_rate, faults=self._faults)
 
     def disciplined(self, offset: float) -> Source:
         """Return the same sensors, sampled ``offset`` s after world time 0 and without drift."""
         table = self._scenario.to_dict()
         for sensor in self.device.sensors:
             table["sensors"][sensor]["clock"] = {"offset": offset}
-        return Source(Scenario.from_dict(table), self.device, self.sampling_rate)
+        scenario = Scenario.from_dict(table)
+        return Source(scenario, self.device, self.sampling_rate, faults=self._faults)
 
     def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
         """Return the main channels in counts, not yet rounded or clipped: (n, n_channels)."""
-        return self._sampled.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+        counts = self._sampled.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+        if self._faults is None:
+            return counts
+        return self._faults.apply(sensor, counts, self.times(sensor, first_sample, n))
 
     def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
         """World time of each sample in s, shape (n,)."""

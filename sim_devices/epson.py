@@ -127,9 +127,11 @@ class EpsonDevice:
 
     # --- commands -------------------------------------------------------------------------
 
-    def reset(self, now: float) -> None:
-        """Start anew, as after a power failure."""
-        self._power_on(now)
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure; it has no buffer to overflow."""
+        if kind == "reset":
+            self._power_on(now)
+        return ()
 
     def _power_on(self, now: float) -> None:
         self._window = 0

@@ -54,7 +54,10 @@ class Wire(Protocol):
         """Send each unit, or lose it whole."""
 
     def hang_up(self) -> None:
-        """Close on whoever has the line open."""
+        """Close on whoever has the line open; nobody can open it until :meth:`restore`."""
+
+    def restore(self) -> None:
+        """Plug the cable in again."""
 
     async def close(self) -> None:
         """Take the line away."""
@@ -145,16 +148,23 @@ class PseudoTerminal:
             self._loop.remove_writer(self._master)
 
     def hang_up(self) -> None:
-        """Pull the cable, and plug it in again: whoever had the port open must open it anew."""
+        """Pull the cable of a USB adapter: the port goes away."""
         self._destroy()
+        Path(self.address).unlink()
+
+    def restore(self) -> None:
+        """Plug it in again: whoever had the port open must open it anew."""
         self._make()
 
     def _destroy(self) -> None:
+        if self._master < 0:
+            return
         if self._look is not None:
             self._look.cancel()
         if self._open:
             self._nobody()
         os.close(self._master)
+        self._master = -1
 
     async def close(self) -> None:
         """Take the port away."""
@@ -169,6 +179,7 @@ class TcpPort:
         self._listener = listener
         self._scheme = scheme
         self._writer: asyncio.StreamWriter | None = None
+        self._down = False
         self.address = ""
 
     async def open(self) -> None:
@@ -177,7 +188,7 @@ class TcpPort:
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._writer is not None:
+        if self._writer is not None or self._down:
             writer.transport.abort()
             return
         writer.transport.get_extra_info("socket").setsockopt(
@@ -208,9 +219,14 @@ class TcpPort:
             self._writer.write(bytes(kept))
 
     def hang_up(self) -> None:
-        """Reset the connection."""
+        """Reset the connection, and every new one."""
+        self._down = True
         if self._writer is not None:
             self._writer.transport.abort()
+
+    def restore(self) -> None:
+        """Accept connections again."""
+        self._down = False
 
     async def close(self) -> None:
         """Stop listening."""
@@ -225,6 +241,7 @@ class UdpPort:
     def __init__(self, listener: Listener, scheme: str) -> None:
         self._listener = listener
         self._scheme = scheme
+        self._down = False
         self.address = ""
 
     async def open(self) -> None:
@@ -239,12 +256,17 @@ class UdpPort:
 
     def send(self, units: Iterable[bytes]) -> None:
         """Send each unit as a datagram; nobody need be there."""
-        for unit in units:
+        for unit in () if self._down else units:
             with contextlib.suppress(OSError):
                 self._socket.sendto(unit, self._to)
 
     def hang_up(self) -> None:
-        """Do nothing: there is no connection."""
+        """Send nothing."""
+        self._down = True
+
+    def restore(self) -> None:
+        """Send again."""
+        self._down = False
 
     async def close(self) -> None:
         """Stop sending."""
@@ -260,6 +282,7 @@ class UdpServer(asyncio.DatagramProtocol):
         self._scheme = scheme
         self._transport: asyncio.DatagramTransport | None = None
         self._to: tuple[str, int] | None = None
+        self._down = False
         self.address = ""
 
     async def open(self) -> None:
@@ -273,6 +296,8 @@ class UdpServer(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         """Hand over what came."""
+        if self._down:
+            return
         self._to = addr
         self._listener.received(data)
 
@@ -283,8 +308,12 @@ class UdpServer(asyncio.DatagramProtocol):
                 self._transport.sendto(unit, self._to)
 
     def hang_up(self) -> None:
-        """Forget who spoke last."""
-        self._to = None
+        """Hear nobody, and forget who spoke last."""
+        self._down, self._to = True, None
+
+    def restore(self) -> None:
+        """Hear again."""
+        self._down = False
 
     async def close(self) -> None:
         """Stop listening."""

@@ -5,6 +5,8 @@ The specification is one JSON object::
     {"epoch_ns": 123,              instant of the system's monotonic clock at which world time is 0
      "speed": 1.0,                 world seconds that pass in one second
      "scenario": {...},            see sim_devices.scenario
+     "faults": [...],              what goes wrong, see sim_devices.faults
+     "fault_log": "FILE",          where each fault is noted when it strikes, a JSON object a line
      "devices": [
        {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
         "driver": "epson",         whose protocol it speaks: a key of FAMILIES
@@ -37,15 +39,17 @@ import signal
 import sys
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sim_devices.device import NEVER, ChannelSpec, DeviceSpec, Endpoint, Line, Source
+from sim_devices.device import NEVER, ChannelSpec, DeviceSpec, Endpoint, Faulty, Line, Source
+from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
 from sim_devices.lines import Wire, make_wire
 from sim_devices.pacing import WorldClock, utc_of
 from sim_devices.scenario import Scenario
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 FAMILIES = {
     "epson": "sim_devices.epson:create",
@@ -67,19 +71,26 @@ class Served:
     Sends are made at absolute instants of world time, so that lateness never adds up.
     """
 
-    def __init__(self, line: Line, clock: WorldClock) -> None:
+    def __init__(
+        self,
+        line: Line,
+        clock: WorldClock,
+        faults: LineFaults,
+        tell: Callable[[float, Fault], None],
+    ) -> None:
         self.line = line
+        self._faults = faults
+        self._tell = tell
         self._endpoint: Endpoint = line.endpoint
         self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._last = 0.0
-        self._connected = False
+        self._down = False
         self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme)
 
     def connected(self) -> None:
         """Somebody opened the line."""
-        self._connected = True
         self._send(self._endpoint.connected(self._clock.now()))
         self._schedule()
 
@@ -90,25 +101,45 @@ class Served:
 
     def disconnected(self) -> None:
         """Nobody has the line open any more."""
-        self._connected = False
         self._endpoint.disconnected(self._clock.now())
         self._schedule()
 
     async def close(self) -> None:
         """Take the line away."""
+        await self.wire.close()
         if self._timer is not None:
             self._timer.cancel()
-        await self.wire.close()
 
     def _send(self, units: Sequence[bytes]) -> None:
         if units:
+            units = self._faults.send(units, self._clock.now())
             self.wire.send(units)
+
+    def _strike(self) -> None:
+        """Let go wrong what is due to, and repair what was to be repaired."""
+        now = self._clock.now()
+        if self._down and now >= self._faults.down_until:
+            self._down = False
+            self.wire.restore()
+        faults, units = self._faults.act(now)
+        self.wire.send(units)
+        for fault in faults:
+            if fault.kind == "disconnect" and not self._down:
+                self._down = True
+                self.wire.hang_up()
+            elif isinstance(self._endpoint, Faulty):
+                self._send(self._endpoint.fault(fault.kind, now, fault.duration))
+        for at, fault in self._faults.struck:
+            self._tell(at, fault)
+        self._faults.struck.clear()
 
     def _schedule(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        when = self._endpoint.next_due()
+        when = min(self._endpoint.next_due(), self._faults.next_due())
+        if self._down:
+            when = min(when, self._faults.down_until)
         if when < NEVER:
             at = max(self._clock.monotonic(when), self._last + LEAST_INTERVAL)
             self._timer = self._loop.call_at(at, self._tick)
@@ -116,6 +147,7 @@ class Served:
     def _tick(self) -> None:
         self._timer = None
         self._last = self._loop.time()
+        self._strike()
         self._send(self._endpoint.due(self._clock.now()))
         self._schedule()
 
@@ -127,7 +159,12 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
     scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
     clock = WorldClock(epoch_ns, float(spec.get("speed", 1.0)))
     module, _, function = FAMILIES[device.driver].partition(":")
-    source = Source(scenario, device)
+    faults = parse(spec.get("faults", ()), device.sensors)
+    for fault in faults:
+        if fault.kind == "wrap":  # of a 16-bit counter
+            first = round(-fault.at * device.sampling_rate) % 65536
+            device = replace(device, settings={**device.settings, "first_count": first})
+    source = Source(scenario, device, faults=SampleFaults(faults))
     for sensor in device.sensors:  # the first sample takes its time: before anybody waits for it
         source.counts(sensor, source.first_sample_after(sensor, clock.now()), 1)
     lines: Sequence[Line] = getattr(import_module(module), function)(device, source)
@@ -137,7 +174,24 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
         loop.add_signal_handler(number, ended.set)
     with contextlib.suppress(PermissionError):  # /dev/null: nobody will close it
         loop.add_reader(sys.stdin.fileno(), _end_of_input, ended)
-    served = [Served(line, clock) for line in lines]
+    name = ",".join(device.sensors)
+    log = spec.get("fault_log")
+
+    def tell(at: float, fault: Fault) -> None:
+        if log:
+            told = {"at": at, "sensors": device.sensors, **fault.model_dump(exclude={"sensors"})}
+            with Path(log).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(told) + "\n")
+
+    served = [
+        Served(
+            line,
+            clock,
+            LineFaults(faults if k == 0 else (), f"{name} {k}", begin=clock.now()),
+            tell,
+        )
+        for k, line in enumerate(lines)
+    ]
     opened: list[Served] = []
     try:
         for one in served:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 REPLY_TIMEOUT = 0.3
 QUIET = 0.03
 """Without a byte for so long, in s, the device has stopped streaming: six frames at 200 Hz."""
-ATTEMPTS = 5
+ATTEMPTS, READ_ATTEMPTS = 5, 3
 SETTLE_TIMEOUT = 3.0
 """For the device to get ready (flash, reset) or change its mode or filter, s."""
 STALLED = 1.0
@@ -156,6 +156,13 @@ class _Device:
         await asyncio.sleep(WRITE_INTERVAL)
 
     async def read(self, register: Register) -> int:
+        """Read a register; an answer that was lost on the way is asked for again."""
+        for _ in range(READ_ATTEMPTS - 1):
+            with contextlib.suppress(NoAnswerError, WrongDeviceError):
+                return await self._read(register)
+        return await self._read(register)
+
+    async def _read(self, register: Register) -> int:
         self._stream.discard()
         await self._stream.write(epson.read(register))
         received = b""
@@ -219,17 +226,11 @@ class _Device:
     async def information(self) -> DeviceInformation:
         """Read what the device says about itself; refuse it if it is not the one expected."""
         await self.wait_clear(epson.GLOB_CMD, epson.NOT_READY, "starting")
-        model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
-        serial_number = epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
-        named = re.search(r"A\d{3}", self._sensor.model.upper())
-        for what, wanted, found, differs in (
-            ("model", self._sensor.model, model, named and named[0] not in model),
-            ("serial number", self._sensor.serial_number, serial_number, True),
-        ):
-            if wanted and wanted != found and differs:
-                raise WrongDeviceError(
-                    f"{self._stream.label}: expected {what} {wanted!r}, got {found!r}"
-                )
+        model, serial_number = await self._identity()
+        if self._refusal(model, serial_number):  # replies bear no checksum: look again
+            model, serial_number = await self._identity()
+        if refusal := self._refusal(model, serial_number):
+            raise WrongDeviceError(f"{self._stream.label}: {refusal}")
         version = await self.read(epson.VERSION)
         high = await self.read(epson.TEMP_HIGH)
         low = await self.read(Register(epson.TEMP_HIGH.window, epson.TEMP_HIGH.address + 2))
@@ -244,6 +245,21 @@ class _Device:
             details={"DIAG_STAT": f"{diagnosis:04X}"} if diagnosis else {},
         )
 
+    async def _identity(self) -> tuple[str, str]:
+        """Return model and serial number."""
+        model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
+        return model, epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
+
+    def _refusal(self, model: str, serial_number: str) -> str:
+        """Say why this is not the device the bench file names; nothing if it is."""
+        wanted = self._sensor.model
+        named = re.search(r"A\d{3}", wanted.upper())
+        if named and named[0] not in model:
+            return f"expected model {wanted!r}, got {model!r}"
+        if self._sensor.serial_number not in {"", serial_number}:
+            return f"expected serial number {self._sensor.serial_number!r}, got {serial_number!r}"
+        return ""
+
     async def sampling_rate(self) -> float | None:
         code = await self.read(epson.SMPL_CTRL) >> 8
         return next((float(rate) for rate, c in epson.RATES.items() if c == code), None)
@@ -251,17 +267,24 @@ class _Device:
     async def configure(self, configuration: _Configuration) -> None:
         """Set every register that matters, and read each back."""
         for register, high, value in configuration.writes():
-            await self.write(register, value, high=high)
-            if register is epson.FILTER_CTRL:
-                await self.wait_clear(register, epson.FILTER_BUSY, "changing its filter")
+            await self._set(register, value, high=high)
         for register, high, value in configuration.writes():
-            found = await self.read(register) >> (8 if high else 0) & 0xFF
-            if found != value:
+            for _ in range(READ_ATTEMPTS):
+                found = await self.read(register) >> (8 if high else 0) & 0xFF
+                if found == value:
+                    break
+                await self._set(register, value, high=high)
+            else:
                 raise WrongDeviceError(
                     f"{self._stream.label}: register {register.address + high:02X} of window"
                     f" {register.window} was set to {value:02X} and reads {found:02X}:"
                     " this model does not have that setting"
                 )
+
+    async def _set(self, register: Register, value: int, *, high: bool) -> None:
+        await self.write(register, value, high=high)
+        if register is epson.FILTER_CTRL:
+            await self.wait_clear(register, epson.FILTER_BUSY, "changing its filter")
 
 
 class EpsonSession:

@@ -1,0 +1,293 @@
+"""What goes wrong on a simulated bench, and when: the fault script.
+
+A list of tables, as ``[[faults]]`` in a TOML file or under ``[simulation]`` of a bench file::
+
+    [[faults]]
+    kind = "corrupt"        # see below
+    sensors = ["A"]         # devices of these sensors; all, if not given
+    at = 12.0               # world time of the first, s
+    every = 30.0            # and again so often, s; once, if not given
+    count = 3               # bytes, or frames
+
+Kinds that strike the next unit (frame, packet, reply) a device sends, in every family:
+
+========== ==========================================================================
+drop       ``count`` units are not sent
+cut        ``count`` bytes are taken out of a unit's middle
+corrupt    ``count`` bytes of a unit are changed
+checksum   one bit of a unit's last byte but one is changed, where most have a checksum
+garbage    ``count`` random bytes go before a unit
+duplicate  a unit is sent ``1 + count`` times
+merge      the first half of a unit is followed by the second half of the next
+late       a unit, and all behind it, is kept back for ``duration`` s
+========== ==========================================================================
+
+Kinds that last ``duration`` s:
+
+========== ==========================================================================
+jitter     each unit is kept back for up to ``level`` s
+stall      the device sends nothing; what it would have sent is lost
+disconnect the cable is pulled; the port comes back
+clip       samples end at ± ``level`` counts (of ``channel``, or of all)
+dead       samples are 0 (of ``channel``, or of all)
+========== ==========================================================================
+
+Others: ``spike`` adds ``level`` counts to one sample; ``reset`` starts the device anew; ``wrap``
+lets its counter wrap ``at`` seconds after sampling starts; ``overflow`` is the device's own
+overflow of its buffer, lasting ``duration``. The last three strike devices that have such a thing.
+
+Everything is drawn from ``seed``: the same script does the same to the same stream. A wandering,
+jittering or wrong clock is no fault but a property of the sensor: ``clock`` in the scenario.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+import zlib
+from collections import deque
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
+
+from sim_devices.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sim_devices.arrays import FloatArray
+
+Kind: TypeAlias = Literal[
+    "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
+    "jitter", "stall", "disconnect",
+    "clip", "dead", "spike",
+    "reset", "wrap", "overflow",
+]  # fmt: skip
+UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
+SAMPLE_KINDS = ("clip", "dead", "spike")
+PATIENCE = 1.0
+"""A fault that finds no unit to strike for so long, s, does not strike."""
+
+
+class Fault(BaseModel):
+    """One line of a fault script."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Kind
+    at: NonNegativeFloat
+    every: PositiveFloat | None = None
+    sensors: tuple[str, ...] | None = None
+    count: PositiveInt = 1
+    duration: NonNegativeFloat = 1.0
+    level: float = 0.0
+    channel: NonNegativeInt | None = None
+    seed: int = 0
+
+    def times(self, begin: float = 0.0) -> Iterator[float]:
+        """World times at which it strikes, in s, from ``begin`` on."""
+        if self.every is None:
+            return iter((self.at,) if self.at >= begin else ())
+        first, every = max(0, math.ceil((begin - self.at) / self.every)), self.every
+        return (self.at + k * every for k in itertools.count(first))
+
+
+_SCRIPT = TypeAdapter(list[Fault])
+
+
+def parse(tables: Sequence[Any], sensors: Sequence[str] | None = None) -> tuple[Fault, ...]:
+    """Read a fault script.
+
+    Parameters
+    ----------
+    tables
+        As in a TOML file's ``[[faults]]``.
+    sensors
+        Leave only what strikes one of these.
+
+    Raises
+    ------
+    ScenarioError
+        Naming every key that is wrong, its value and what was expected.
+    """
+    try:
+        faults = _SCRIPT.validate_python(list(tables))
+    except ValidationError as error:
+        raise ScenarioError(
+            "\n".join(
+                f"faults[{fault['loc'][0]}]{''.join(f'.{key}' for key in fault['loc'][1:])}"
+                f" = {fault['input']!r}: {fault['msg']}"
+                for fault in error.errors(include_url=False)
+            )
+        ) from error
+    if sensors is None:
+        return tuple(faults)
+    return tuple(f for f in faults if f.sensors is None or set(f.sensors) & set(sensors))
+
+
+class SampleFaults:
+    """What the script does to samples before the device sends them."""
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        self._faults = [fault for fault in faults if fault.kind in SAMPLE_KINDS]
+
+    def apply(
+        self, sensor: str, counts: NDArray[np.float64], times: FloatArray
+    ) -> NDArray[np.float64]:
+        """Return counts (n, n_channels), sampled at world ``times`` (n,), with what went wrong."""
+        for fault in self._faults:
+            if fault.sensors is not None and sensor not in fault.sensors:
+                continue
+            columns = slice(None)
+            if fault.channel is not None:
+                columns = slice(fault.channel, fault.channel + 1)
+            since = times - fault.at
+            period = fault.every or math.inf
+            struck = (since >= 0) & (np.mod(since, period) < fault.duration)
+            if fault.kind == "spike":  # the first sample from each strike on
+                step = times[1] - times[0] if times.size > 1 else 0.0
+                around = np.append(since[0] - step, since)
+                strikes = np.where(around < 0, -1.0, np.floor(around / period))
+                struck = np.diff(strikes) > 0
+                counts[struck, columns] += fault.level
+            elif fault.kind == "dead":
+                counts[struck, columns] = 0.0
+            else:
+                counts[struck, columns] = np.clip(
+                    counts[struck, columns], -fault.level, fault.level
+                )
+        return counts
+
+
+class LineFaults:
+    """What the script does to one line: to its units, and to the line itself.
+
+    The line asks :meth:`next_due` when there is something to do, does it with :meth:`act`, and
+    passes all it sends through :meth:`send`.
+    """
+
+    def __init__(self, faults: Sequence[Fault], name: str, *, begin: float = 0.0) -> None:
+        self._rng = np.random.default_rng(
+            [zlib.crc32(name.encode()), *(fault.seed for fault in faults)]
+        )
+        self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
+        for index, fault in enumerate(faults):
+            if fault.kind not in (*SAMPLE_KINDS, "wrap"):
+                times = fault.times(begin)
+                first = next(times, None)
+                if first is not None:
+                    self._schedule.append((first, index, fault, times))
+        heapq.heapify(self._schedule)
+        self._armed: deque[tuple[float, Fault]] = deque()
+        self._half = b""  # the first half of a unit to be merged with the next
+        self._held: deque[tuple[float, bytes]] = deque()
+        self._silent_until = self._jitter_until = -math.inf
+        self._jitter = 0.0
+        self.down_until = -math.inf
+        """World time until which the cable is out."""
+        self.struck: list[tuple[float, Fault]] = []
+        """What struck, and when, since this was last emptied."""
+
+    def next_due(self) -> float:
+        """World time of the next thing to do: strike, or send what is kept back."""
+        return min(
+            self._schedule[0][0] if self._schedule else math.inf,
+            self._held[0][0] if self._held else math.inf,
+        )
+
+    def act(self, now: float) -> tuple[list[Fault], list[bytes]]:
+        """Do what is due; return what the line and the device must do, and units to send now."""
+        outside = []
+        while self._schedule and self._schedule[0][0] <= now:
+            at, index, fault, times = heapq.heappop(self._schedule)
+            following = next(times, None)
+            if following is not None:
+                heapq.heappush(self._schedule, (following, index, fault, times))
+            if fault.kind in UNIT_KINDS:
+                units = fault.count if fault.kind == "drop" else 1
+                self._armed.extend([(at + PATIENCE, fault)] * units)
+                continue
+            self.struck.append((at, fault))
+            if fault.kind == "stall":
+                self._silent_until = at + fault.duration
+            elif fault.kind == "jitter":
+                self._jitter_until, self._jitter = at + fault.duration, fault.level
+            else:
+                if fault.kind == "disconnect":
+                    self.down_until = at + fault.duration
+                outside.append(fault)
+        return outside, self._released(now)
+
+    def send(self, units: Sequence[bytes], now: float) -> list[bytes]:
+        """Return what of these units, and of those kept back, goes out now."""
+        if now < self._silent_until:
+            return []
+        while self._armed and self._armed[0][0] < now:
+            self._armed.popleft()
+        sent: list[bytes] = []
+        for unit in units:
+            struck = [unit]
+            if self._half:
+                struck = [self._half + unit[len(unit) // 2 :]]
+                self._half = b""
+            elif self._armed and unit:
+                struck = self._strike(self._armed.popleft()[1], unit, now)
+            sent += struck
+        if now < self._jitter_until:
+            for unit in sent:
+                self._hold(unit, now + self._rng.uniform(0, self._jitter))
+            sent = []
+        elif self._held:
+            for unit in sent:
+                self._hold(unit, now)
+            sent = []
+        return [*self._released(now), *sent]
+
+    def _hold(self, unit: bytes, until: float) -> None:
+        last = self._held[-1][0] if self._held else until
+        self._held.append((max(last, until), unit))
+
+    def _released(self, now: float) -> list[bytes]:
+        released = []
+        while self._held and self._held[0][0] <= now:
+            released.append(self._held.popleft()[1])
+        return released
+
+    def _strike(self, fault: Fault, unit: bytes, now: float) -> list[bytes]:
+        self.struck.append((now, fault))
+        octets = np.frombuffer(unit, np.uint8).copy()
+        n = min(fault.count, octets.size)
+        sent: list[bytes] = []
+        match fault.kind:
+            case "duplicate":
+                sent = [unit] * (1 + fault.count)
+            case "garbage":
+                sent = [self._rng.bytes(fault.count), unit]
+            case "merge":
+                self._half = unit[: (len(unit) + 1) // 2]
+            case "late":
+                self._hold(unit, now + fault.duration)
+            case "cut":
+                start = (octets.size - n) // 2
+                sent = [np.delete(octets, slice(start, start + n)).tobytes()]
+            case "checksum":
+                octets[max(0, octets.size - 2)] ^= 1
+                sent = [octets.tobytes()]
+            case "corrupt":
+                places = self._rng.choice(octets.size, n, replace=False)
+                octets[places] ^= self._rng.integers(1, 256, n, dtype=np.uint8)
+                sent = [octets.tobytes()]
+        return sent  # nothing of one that is dropped

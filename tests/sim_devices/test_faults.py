@@ -1,0 +1,203 @@
+"""The fault script strikes what it says, and our drivers survive every kind of it."""
+
+from __future__ import annotations
+
+import json
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.protocols import epson
+from daq.protocols.block import Block, BlockFlag, Event
+from sim_devices import launch
+from sim_devices.errors import ScenarioError
+from sim_devices.faults import LineFaults, SampleFaults, parse
+from tests.sim_devices.bench import device, scenario, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from daq.bench import Sensor
+    from daq.drivers.base import Session
+
+UNIT = bytes(range(20))
+
+
+def strike(**fault: Any) -> list[bytes]:  # noqa: ANN401 -- a line of a script
+    """Return what becomes of four units, the first of which the fault strikes."""
+    faults = LineFaults(parse([{"at": 1.0, **fault}]), "A")
+    assert faults.next_due() == 1.0
+    assert faults.send([UNIT], 0.5) == [UNIT]
+    faults.act(1.0)
+    return faults.send([UNIT] * 4, 1.0)
+
+
+def test_what_strikes_units() -> None:
+    assert strike(kind="drop", count=2) == [UNIT] * 2
+    assert strike(kind="cut", count=4) == [UNIT[:8] + UNIT[12:], *[UNIT] * 3]
+    assert strike(kind="duplicate", count=2) == [UNIT] * 6
+    assert strike(kind="merge") == [UNIT, UNIT, UNIT]  # two halves of one content
+    garbage, *rest = strike(kind="garbage", count=7)
+    assert (len(garbage), rest) == (7, [UNIT] * 4)
+    (changed, *rest) = strike(kind="corrupt", count=3)
+    assert sum(a != b for a, b in zip(changed, UNIT, strict=True)) == 3
+    assert strike(kind="checksum")[0] == UNIT[:-2] + bytes([UNIT[-2] ^ 1]) + UNIT[-1:]
+
+
+def test_late_units_keep_their_order() -> None:
+    faults = LineFaults(parse([{"kind": "late", "at": 1.0, "duration": 0.5}]), "A")
+    faults.act(1.0)
+    assert faults.send([b"a", b"b"], 1.0) == []
+    assert faults.next_due() == 1.5
+    assert faults.send([b"c"], 1.2) == []
+    assert faults.act(1.5) == ([], [b"a", b"b", b"c"])
+    assert faults.send([b"d"], 1.6) == [b"d"]
+
+
+def test_a_stalled_device_sends_nothing_and_comes_back() -> None:
+    faults = LineFaults(parse([{"kind": "stall", "at": 1.0, "duration": 0.5, "every": 2.0}]), "A")
+    faults.act(1.0)
+    assert faults.send([UNIT], 1.4) == []
+    assert faults.send([UNIT], 1.5) == [UNIT]
+    assert faults.next_due() == 3.0
+
+
+def test_what_was_due_before_the_device_was_there_is_left_out() -> None:
+    script = parse([{"kind": "drop", "at": 1.0, "every": 2.0}, {"kind": "reset", "at": 4.0}])
+    assert LineFaults(script, "A", begin=6.0).next_due() == 7.0
+
+
+def test_the_same_script_does_the_same() -> None:
+    script = {"kind": "corrupt", "count": 5}
+    assert strike(**script) == strike(**script) != strike(**script, seed=1)
+
+
+@pytest.mark.parametrize("cut", [100, 33, 1])
+def test_what_strikes_samples(cut: int) -> None:
+    script: list[dict[str, Any]] = [
+        {"kind": "spike", "at": 0.205, "level": 1000.0, "channel": 0},
+        {"kind": "spike", "at": 0.395, "every": 0.3, "level": -7.0, "channel": 1},
+        {"kind": "dead", "at": 0.495, "duration": 0.1, "channel": 2},
+        {"kind": "clip", "at": 0.795, "duration": 0.1, "level": 2.0},
+        {"kind": "dead", "at": 0.0, "sensors": ["B"]},
+    ]
+    if cut == 1:  # one sample at a time cannot tell when the one before was
+        script = script[2:]
+    faults = SampleFaults(parse(script))
+    times = np.arange(100) / 100
+    pieces = [
+        faults.apply("A", np.full((len(some), 3), 5.0), some)
+        for some in np.split(times, range(cut, 100, cut))
+    ]
+    counts = np.concatenate(pieces)
+    wanted = np.full((100, 3), 5.0)
+    if cut > 1:
+        wanted[21, 0] += 1000
+        wanted[[40, 70], 1] -= 7
+    wanted[50:60, 2] = 0
+    wanted[80:90] = 2
+    np.testing.assert_array_equal(counts, wanted)
+
+
+def test_a_wrong_script_says_what_is_wrong() -> None:
+    with pytest.raises(ScenarioError) as caught:
+        parse([{"kind": "drop"}, {"kind": "melt", "at": -1}])
+    assert "faults[0].at" in str(caught.value)
+    assert "faults[1].kind = 'melt'" in str(caught.value)
+    assert "faults[1].at = -1" in str(caught.value)
+
+
+DRIVER = driver_type("epson")
+SPEED = 8.0
+EVERYTHING = [
+    {"kind": kind, "at": 16.0 + k / 3, "every": 3.0, "count": 3}
+    for k, kind in enumerate(
+        ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
+    )
+]
+EVERYTHING[-1]["duration"] = 0.2
+EVERYTHING += [
+    {"kind": "stall", "at": 18.9, "every": 3.0, "duration": 0.2},
+    {"kind": "jitter", "at": 17.5, "every": 7.0, "duration": 1.0, "level": 0.05},
+]
+
+
+@asynccontextmanager
+async def connected(sensor: Sensor, clock: SystemClock) -> AsyncIterator[Session]:
+    """Open a sensor however often it takes, as the recorder does."""
+    async with AsyncExitStack() as stack:
+        while True:
+            try:
+                session = await stack.enter_async_context(DRIVER.open([sensor], clock))
+                break
+            except DeviceError:
+                continue
+        yield session
+
+
+async def test_every_sample_that_came_has_its_place(tmp_path: Path) -> None:
+    """Each received sample is the world's at its index: so every gap is exact."""
+    table = device("A", settings={"first_count": 64000})
+    log = tmp_path / "struck"
+    world = spec(table, speed=SPEED) | {"faults": EVERYTHING, "fault_log": str(log)}
+    blocks: list[Block] = []
+    events: list[Event] = []
+    with launch.start(world) as (one,):
+        (sensor,) = sensors(one, table)
+        async with connected(sensor, SystemClock(SPEED)) as session:
+            async for item in session.read():
+                if isinstance(item, Block):
+                    blocks.append(item)
+                else:
+                    events.append(item)
+                if blocks and blocks[-1].end_sample > 3500:
+                    break
+    struck = {json.loads(line)["kind"] for line in log.read_text().splitlines()}
+    assert struck == {fault["kind"] for fault in EVERYTHING}
+    assert {event.kind for event in events} == {"checksum", "resynchronised"}
+    assert not any(BlockFlag.MISSING_ESTIMATED in block.flags for block in blocks)
+    found = {
+        block.first_sample + row: tuple(counts)
+        for block in blocks
+        for row, counts in enumerate(block.counts[:, :3].tolist())
+    }
+    assert len(found) == sum(block.n_samples for block in blocks)  # none twice
+    truth = np.rint(scenario("A").samples("A", 0, 60 * 200) * epson.COUNTS_PER_UNIT)
+    place = {tuple(row): index for index, row in enumerate(truth.astype(int).tolist())}
+    begin = place[found[0]]
+    assert {place.get(counts, -1) - index for index, counts in found.items()} == {begin}
+    received = len(found) / blocks[-1].end_sample
+    assert 0.8 < received < 0.97  # of every 3 s: 0.2 s stalled, and a few frames struck
+
+
+@pytest.mark.parametrize(
+    ("kind", "port", "error"),
+    [
+        ("disconnect", "pty", NotConnectedError),
+        ("disconnect", "tcp", NotConnectedError),
+        ("reset", "pty", NoAnswerError),
+    ],
+)
+async def test_what_ends_a_session(kind: str, port: str, error: type[Exception]) -> None:
+    table = device("A", port=port)
+    fault = {"kind": kind, "at": 8.0, "every": 12.0, "duration": 1.0}
+    with launch.start(spec(table, speed=SPEED) | {"faults": [fault]}) as (one,):
+        (sensor,) = sensors(one, table)
+        clock = SystemClock(SPEED)
+        ended = sampled = False
+        while True:
+            try:
+                async with DRIVER.open([sensor], clock) as session:
+                    async for _ in session.read():
+                        sampled = True
+                        if ended:
+                            return  # it came back, under the same name
+            except (NotConnectedError, NoAnswerError) as came:
+                ended = ended or (sampled and isinstance(came, error))
+            sampled = False
