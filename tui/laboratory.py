@@ -1,18 +1,18 @@
 """The laboratory set-ups: five triaxial sensors side by side, Table 1 and Fig. 14.
 
 Segments are 10 s with a Hann window and half overlap: the paper's rectangular ones would leak the
-motion at the structure's modes into bins where it is ten thousand times weaker. Theory is the
-estimator's limit on the true cross-spectral matrix as such segments see it, that is (13) and (30)
-with the coherence of the field and the resolution of the window.
+motion at the structure's modes into bins where it is ten thousand times weaker. Theory is (13)
+and (30) with the cross-spectra of the field, as such segments see them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.bias import three_channel_bias, three_sensor_bias
 from estimator.dimension import choose_dimension
 from estimator.methods import self_noise
 from estimator.spectra import CrossSpectra, WelchSettings
@@ -46,23 +46,32 @@ REACH = 3
 """Bins to each side from which a Hann window takes power."""
 PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
 BIAS_LABEL = "fractional bias (1)"
+BIAS = {"three-channel": three_channel_bias, "three-sensor": three_sensor_bias}
 STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C2-"}
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A scenario's cross-spectral matrix, and what it would be without statistical error."""
+    """A scenario's cross-spectral matrix, and what it would be without statistical error.
+
+    That is `motion` (n_freqs, n_channels, n_channels) and `noise` (n_freqs, n_channels) on its
+    diagonal.
+    """
 
     scenario: Scenario
     csm: ComplexArray
-    limit: ComplexArray
+    motion: ComplexArray
+    noise: FloatArray
     n_effective: float
 
-    def of(self, csm: ComplexArray, sensors: tuple[str, ...]) -> ComplexArray:
-        """Return the part of a matrix that belongs to some sensors, in their order."""
+    def of(self, sensors: tuple[str, ...]) -> Measured:
+        """Return the part that belongs to some sensors, in their order."""
         first = {name: 3 * number for number, name in enumerate(self.scenario.names)}
         used = np.concatenate([first[name] + np.arange(3) for name in sensors])
-        return csm[:, used][:, :, used]
+        square = np.ix_(np.arange(len(self.csm)), used, used)
+        return replace(
+            self, csm=self.csm[square], motion=self.motion[square], noise=self.noise[:, used]
+        )
 
 
 class Laboratory:
@@ -102,18 +111,28 @@ def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None
     return Measured(
         scenario=scenario,
         csm=spectra.csm()[SHOWN],
-        limit=expected_csm(scenario, HANN)[SHOWN],
+        motion=smoothed(lambda f: scenario.motion_csm(scenario.names, f), HANN)[SHOWN],
+        noise=smoothed(lambda f: true_noise(scenario, scenario.names, f), HANN)[SHOWN].real,
         n_effective=spectra.n_effective,
     )
 
 
-def expected_csm(scenario: Scenario, settings: WelchSettings) -> ComplexArray:
-    """Cross-spectral matrix that windowed segments of a scenario have on average.
+def smoothed(
+    spectrum: Callable[[FloatArray], FloatArray | ComplexArray], settings: WelchSettings
+) -> ComplexArray:
+    """Spectrum that windowed segments have on average.
+
+    Parameters
+    ----------
+    spectrum
+        From frequency in Hz, shape (n,), to the true spectrum, shape (n, ...).
+    settings
+        Of the segments.
 
     Returns
     -------
-    complex128, shape (n_freqs, n_channels, n_channels)
-        The true matrix, smoothed by the power of the window's transform.
+    complex128, shape (n_freqs, ...)
+        The true spectrum, smoothed by the power of the window's transform.
     """
     window = get_window(settings.window, settings.segment_length)
     offsets = np.arange(-REACH * FINE, REACH * FINE + 1) / FINE
@@ -121,12 +140,24 @@ def expected_csm(scenario: Scenario, settings: WelchSettings) -> ComplexArray:
     weights = np.abs(np.exp(-2j * np.pi * turns) @ window) ** 2
     weights /= weights.sum()
     bin_width = settings.sampling_rate / settings.segment_length
-    expected = np.zeros((), dtype=complex)
+    total = np.zeros((), dtype=complex)
     for offset, weight in zip(offsets, weights, strict=True):
         frequency = settings.frequencies + offset * bin_width
-        folded = scenario.true_csm(scenario.names, np.abs(frequency))
-        expected = expected + weight * np.where(frequency[:, None, None] < 0, folded.conj(), folded)
-    return np.asarray(expected)
+        part = spectrum(np.abs(frequency))
+        part[frequency < 0] = part[frequency < 0].conj()
+        total = total + weight * part
+    return np.asarray(total)
+
+
+def true_noise(scenario: Scenario, sensors: tuple[str, ...], frequency: FloatArray) -> FloatArray:
+    """Return the true noise PSD of the sensors' channels, shape (n_freqs, n_channels)."""
+    return np.transpose(
+        [
+            scenario.true_noise_psd(sensor, channel, frequency)
+            for sensor in sensors
+            for channel in range(scenario.n_channels(sensor))
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,19 +176,22 @@ def estimate(
 ) -> Noise:
     """Estimate the noise of the leading channels of some sensors.
 
-    What theory expects is the estimate from the cross-spectral matrix without statistical error.
+    Theory expects (13) or (30) with the motion's true cross-spectra.
     """
-    dims, n = (3,) * len(sensors), measured.n_effective
-    limit = measured.of(measured.limit, sensors)
-    found = self_noise(method, measured.of(measured.csm, sensors), dims=dims, n_effective=n)
-    predicted = self_noise(method, limit, dims=dims, n_effective=n)
-    unbiased = self_noise(method, limit, dims=dims, n_effective=n, correct=False)
+    part, dims, n = measured.of(sensors), (3,) * len(sensors), measured.n_effective
+    truth = true_noise(measured.scenario, sensors, HANN.frequencies[SHOWN])
+    found = self_noise(method, part.csm, dims=dims, n_effective=n)
+    channel = np.arange(sum(dims))
+    expected = part.motion.copy()
+    expected[:, channel, channel] += part.noise
+    predicted = self_noise(method, expected, dims=dims, n_effective=n)
+    limit = part.noise + truth * BIAS[method](part.motion, truth, dims=dims)
     return Noise(
         method=method,
         estimate=found.noise_psd[:, :n_channels],
-        limit=unbiased.noise_psd[:, :n_channels],
+        limit=limit[:, :n_channels],
         deviation=(predicted.cov * np.abs(predicted.noise_psd))[:, :n_channels],
-        truth=_truth(measured, sensors)[:, :n_channels],
+        truth=truth[:, :n_channels],
     )
 
 
@@ -168,23 +202,12 @@ def estimate_any_dimension(measured: Measured, *, n_channels: int) -> Noise:
     """
     sensors = measured.scenario.names[::-1]  # the one in the middle comes first
     dims, n = (3,) * len(sensors), measured.n_effective
-    csm = measured.of(measured.csm, sensors)
+    csm = measured.of(sensors).csm
     n_factors, _ = choose_dimension(csm, HANN.frequencies[SHOWN], dims=dims, n_effective=n)
     found = self_noise("maximum-likelihood", csm, dims=dims, n_effective=n, n_factors=n_factors)
-    truth = _truth(measured, sensors)[:, :n_channels]
+    truth = true_noise(measured.scenario, sensors, HANN.frequencies[SHOWN])[:, :n_channels]
     cov = np.where(np.isfinite(found.cov), found.cov, 1.0)[:, :n_channels]  # at zero: one
     return Noise("maximum-likelihood", found.noise_psd[:, :n_channels], truth, cov * truth, truth)
-
-
-def _truth(measured: Measured, sensors: tuple[str, ...]) -> FloatArray:
-    frequency = HANN.frequencies[SHOWN]
-    return np.transpose(
-        [
-            measured.scenario.true_noise_psd(sensor, channel, frequency)
-            for sensor in sensors
-            for channel in range(3)
-        ]
-    )
 
 
 def band_series(
@@ -235,7 +258,7 @@ def _spectra(title: str, record: Curve, noises: tuple[Noise, ...]) -> Panel:
 
 
 def _record(measured: Measured, sensor: str) -> Curve:
-    power = measured.of(measured.csm, (sensor,))[:, 0, 0].real
+    power = measured.of((sensor,)).csm[:, 0, 0].real
     return Curve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
 
 

@@ -156,7 +156,8 @@ def _print(console: Console, studies: list[Study], folder: Path, elapsed: float)
     deviations = np.concatenate([study.deviations for study in studies])
     console.print(
         f"\nEach row shows the point of a curve where theory expects most, ± one standard error;"
-        f" 'off' is the curve's furthest point, in standard errors."
+        f" 'off' is the curve's furthest point, in standard errors. Where no theory is exact,"
+        f" it says what may be missed besides."
         f"\n{np.sum(np.abs(deviations) <= TOLERANCE)} of {deviations.size} points are within"
         f" {TOLERANCE:g} standard errors of theory (rms {np.sqrt(np.mean(deviations**2)):.2f})."
         f" Figures in {folder}; {elapsed:.0f} s."
@@ -169,6 +170,7 @@ def _row(series: Series) -> tuple[str, ...]:
     return (
         f"{point.x:.3g}",
         f"{point.measured:.4g} ± {point.error:.1g}",
-        f"{point.theory:.4g}" if abs(point.theory) > 1e-9 else "0",
+        (f"{point.theory:.4g}" if abs(point.theory) > 1e-9 else "0")
+        + (f" ± {point.allowed:g}" if point.allowed else ""),
         off if worst.agrees else f"[red]{off} NO[/red]",
     )
