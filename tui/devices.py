@@ -62,6 +62,7 @@ def specification(bench: Bench, *, speed: float) -> dict[str, Any]:
         "epoch_ns": time.monotonic_ns() + HEAD_START_NS,
         "speed": speed,
         "scenario": scenario,
+        "faults": bench.simulation.get("faults", []),
         "devices": [_device(sensors) for sensors in bench.ports().values()],
     }
 
