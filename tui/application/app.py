@@ -180,6 +180,7 @@ class HuddleApp(App[None]):
             return
         self.query_one("#status", Static).update(self._status())
         snapshot, settings = self.snapshot, self._settings
+        self.screen.set_class(snapshot is None, "-idle")
         if snapshot is None or settings is None:
             self.query_one("#table", Static).update(self._controls.description())
             self.query_one("#progress", Static).update(
@@ -187,6 +188,7 @@ class HuddleApp(App[None]):
             )
             return
         plot = self.query_one(PsdPlot)
+        plot.visible = snapshot.n_segments > 0
         self.query_one("#title", Static).update(view.plot_title(snapshot, self.choice))
         plot.show(view.curves(snapshot, settings, self.choice, n_points=plot.n_points))
         self.query_one("#table", Static).update(view.sensor_table(snapshot, settings, self.choice))

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class Curve:
     """One curve, one point per band of frequencies; shape (n_points,).
 
-    ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; there ``high_db``
-    may still be a number: the noise is below it. ``low_db`` and ``high_db`` bound the 95 %
-    interval and are NaN throughout for a curve without one.
+    ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; ``negative`` says
+    where it is known not to be. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
+    bound is not positive, and throughout for a curve without one.
     """
 
     label: str
@@ -33,6 +33,7 @@ class Curve:
     level_db: FloatArray
     low_db: FloatArray
     high_db: FloatArray
+    negative: NDArray[np.bool_]
 
 
 def decibels(psd: FloatArray) -> FloatArray:
@@ -47,7 +48,16 @@ def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: 
     starts = edges[:-1]
     mean = np.add.reduceat(psd[: edges[-1]], starts) / np.diff(edges)
     nothing = np.full(mean.size, np.nan)
-    return Curve("data", style, style, _centres(frequency, edges), decibels(mean), nothing, nothing)
+    return Curve(
+        label="data",
+        style=style,
+        band_style=style,
+        log_frequency=_centres(frequency, edges),
+        level_db=decibels(mean),
+        low_db=nothing,
+        high_db=nothing,
+        negative=np.zeros(mean.size, dtype=bool),
+    )
 
 
 def noise_curve(
@@ -65,13 +75,14 @@ def noise_curve(
     edges = log_edges(frequency, n_points)
     means = band_means(psd, cov, edges, correlation)
     return Curve(
-        label,
-        style,
-        band_style,
-        _centres(frequency, edges),
-        decibels(means.mean),
-        decibels(means.low),
-        decibels(means.high),
+        label=label,
+        style=style,
+        band_style=band_style,
+        log_frequency=_centres(frequency, edges),
+        level_db=decibels(means.mean),
+        low_db=decibels(means.low),
+        high_db=decibels(means.high),
+        negative=means.mean <= 0,
     )
 
 

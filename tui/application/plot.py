@@ -110,8 +110,7 @@ class PsdPlot(PlotWidget, can_focus=False):
                 marker_style=curve.band_style,
                 hires_mode=HiResMode.BRAILLE,
             )
-        below = np.isfinite(curve.high_db) & np.isnan(curve.level_db)
-        if below.any():  # the estimate came out negative: all that is known is an upper bound
-            self.scatter(
-                curve.log_frequency[below], high[below], marker="▾", marker_style=curve.style
-            )
+        below = curve.negative
+        if below.any():  # all that is known is an upper bound, or not even that
+            y = np.where(np.isfinite(high), high, limits[0])[below]
+            self.scatter(curve.log_frequency[below], y, marker="▾", marker_style=curve.style)

@@ -19,13 +19,12 @@ KEYS = (
     ("← →", "channel"),
     ("↑ ↓", "sensor"),
     ("e", "estimate shown: each method in turn, then all"),
-    ("b", "a wider or narrower band of the levels in the table"),
     ("q", "quit; a recording goes on, and is found again"),
 )
 READING = (
     "Grey is what the channel recorded, in colour what is its own noise; the shade around it is "
     "the 95 % interval and closes in as segments come. ▾ marks frequencies where the estimate "
-    "came out negative: the noise is below. c.o.v. is the scatter of one frequency's estimate, "
+    "came out negative: its upper bound, or the floor. c.o.v. is the scatter of one frequency's estimate, "
     "relative, in the worst channel."
 )
 

@@ -146,14 +146,15 @@ def progress_line(snapshot: Snapshot, settings: Settings, choice: Choice, *, wid
     """Return how far the test is: a bar where there is a target, segments, c.o.v., time left."""
     method = next((m for m in choice.methods if m in snapshot.results), None)
     cov, target = reached_cov(snapshot, settings, method), settings.target_cov
+    if snapshot.n_segments == 0:
+        return Text(f"waiting for the first {settings.segment:g} s segment", "#9aa5b8")
     parts = [f"{snapshot.n_segments} segments"]
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} dropped")
     if not math.isnan(cov):
         parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
     if target is not None:
-        short = not snapshot.time_left
-        reached = "target reached" if short else "target not reached"
+        reached = "target reached" if cov <= target else "target not reached"
         parts.append(reached if snapshot.closed else time_left(snapshot.time_left))
     text = " · ".join(parts)
     line = Text()
@@ -173,8 +174,6 @@ def progress_line(snapshot: Snapshot, settings: Settings, choice: Choice, *, wid
 def advice(snapshot: Snapshot, settings: Settings, choice: Choice) -> Text:
     """Return one line on what to know about what is shown."""
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
-    if snapshot.n_segments == 0:
-        return Text(f"waiting for the first {settings.segment:g} s segment", "#9aa5b8")
     if refused:
         return Text(refused[0], "yellow")
     for method in choice.methods:

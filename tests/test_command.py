@@ -1,0 +1,239 @@
+"""The command: help, exit codes, what is loaded, and results on the real recording."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.estimation import Settings, estimate
+from tui.command import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COMMANDS = (
+    "init",
+    "check",
+    "devices",
+    "demo",
+    "record",
+    "run",
+    "watch",
+    "simulate",
+    "import",
+    "estimate",
+    "tui",
+    "serve",
+)
+
+
+def huddle(*arguments: str, code: int = 0) -> str:
+    """Run the command in this process; return its standard output."""
+    result = CliRunner().invoke(app, arguments, terminal_width=200)
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def modules_after(code: str) -> set[str]:
+    """Names of the modules loaded after running code in a new interpreter."""
+    code += "; import sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+# ------------------------------------------------------------------------------ help
+
+
+def test_help_names_every_command_and_is_quick() -> None:
+    spent = []
+    for _ in range(3):  # the best of three: others use this machine too
+        began = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", "tui", "--help"], capture_output=True, text=True, check=True
+        )
+        spent.append(time.perf_counter() - began)
+    assert all(name in done.stdout for name in COMMANDS)
+    assert min(spent) < 0.3
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_examples(name: str) -> None:
+    text = huddle(name, "--help")
+    assert "Examples" in text
+    assert f"huddle {name} " in text or f"huddle {name}\n" in text
+
+
+def test_help_loads_neither_arrays_nor_screens() -> None:
+    loaded = modules_after("import tui.command")
+    assert not loaded & {"numpy", "scipy", "h5py", "textual", "pydantic", "serial", "matplotlib"}
+
+
+@pytest.mark.parametrize("module", ["tui.recording", "tui.running", "tui.estimating"])
+def test_recording_and_estimating_never_load_textual(module: str) -> None:
+    loaded = modules_after(f"import {module}")
+    assert "h5py" in loaded
+    assert not {name for name in loaded if name.split(".")[0] in {"textual", "matplotlib"}}
+
+
+# ------------------------------------------------------------------------ exit codes
+
+
+def test_usage_is_exit_2(tmp_path: Path) -> None:
+    for arguments in (
+        ("estimate",),
+        ("estimate", "x.h5", "--overlap", "3"),
+        ("estimate", "x.h5", "--method", "magic"),
+        ("estimate", "x.h5", "--segment", "soon"),
+        ("fly",),
+    ):
+        huddle(*arguments, code=2)
+    bench = tmp_path / "bench.toml"
+    bench.write_text('name = "x"\nsampling_rat = 200\n')
+    result = CliRunner().invoke(app, ["check", str(bench)])
+    assert result.exit_code == 2
+    for said in ("bench.toml", "sampling_rat", "sampling_rate", "sensors"):
+        assert said in result.stderr
+
+
+def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_text("not HDF5")
+    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "a.h5")])
+    assert result.exit_code == 3
+    assert "a.h5: not a huddle recording" in result.stderr
+    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "none.h5")])
+    assert result.exit_code == 3
+    assert "none.h5" in result.stderr
+    assert "Traceback" not in result.output
+
+
+# --------------------------------------------------------------------------- benches
+
+
+def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    before = bench.read_text(encoding="utf-8")
+    assert "the bench file is right" in huddle("check", str(bench), "--no-devices")
+    huddle("init", "--out", str(bench), code=3)
+    assert bench.read_text(encoding="utf-8") == before
+
+
+def test_check_names_sensor_and_port_that_are_not_there(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    text = bench.read_text(encoding="utf-8").replace("/dev/ttyUSB", f"{tmp_path}/tty")
+    bench.write_text(text, encoding="utf-8")
+    result = CliRunner().invoke(app, ["check", str(bench), "--json", "-"])
+    assert result.exit_code == 3
+    for name, port in (("A", "tty0"), ("B", "tty1"), ("C", "tty2")):
+        assert any(name in line and port in line for line in result.stderr.splitlines())
+    assert len(json.loads(result.stdout)["errors"]) == 3
+
+
+# --------------------------------------------------------------- the real recording
+
+PUBLISHED = (
+    "--segment", "409.6s", "--overlap", "0.125", "--window", "hann", "--detrend", "none",
+    "--no-correction", "--unit", "m/s²",
+)  # fmt: skip
+TABLE = {  # method.md: real part in dB re 1 (m/s²)²/Hz, bins at or below zero
+    ("XX.TST5.00", "BH0"): (-165.1383, 0),
+    ("XX.TST5.10", "BH0"): (-165.3101, 0),
+    ("XX.TST6.00", "BH0"): (-166.2117, 0),
+    ("XX.TST5.00", "BH1"): (-165.6237, 0),
+    ("XX.TST5.10", "BH1"): (-165.8338, 58),
+    ("XX.TST6.00", "BH1"): (-165.7667, 4),
+    ("XX.TST5.00", "BH2"): (-165.2734, 0),
+    ("XX.TST5.10", "BH2"): (-165.4332, 48),
+    ("XX.TST6.00", "BH2"): (-165.5282, 0),
+}
+COMPLEX_TABLE = {  # the published numbers: magnitude of the complex quotient
+    "BH0": (-165.0870, -165.2535, -166.1229),
+    "BH1": (-165.5604, -165.7494, -165.6986),
+    "BH2": (-165.2139, -165.3460, -165.4636),
+}
+
+
+@pytest.fixture(scope="module")
+def tst(usgs_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("obspy", reason="ObsPy is an extra")
+    out = tmp_path_factory.mktemp("usgs") / "tst.h5"
+    sources = sorted(str(path) for path in usgs_recording.glob("*.mseed"))
+    response = str(usgs_recording / "T-compact_Q330HR_BH_40")
+    huddle("import", *sources, "--response", response, "--out", str(out))
+    return out
+
+
+def result_of(path: Path, *options: str) -> dict[str, Any]:
+    """Run ``huddle estimate --json -``."""
+    found: dict[str, Any] = json.loads(huddle("estimate", str(path), *options, "--json", "-"))
+    return found
+
+
+def level_db(document: dict[str, Any], sensor: str, channel: str) -> float:
+    """Level of a channel's mean noise PSD from 0.2 to 0.33 Hz, dB."""
+    frequency = np.array(document["frequency_hz"])
+    inside = (frequency >= 0.2) & (frequency <= 0.33)
+    (found,) = (c for c in document["channels"] if (c["sensor"], c["channel"]) == (sensor, channel))
+    return 10 * math.log10(np.array(found["noise_psd"], dtype=float)[inside].mean())
+
+
+def test_published_table_through_the_command(tst: Path) -> None:
+    document = result_of(tst, "--method", "three-channel", *PUBLISHED)
+    assert document["method"] == "three-channel"
+    frequency = np.array(document["frequency_hz"])
+    inside = (frequency >= 1 / 30) & (frequency <= 10)
+    assert inside.sum() == 4083
+    for channel in document["channels"]:
+        level, n_negative = TABLE[channel["sensor"], channel["channel"]]
+        psd = np.array(channel["noise_psd"], dtype=float)[inside]
+        assert np.mean(10 * np.log10(np.abs(psd))) == pytest.approx(level, abs=1e-3)
+        assert np.sum(psd <= 0) == n_negative
+
+
+def test_published_table_of_complex_magnitudes(tst: Path) -> None:
+    settings = Settings(
+        segment=409.6, overlap=0.125, detrend="none", methods=("three-channel",),
+        correct=False, unit="m/s²",
+    )  # fmt: skip
+    snapshot = estimate([tst], settings)
+    inside = (snapshot.frequency >= 1 / 30) & (snapshot.frequency <= 10)
+    csm = snapshot.csm[inside]
+    for place, levels in enumerate(COMPLEX_TABLE.values()):
+        for sensor, level in enumerate(levels):
+            i, j, k = (3 * ((sensor + step) % 3) + place for step in range(3))
+            noise = csm[:, i, i] - csm[:, i, j] * csm[:, k, i] / csm[:, k, j]
+            assert np.mean(10 * np.log10(np.abs(noise))) == pytest.approx(level, abs=1e-3)
+
+
+def test_three_sensor_removes_the_microseism_that_leaks_through_misalignment(tst: Path) -> None:
+    options = ("--segment", "409.6s", "--overlap", "0.5", "--unit", "m/s²", "--detrend", "none")
+    leaking, clean = (
+        level_db(result_of(tst, "--method", method, *options), "XX.TST5.00", "BH1")
+        for method in ("three-channel", "three-sensor")
+    )
+    assert leaking == pytest.approx(-161.9, abs=0.1)
+    assert clean == pytest.approx(-174.8, abs=0.2)
+    assert leaking - clean >= 12
+
+
+def test_all_methods_a_part_of_the_time_and_csv(tst: Path, tmp_path: Path) -> None:
+    csv = tmp_path / "curves.csv"
+    document = result_of(
+        tst, "--method", "all", "--segment", "60s", "--start", "2016-07-14T02:00",
+        "--end", "80min", "--csv", str(csv), "--band", "0.1:1",
+    )  # fmt: skip
+    methods = [entry["method"] for entry in document["results"]]
+    assert {"three-channel", "three-sensor", "maximum-likelihood"} <= set(methods)
+    assert document["results"][0]["segments"] == 39  # 20 minutes, one segment in 30 s
+    header, first = csv.read_text(encoding="utf-8").splitlines()[:2]
+    assert header.startswith("frequency (Hz),XX.TST5.00.BH0 data ((m/s)²/Hz)")
+    assert len(header.split(",")) == len(first.split(",")) == 1 + 9 * (1 + 4 * len(methods))

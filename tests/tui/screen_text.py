@@ -1,0 +1,37 @@
+"""The text of a Textual screen, out of the picture it exports of itself."""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from textual.app import App
+
+FOLDER = Path(__file__).parent / "pictures"
+_TEXT = re.compile(
+    r'<text class="[^"]*-r\d+" x="([\d.]+)" y="[\d.]+" textLength="[\d.]+" '
+    r'clip-path="url\(#[^"]*-line-(\d+)\)">(.*?)</text>'
+)
+_CELL = 12.2  # width of a character in the picture
+
+
+def screen_text(app: App[None]) -> str:
+    """Return what is on the screen, line by line, without colours."""
+    lines: dict[int, str] = {}
+    for x, number, text in _TEXT.findall(app.export_screenshot()):
+        line = lines.get(int(number), "").ljust(round(float(x) / _CELL))
+        lines[int(number)] = line + html.unescape(text).replace("\xa0", " ")
+    return "\n".join(lines.get(n, "").rstrip() for n in range(max(lines) + 1)) + "\n"
+
+
+def assert_looks_as_before(app: App[None], name: str) -> None:
+    """Compare the screen with the picture kept of it; HUDDLE_NEW_PICTURES=1 keeps a new one."""
+    text, kept = screen_text(app), FOLDER / f"{name}.txt"
+    if os.environ.get("HUDDLE_NEW_PICTURES") or not kept.exists():
+        FOLDER.mkdir(exist_ok=True)
+        kept.write_text(text, encoding="utf-8")
+    assert text == kept.read_text(encoding="utf-8")

@@ -1,0 +1,142 @@
+"""The application: what it tells its recorder, what it says of a snapshot, how it looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from textual.widgets import Static
+
+from tests.tui.made import SETTINGS, Told, empty_snapshot, made_snapshot
+from tests.tui.screen_text import assert_looks_as_before, screen_text
+from tui.application.app import Following, Fresh, HuddleApp, Trouble
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from textual.pilot import Pilot
+
+NARROW, WIDE = (80, 24), (160, 45)
+
+
+async def shown(pilot: Pilot[None], app: HuddleApp, message: object) -> None:
+    """Post a message and wait until it has been drawn."""
+    app.post_message(message)  # type: ignore[arg-type]  # any of the application's
+    for _ in range(3):
+        await pilot.pause()
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Told:
+    return Told(tmp_path / "run.h5")
+
+
+# -------------------------------------------------------------------- messages first
+
+
+async def test_keys_tell_the_recorder(told: Told, tmp_path: Path) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("x", "m")
+        assert told.told == []  # nothing runs: nothing to stop or mark
+        app.post_message(Following(tmp_path / "missing.h5"))
+        await app.workers.wait_for_complete()
+        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await pilot.press("s")  # one runs already
+        await pilot.press("m", *"door", "enter")
+        await pilot.press("x")
+        await app.workers.wait_for_complete()
+    assert told.told == ["mark missing.h5 door", "stop missing.h5"]
+
+
+async def test_start_follows_the_file_and_says_what_is_wrong_with_it(told: Told) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW, notifications=True) as pilot:
+        await pilot.press("s")
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert told.told == ["start"]
+        assert "run.h5" in screen_text(app)  # the file is not there: followed, and told so
+        assert "cannot be read" in screen_text(app)
+
+
+async def test_a_running_recording_is_found_again(told: Told, tmp_path: Path) -> None:
+    told.running = tmp_path / "old.h5"
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert "old.h5" in screen_text(app)
+
+
+async def test_channels_sensors_and_methods_by_keys(told: Told) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        assert app.choice.methods == ("three-sensor",)
+        for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
+            await pilot.press(key)
+            assert app.choice.channel == channel
+        title = app.query_one("#title", Static)
+        assert "C X" in str(title.render())
+        for methods in (("three-channel",), ("three-sensor", "three-channel"), ("three-sensor",)):
+            await pilot.press("e")
+            assert app.choice.methods == methods
+
+
+async def test_trouble_is_told(told: Told) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW, notifications=True) as pilot:
+        await shown(pilot, app, Trouble("sensor B at /dev/ttyUSB1: no answer"))
+        assert "no answer" in screen_text(app)
+
+
+async def test_quitting_tells_the_recorder_nothing(told: Told) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await pilot.press("q")
+    assert told.told == []
+    assert app.return_code == 0
+
+
+# --------------------------------------------------------------------- then pictures
+
+
+@pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
+async def test_pictures(told: Told, name: str, size: tuple[int, int]) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert_looks_as_before(app, f"{name}-idle")
+        await shown(pilot, app, Fresh(empty_snapshot(), SETTINGS))
+        assert_looks_as_before(app, f"{name}-waiting")
+        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await pilot.press("e", "e", "down")
+        await pilot.pause()
+        assert_looks_as_before(app, f"{name}-running")
+        await shown(pilot, app, Fresh(made_snapshot(n_effective=2000, closed=True), SETTINGS))
+        assert_looks_as_before(app, f"{name}-ended")
+        await pilot.press("question_mark")
+        await pilot.pause()
+        assert_looks_as_before(app, f"{name}-help")
+
+
+async def test_negative_estimates_are_marked_not_hidden(told: Told) -> None:
+    snapshot = made_snapshot()
+    noise = snapshot.results["three-sensor"]
+    psd, high = noise.noise_psd.copy(), noise.high.copy()
+    psd[20:60, 0] = -1e-13
+    changed = replace(noise, noise_psd=psd, high=high, cov=np.abs(noise.cov))
+    snapshot = replace(snapshot, results={"three-sensor": changed})
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, Fresh(snapshot, SETTINGS))
+        text = screen_text(app)
+    assert "40 of 199 values at or below zero" in text
+    assert "▾" in text.replace("(▾ marks", "")
