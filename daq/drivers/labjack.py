@@ -1,0 +1,195 @@
+"""Driver for LabJack T7 and T8 digitizers, which stream analog inputs over Ethernet.
+
+All sensors of one port share the device: each says with ``inputs`` which of its channels is which
+analog input, and one scan list holds them all, so they are sampled by one clock and their samples
+have the same indices.
+
+What is recorded are the converter's counts (uint16), as they come. The device's calibration is read
+from its flash and told (``DeviceInformation.details``): counts per volt of each range. A channel's
+``sensitivity`` in the bench file is that times the sensor's volts per unit; at ±10 V the nominal
+3166.5 counts/V make 3166.5 × 1.27 for a sensor of 1.27 V/(m/s²). The centre of the converter (33523
+counts) is an offset like any other. The T8 does not show its calibration.
+
+The device has few sockets: one on port 502 does everything but spontaneous streams, by function 76.
+With ``core_timer`` the scan list leads with the device's 40 MHz clock, so that gaps are counted
+exactly. A stream that breaks off (2942, 2943, 2945) is started anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.drivers import labjack_setup as setup
+from daq.drivers.labjack_setup import LabJackSettings, Registers
+from daq.errors import DeviceError, NoAnswerError
+from daq.protocols import labjack
+from daq.protocols import labjack_registers as reg
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.labjack import StreamDecoder
+from daq.protocols.labjack_registers import Read
+from daq.transport import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.drivers.base import DeviceInformation
+    from daq.protocols.block import Block, Event
+
+STALLED = 1.0
+"""Beyond two packets, how long nothing may come, s."""
+POLL_INTERVAL = 0.05
+"""Between two reads of a stream by command, s, once it has been read up."""
+MOST_RESTARTS = 3
+"""Of a stream that breaks off with its first packet."""
+
+
+class LabJackSession:
+    """A digitizer whose scan list is set."""
+
+    def __init__(
+        self,
+        registers: Registers,
+        settings: LabJackSettings,
+        decoder: StreamDecoder,
+        *,
+        information: tuple[DeviceInformation, ...],
+        clock: HostClock,
+        stream_address: str,
+        packet_seconds: float,
+    ) -> None:
+        self.information = information
+        self._registers = registers
+        self._settings = settings
+        self._decoder = decoder
+        self._clock = clock
+        self._stream_address = stream_address
+        self._patience = STALLED + 2 * packet_seconds
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Start the stream and yield its blocks; start it anew where it breaks off."""
+        if self._settings.mode == "command-response":
+            received = self._by_command()
+        else:
+            received = self._spontaneous()
+        fruitless = 0
+        async with contextlib.aclosing(received):
+            async for items in received:
+                for item in items:
+                    yield item
+                if self._decoder.fatal is None:
+                    fruitless = 0 if items else fruitless
+                    continue
+                fruitless += 1
+                if fruitless > MOST_RESTARTS:
+                    why = labjack.FATAL[self._decoder.fatal]
+                    raise DeviceError(f"{self._registers.label}: the stream does not go on: {why}")
+                await self._registers.stop_stream()
+                self._decoder.restart()
+                await self._start()
+
+    async def _start(self) -> None:
+        await self._registers.do("starting the stream", setup.long(reg.STREAM_ENABLE, 1))
+
+    async def _spontaneous(self) -> AsyncGenerator[list[Block | Event]]:
+        label = self._registers.label
+        async with open_port(self._stream_address, self._clock, label=label) as stream:
+            await self._start()
+            while True:
+                try:
+                    async with asyncio.timeout(self._patience):
+                        received, at = await stream.read()
+                except TimeoutError as error:
+                    raise NoAnswerError(
+                        f"{label}: no samples for {self._patience:g} s from {self._stream_address}"
+                    ) from error
+                yield self._decoder.receive(received, at)
+
+    async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
+        await self._start()
+        silent_since = self._clock.now().monotonic_ns
+        read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
+        while True:
+            values, at = await self._registers.exchange(read)
+            packet = labjack.decode_response(values)
+            if len(packet.samples):
+                silent_since = at.monotonic_ns
+            elif (at.monotonic_ns - silent_since) * 1e-9 > self._patience:
+                raise NoAnswerError(
+                    f"{self._registers.label}: no samples for {self._patience:g} s in register"
+                    f" {reg.STREAM_DATA_CR}"
+                )
+            yield self._decoder.receive_response(packet, at)
+            if len(packet.samples) < labjack.MAX_CR_SAMPLES:
+                await asyncio.sleep(POLL_INTERVAL)
+
+
+class LabJackDriver:
+    """See :class:`daq.drivers.base.DriverType`."""
+
+    name = "labjack"
+    summary = "LabJack T7 or T8: analog inputs streamed over Ethernet, several sensors on one"
+    settings = LabJackSettings
+    shares_clock = True
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return uint16."""
+        return np.dtype(np.uint16)
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[LabJackSession]:
+        """Connect, identify, read the calibration and set the stream up."""
+        first = sensors[0]
+        settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
+        common = settings[first.name]
+        inputs = setup.inputs_of(sensors, settings)
+        stream_plan = setup.plan(common, inputs, first.sampling_rate)
+        names = ", ".join(repr(sensor.name) for sensor in sensors)
+        label = f"sensor {names} on {first.port}"
+        host, _, number = (first.port.partition("://")[2] or first.port).partition(":")
+        async with open_port(f"socket://{host}:{number or 502}", clock, label=label) as stream:
+            registers = Registers(stream)
+            product, identity = await setup.identify(registers, sensors)
+            await registers.stop_stream()
+            try:
+                for name, numbers in inputs.items():
+                    await setup.set_inputs(registers, numbers, settings[name], product)
+                rate = await setup.set_stream(registers, common, stream_plan, product)
+                calibrations = await setup.read_calibrations(registers, product)
+                information = tuple(
+                    replace(
+                        identity,
+                        sensor=name,
+                        sampling_rate=rate,
+                        details=setup.details_of(settings[name], numbers, calibrations),
+                    )
+                    for name, numbers in inputs.items()
+                )
+                decoder = StreamDecoder(
+                    {name: [reg.ain(n) for n in numbers] for name, numbers in inputs.items()},
+                    scan_list=stream_plan.scan_list,
+                    scan_rate=rate,
+                )
+                yield LabJackSession(
+                    registers,
+                    common,
+                    decoder,
+                    information=information,
+                    clock=clock,
+                    stream_address=f"socket://{host}:{common.stream_port}",
+                    packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
+                )
+            finally:
+                with contextlib.suppress(DeviceError, RemoteProtocolError):
+                    await registers.stop_stream()
+
+
+DRIVER = LabJackDriver()
