@@ -9,14 +9,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event
 from daq.protocols.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+    from collections.abc import AsyncGenerator, Iterator, Sequence
+    from types import TracebackType
 
     from daq.bench_model import Sensor
     from daq.clock import HostClock
@@ -40,29 +41,104 @@ class Connected:
 Item = Block | Event | Connected
 
 
-class Patience:
-    """How long the next block may take: twice what a block took so far."""
+class _Patience:
+    """How long the next block may take: twice as long as blocks took so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: float) -> None:
+        self.last = now
         self._longest = 0.0
-        self._last: float | None = None
+        self._begun = False
 
     @property
     def seconds(self) -> float:
         """From the last block on."""
-        if self._longest == 0.0:
-            return FIRST_PATIENCE
-        return max(LEAST_PATIENCE, 2 * self._longest)
+        return max(LEAST_PATIENCE, 2 * self._longest) if self._longest else FIRST_PATIENCE
 
     def block_came(self, now: float) -> None:
-        """Learn from a block; an old long interval is forgotten slowly."""
-        if self._last is not None:
-            self._longest = max(0.98 * self._longest, now - self._last, 1e-6)
-        self._last = now
+        """Learn from a block; a long interval is forgotten slowly."""
+        if self._begun:
+            self._longest = max(0.98 * self._longest, now - self.last, 1e-6)
+        self._begun, self.last = True, now
 
-    def is_over(self, now: float) -> bool:
-        """Return whether a block is overdue."""
-        return self._last is not None and now - self._last > self.seconds
+
+class _Watch:
+    """Interrupts who waits for a block, when that is overdue.
+
+    One look every ``TICK`` instead of one timer a block; and when the event loop itself was held
+    up, nobody's device is to blame.
+    """
+
+    TICK = 0.1
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._loop = asyncio.get_running_loop()
+        now = self._loop.time()
+        self._whole = _Patience(now)
+        self._each = {name: _Patience(now) for name in names}
+        self._stalled: set[str] = set()
+        self._timeout = asyncio.timeout(None)
+        self._is_waiting = False
+        self._last_look = now
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def seconds(self) -> float:
+        """How long a block may take."""
+        return self._whole.seconds
+
+    async def __aenter__(self) -> Self:
+        await self._timeout.__aenter__()
+        self._timer = self._loop.call_later(self.TICK, self._look)
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        await self._timeout.__aexit__(kind, error, trace)
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Interrupt only what happens within."""
+        self._is_waiting = True
+        try:
+            yield
+        finally:
+            self._is_waiting = False
+
+    def block_came(self, sensor: str) -> None:
+        """Take note of a block."""
+        now = self._loop.time()
+        self._whole.block_came(now)
+        self._each[sensor].block_came(now)
+        self._stalled.discard(sensor)
+
+    def newly_stalled(self) -> list[str]:
+        """Return the sensors that are overdue while others on the port go on, each once."""
+        now = self._loop.time()
+        late = [
+            name
+            for name, patience in self._each.items()
+            if name not in self._stalled and now - patience.last > patience.seconds
+        ]
+        self._stalled.update(late)
+        return late
+
+    def _look(self) -> None:
+        now = self._loop.time()
+        held_up = now - self._last_look > 2 * self.TICK
+        self._last_look = now
+        if held_up or not self._is_waiting:
+            for patience in (self._whole, *self._each.values()):
+                patience.last = max(patience.last, now - patience.seconds / 2)
+        elif now - self._whole.last > self._whole.seconds:
+            self._timeout.reschedule(now)
+            return
+        self._timer = self._loop.call_later(self.TICK, self._look)
 
 
 class Connection:
@@ -78,11 +154,12 @@ class Connection:
         self.connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Done when the first session is open, or could not be opened."""
         self.alive = False
+        self._delay = FIRST_DELAY
         self._clock = clock
 
     async def run(self, queue: asyncio.Queue[Item], go: asyncio.Event) -> None:
         """Connect once, wait for ``go``, then read until cancelled, reconnecting if need be."""
-        reason, said, delay = "", "", FIRST_DELAY
+        reason, said = "", ""
         while True:
             try:
                 async with self.driver.open(self.sensors, self._clock) as session:
@@ -95,9 +172,7 @@ class Connection:
                         text = self._describe(session, name)
                         await queue.put(Event(name, "connected", text, self._clock.now()))
                     self.alive = True
-                    async for item in self._items(session):
-                        delay = FIRST_DELAY
-                        await queue.put(item)
+                    await self._forward(session, queue)
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
             except (DeviceError, RemoteProtocolError) as error:
                 failure = error
@@ -118,40 +193,34 @@ class Connection:
                 for name in self.names:
                     await queue.put(Event(name, kind, said, self._clock.now()))
             self.alive = False
-            await asyncio.sleep(delay)
-            delay = min(2 * delay, LONGEST_DELAY)
+            await asyncio.sleep(self._delay)
+            self._delay = min(2 * self._delay, LONGEST_DELAY)
 
-    async def _items(self, session: Session) -> AsyncIterator[Block | Event]:
-        """Yield what the session does, and raise if nothing comes for too long."""
-        loop = asyncio.get_running_loop()
-        patience = {name: Patience() for name in self.names}
-        stalled: set[str] = set()
-        whole = Patience()
+    async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
+        """Hand on what the session yields; raise if nothing comes for too long."""
+        watch = _Watch(self.names)
         async with contextlib.aclosing(_generator(session)) as items:
-            while True:
-                deadline = whole.seconds
-                try:
-                    async with asyncio.timeout(deadline):
-                        item = await anext(items)
-                except StopAsyncIteration:
-                    return
-                except TimeoutError as error:
-                    if isinstance(error, DeviceError):
-                        raise
-                    raise NoAnswerError(
-                        f"{self.port}: stalled: nothing came for {deadline:.2g} s"
-                    ) from error
-                now = loop.time()
-                if isinstance(item, Block):
-                    whole.block_came(now)
-                    patience[item.sensor].block_came(now)
-                    stalled.discard(item.sensor)
-                yield item
-                # One of several devices on a port: its driver looks after it; here it is said.
-                for name in self.names:
-                    if name not in stalled and patience[name].is_over(now):
-                        stalled.add(name)
-                        yield Event(name, "stalled", "others on the port go on", self._clock.now())
+            try:
+                async with watch:
+                    while True:
+                        with watch.waiting():
+                            item = await anext(items, None)
+                        if item is None:
+                            return
+                        if isinstance(item, Block):
+                            watch.block_came(item.sensor)
+                            self._delay = FIRST_DELAY
+                        await queue.put(item)
+                        for name in watch.newly_stalled():
+                            # One of several on a port: its driver looks after it; here it is said.
+                            text = "others on the port go on"
+                            await queue.put(Event(name, "stalled", text, self._clock.now()))
+            except TimeoutError as error:
+                if isinstance(error, DeviceError):
+                    raise
+                raise NoAnswerError(
+                    f"{self.port}: stalled: no block for {watch.seconds:.2g} s"
+                ) from error
 
     def _check_identity(self, session: Session) -> None:
         """Refuse another device than the bench file names, or than was there before."""

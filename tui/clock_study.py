@@ -104,14 +104,14 @@ def synthesise(
         n_blocks = int((duration - begin) * layout.sampling_rate) // length
         ends = scenario.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
         arrivals = latency.arrivals(ends, rng)
-        for each in _blocks(scenario, layout, length=length, arrivals=arrivals):
+        for each in _blocks(scenario, layout, length=length, arrivals=arrivals, instants=instants):
             writer.append(each)
     writer.close()
     return Path(path)
 
 
 def _blocks(
-    scenario: Scenario, layout: SensorLayout, *, length: int, arrivals: FloatArray
+    scenario: Scenario, layout: SensorLayout, *, length: int, arrivals: FloatArray, instants: bool
 ) -> Iterator[Block]:
     """Yield the blocks of one sensor, each `length` samples, that arrive then (world seconds)."""
     arrivals_ns = np.round(arrivals * 1e9).astype(np.int64).tolist()
@@ -130,7 +130,7 @@ def _blocks(
                 counts[rows],
                 HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
                 flags=BlockFlag.NONE if first + number else BlockFlag.CLOCK_RESTART,
-                instants_ns=taken[rows] if layout.polled else None,
+                instants_ns=taken[rows] if instants else None,
             )
 
 
