@@ -40,6 +40,8 @@ SHOWN = slice(5, 901)
 """0.5 to 90 Hz."""
 BANDS = ((2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, 80.0))
 WAVE_BANDS = (*BANDS[:4], (45.0, 55.0))
+AT_ONCE, PIECES = 4000, 12
+"""Samples simulated at a time, and how many times before they are transformed."""
 FINE = 8
 """Points of the true spectrum per bin, where the window smooths it."""
 REACH = 3
@@ -98,16 +100,18 @@ def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None
     spectra = CrossSpectra(HANN, 3 * len(scenario.names))
     length, hop = HANN.segment_length, HANN.hop
     n_samples = round(duration * HANN.sampling_rate)
-    at_once = 40 * hop
-    kept = np.empty((0, spectra.n_channels))
-    for first in range(0, n_samples, at_once):
-        n = min(at_once, n_samples - first)
+    kept: list[FloatArray] = []
+    for first in range(0, n_samples, AT_ONCE):
+        n = min(AT_ONCE, n_samples - first)
+        # all sensors in turn: they share the waves' spectra, and only the last two are kept
         samples = [scenario.samples(name, first, n) for name in scenario.names]
-        kept = np.concatenate([kept, np.concatenate(samples, axis=1)])
-        starts = np.arange(0, len(kept) - length + 1, hop)
-        spectra.add(kept, starts)
-        kept = kept[len(starts) * hop :]
-        told((first + n) / n_samples)
+        kept.append(np.concatenate(samples, axis=1))
+        if len(kept) == PIECES or first + n == n_samples:
+            together = np.concatenate(kept)
+            starts = np.arange(0, len(together) - length + 1, hop)
+            spectra.add(together, starts)
+            kept = [together[len(starts) * hop :]]
+            told((first + n) / n_samples)
     return Measured(
         scenario=scenario,
         csm=spectra.csm()[SHOWN],
