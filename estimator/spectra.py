@@ -127,17 +127,9 @@ class CrossSpectra:
         """
         samples = np.asarray(samples, dtype=np.float64)
         starts = np.asarray(starts, dtype=np.int64)
-        if samples.ndim != 2 or samples.shape[1] != self.n_channels:
-            raise EstimatorError(
-                f"samples of shape {samples.shape}, expected (n_samples, {self.n_channels})"
-            )
+        self.check(samples, starts)
         if starts.size == 0:
             return
-        last = len(samples) - self.settings.segment_length
-        if starts.ndim != 1 or starts.min() < 0 or starts.max() > last:
-            raise EstimatorError(
-                f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
-            )
         workers = min(THREADS, -(-len(starts) // self._block))
         if workers == 1:
             self._sum += self._total(samples, starts)
@@ -148,6 +140,20 @@ class CrossSpectra:
                 ):
                     self._sum += total
         self.n_segments += len(starts)
+
+    def check(self, samples: FloatArray, starts: IntArray) -> None:
+        """Raise what `add` would raise, and add nothing."""
+        if samples.ndim != 2 or samples.shape[1] != self.n_channels:
+            raise EstimatorError(
+                f"samples of shape {samples.shape}, expected (n_samples, {self.n_channels})"
+            )
+        last = len(samples) - self.settings.segment_length
+        if starts.ndim != 1:
+            raise EstimatorError(f"starts of shape {starts.shape}, expected one row a segment")
+        if starts.size and (starts.min() < 0 or starts.max() > last):
+            raise EstimatorError(
+                f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
+            )
 
     def _total(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
         """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels)."""
