@@ -80,6 +80,7 @@ class _Source:
     runs: list[_Run] = field(default_factory=list)
     n_blocks: int = 0
     device_utc: bool = False
+    polled: bool = False
     clock: Clock | None = None
     learnt: list[_Learnt] = field(default_factory=list)
     frame_delay: float = 0.0
@@ -98,6 +99,7 @@ class _Source:
             return
         if self.n_blocks == 0:
             self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
+            self.polled = self.record.polled
         self.arrivals.add(blocks)
         first = blocks["first_sample"].astype(np.int64)
         length = blocks["n_samples"].astype(np.int64)
@@ -239,7 +241,7 @@ class AlignedRecording:
         seen = {_clock_name(self._sources[reference])}
         free = []
         for number, source in enumerate(self._sources):
-            stated = source.device_utc or source.record.polled
+            stated = source.device_utc or source.polled
             if not stated and _clock_name(source) not in seen:
                 free.append(number)
                 seen.add(_clock_name(source))
@@ -331,7 +333,7 @@ class AlignedRecording:
         for source in self._sources:
             width = len(source.columns)
             if self._passes(source):
-                part, present = self._read_source(source, start, stop)
+                part, present = self._pass_through(source, start, stop)
             else:
                 part, present = self._read_source(source, first, last)
                 part = part[start - first : stop - first]
@@ -341,7 +343,25 @@ class AlignedRecording:
             column += width
         return samples, valid
 
+    def _pass_through(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        """Return samples that fall on the grid, as they are."""
+        second = np.array([(self._start or 0.0) + start / self.sampling_rate])
+        samples = np.zeros((stop - start, len(source.columns)))
+        valid = np.zeros(stop - start, dtype=bool)
+        for epoch in _known(source).epochs:
+            first = round(float(epoch.position(second)[0]))
+            low = max(first, epoch.first_sample)
+            high = min(first + stop - start, epoch.end_sample)
+            if low < high:
+                part, present = source.read(low, high)
+                if high - low == stop - start:
+                    return part, present
+                samples[low - first : high - first][present] = part[present]
+                valid[low - first : high - first] |= present
+        return samples, valid
+
     def _read_source(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        """Return samples interpolated on the grid."""
         seconds = (self._start or 0.0) + np.arange(start, stop) / self.sampling_rate
         samples = np.zeros((stop - start, len(source.columns)))
         valid = np.zeros(stop - start, dtype=bool)
@@ -350,10 +370,7 @@ class AlignedRecording:
             if epoch.end < seconds[0] or epoch.start > seconds[-1]:
                 continue
             positions = epoch.position(seconds)
-            whole = ratio == 1.0 and self._passes(source)
-            if whole:
-                positions = np.round(positions[0]) + np.arange(len(positions))
-            margin = 0 if whole else reach(ratio)
+            margin = reach(ratio)
             low = math.floor(positions[0]) - margin
             high = math.ceil(positions[-1]) + margin + 1
             inputs, present = source.read(low, high)
@@ -369,7 +386,7 @@ class AlignedRecording:
     def _set_clocks(self) -> None:
         sources = self._sources
         together = len({_clock_name(source) for source in sources}) == 1 and not any(
-            source.device_utc or source.record.polled for source in sources
+            source.device_utc or source.polled for source in sources
         )
         if together and len({source.record.sampling_rate for source in sources}) == 1:
             for source in sources:
@@ -385,7 +402,7 @@ class AlignedRecording:
         for source in [reference, *sources]:
             name = source.record.name
             known = solved.get(_clock_name(source))
-            if source.record.polled:
+            if source.polled:
                 source.clock = self._polled(source)
             elif known is None or source.device_utc:
                 measured = None if source is reference else _measured(source, _known(reference))

@@ -151,8 +151,9 @@ class DelayMeter:
         """Spectra of shape (n_freqs, n_segments, n_channels)."""
         length = len(self.window)
         frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
-        frames = (frames - frames.mean(axis=-1, keepdims=True)) * self.window
-        spectra = scipy.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1]
+        frames -= frames.mean(axis=-1, keepdims=True)
+        frames *= self.window
+        spectra = scipy.fft.rfft(frames, axis=-1, overwrite_x=True)[:, :, 1 : len(self.omega) + 1]
         return np.ascontiguousarray(spectra.transpose(2, 0, 1))
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
