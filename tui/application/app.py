@@ -195,7 +195,7 @@ class HuddleApp(App[None]):
         self.query_one("#progress", Static).update(
             view.progress_line(snapshot, settings, self.choice, width=self.size.width - 2)
         )
-        self.query_one("#advice", Static).update(view.advice(snapshot, settings, self.choice))
+        self.query_one("#advice", Static).update(view.advice(snapshot, self.choice))
 
     def _status(self) -> Text:
         snapshot = self.snapshot

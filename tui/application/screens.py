@@ -24,8 +24,8 @@ KEYS = (
 READING = (
     "Grey is what the channel recorded, in colour what is its own noise; the shade around it is "
     "the 95 % interval and closes in as segments come. ▾ marks frequencies where the estimate "
-    "came out negative: its upper bound, or the floor. c.o.v. is the scatter of one frequency's estimate, "
-    "relative, in the worst channel."
+    "came out negative: its upper bound, or the floor. c.o.v. is the relative scatter of the "
+    "estimate at one frequency, in the worst channel."
 )
 
 

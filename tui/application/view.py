@@ -171,7 +171,7 @@ def progress_line(snapshot: Snapshot, settings: Settings, choice: Choice, *, wid
     return line
 
 
-def advice(snapshot: Snapshot, settings: Settings, choice: Choice) -> Text:
+def advice(snapshot: Snapshot, choice: Choice) -> Text:
     """Return one line on what to know about what is shown."""
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
     if refused:
