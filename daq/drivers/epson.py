@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveFloat, field_validator
 
+from daq.bench import Channel, Sensor
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, DeviceError, NoAnswerError, WrongDeviceError
 from daq.protocols import epson
@@ -26,7 +27,6 @@ from daq.transport import open_port
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Sequence
 
-    from daq.bench import Sensor
     from daq.clock import HostClock
     from daq.protocols.block import Block, Event
     from daq.transport import ByteStream
@@ -204,13 +204,13 @@ class _Device:
                     async with asyncio.timeout(QUIET):
                         await self._stream.read()
 
-    async def identify(self) -> None:
+    async def identify(self, attempts: int = ATTEMPTS) -> None:
         """Find the device, streaming or not, in the middle of a command or not."""
         failure: DeviceError | None = None
-        for _ in range(ATTEMPTS):
+        for _ in range(attempts):
             await self.stop()
             try:
-                found = await self.read(epson.ID)
+                found = await self._read(epson.ID)
             except (NoAnswerError, WrongDeviceError) as error:
                 failure = error
                 await self._stream.write(bytes([epson.DELIMITER]))
@@ -329,6 +329,29 @@ class EpsonSession:
             patience = STALLED
             for item in decoder.receive(received, at):
                 yield item
+
+
+async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInformation:
+    """Ask whether an Epson accelerometer is on a port, and which; it is left quiet.
+
+    Raises
+    ------
+    DeviceError
+        None is there.
+    """
+    anyone = Sensor(
+        name="found",
+        driver="epson",
+        port=port,
+        sampling_rate=200.0,
+        channels=(Channel(name="x", sensitivity=epson.COUNTS_PER_UNIT),),
+    )
+    label = f"port {port} at {baud_rate} baud"
+    async with open_port(port, clock, label=label, baud_rate=baud_rate) as stream:
+        device = _Device(anyone, stream)
+        await device.identify(attempts=2)
+        information = await device.information()
+        return replace(information, sampling_rate=await device.sampling_rate())
 
 
 class EpsonDriver:

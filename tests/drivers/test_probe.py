@@ -1,0 +1,108 @@
+"""What ``huddle check`` learns about devices."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from daq.bench import parse
+from daq.clock import SystemClock
+from daq.errors import NotConnectedError
+from daq.probe import discover, probe, probe_bench
+from sim_devices import launch
+from tests.sim_devices.bench import device, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sim_devices.launch import RunningDevice
+
+SPEED = 4.0
+RATE = 50.0
+POLLED: dict[str, Any] = device(
+    "P",
+    "registers",
+    sampling_rate=RATE,
+    settings={"preset": "witmotion"},
+    channels={"P": [{"name": axis, "sensitivity": 2e5} for axis in "xyz"]},
+)
+TABLES = [device("A", serial_number="A0000007"), POLLED]
+CLOCK = SystemClock(SPEED)
+FAULTS = [
+    {"kind": "dead", "at": 0.0, "duration": 1e6, "channel": 1, "sensors": ["A"]},
+    {"kind": "clip", "at": 0.0, "duration": 1e6, "channel": 2, "sensors": ["A"], "level": 100.0},
+]
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    world = spec(*TABLES, speed=SPEED, sampling_rate=RATE)
+    world["scenario"]["sensors"]["A"]["sampling_rate"] = 200.0
+    with launch.start(world | {"faults": FAULTS}) as devices:
+        yield devices
+
+
+async def test_a_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
+    (check,) = await probe(sensors(running[0], TABLES[0]), CLOCK)
+    assert check.information.serial_number == "A0000007"
+    assert check.n_samples >= 200
+    assert check.n_missing == 0
+    assert check.measured_rate == pytest.approx(200, rel=0.1)
+    x, y, z, temperature = check.channels
+    assert 0.5e-3 < x.rms < 20e-3  # white motion of 1e-6 (m/s²)²/Hz
+    assert not x.is_stuck
+    assert y.is_stuck
+    assert (y.mean, y.rms) == (0, 0)
+    assert z.largest == pytest.approx(100 / TABLES[0]["channels"]["A"][2]["sensitivity"])
+    assert temperature.mean == pytest.approx(2634, abs=140)
+    assert not temperature.is_stuck
+    assert check.jitter is None
+
+
+async def test_polling_leaves_so_much_bandwidth(running: tuple[RunningDevice, ...]) -> None:
+    chosen = sensors(running[1], TABLES[1], settings={"preset": "witmotion"})
+    (check,) = await probe(chosen, CLOCK, duration=2.0)
+    assert check.bandwidth is not None
+    assert 2 < check.bandwidth <= RATE / 2 * 1.1
+    assert check.jitter is not None
+    assert 0 < check.jitter < 0.1
+    assert check.signal_to_noise_db is not None
+
+
+async def test_ports_in_trouble_do_not_hide_the_others(running: tuple[RunningDevice, ...]) -> None:
+    bench = parse(
+        f"""
+        name = "bench"
+        sampling_rate = 200.0
+
+        [[sensors]]
+        name = "A"
+        driver = "epson"
+        port = "{running[0].port}"
+        channels = [{{name = "x", sensitivity = 1.7e6}}]
+
+        [[sensors]]
+        name = "B"
+        driver = "epson"
+        port = "/dev/ttyNotThere"
+        channels = [{{name = "x", sensitivity = 1.7e6}}]
+        """,
+        "bench.toml",
+        check=False,  # two sensors are no huddle test, and need be none here
+    )
+    found, errors = await probe_bench(bench, CLOCK, duration=0.1)
+    assert [check.information.sensor for check in found] == ["A"]
+    assert ["'B' on /dev/ttyNotThere" in str(error) for error in errors] == [True]
+
+
+async def test_what_is_on_a_port(running: tuple[RunningDevice, ...]) -> None:
+    (accelerometer,) = await discover(running[0].port, CLOCK)
+    assert (accelerometer.driver, accelerometer.settings) == ("epson", {"baud_rate": 460800})
+    assert accelerometer.information is not None
+    assert accelerometer.information.model == "A352AD10"
+    (slave,) = await discover(running[1].port, CLOCK, baud_rates=[9600], device_ids=[7, 0x50])
+    assert (slave.driver, slave.settings) == ("registers", {"device_id": 0x50, "baud_rate": 9600})
+    assert slave.remark == "answers, and has no register 0"
+    with pytest.raises(NotConnectedError, match="there is no such port"):
+        await discover("/dev/ttyNotThere", CLOCK)
