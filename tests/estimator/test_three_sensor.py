@@ -10,6 +10,7 @@ import pytest
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError, UnknownMethodError
 from estimator.methods import METHODS, Flag, SelfNoise, self_noise
+from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.three_channel import three_channel
 from estimator.three_sensor import three_sensor
 from tests.estimator.models import (
@@ -156,6 +157,35 @@ def test_uncorrected_bias_is_minus_d_over_n(d: int) -> None:
     relative = found.noise_psd / noise_psd
     error = relative.std(axis=0) / np.sqrt(len(sample))
     assert np.all(np.abs(relative.mean(axis=0) - 1 + d / 20) < 4.5 * error)
+
+
+@pytest.mark.parametrize("overlap", [0.5, 0.75])
+def test_overlapping_segments_are_worth_n_effective_for_the_bias_too(overlap: float) -> None:
+    # method.md: d = 3, 20 segments, Hann, 75 %: -0.273 uncorrected, -0.281 predicted
+    settings = WelchSettings(1.0, 64, overlap)
+    rng = np.random.default_rng(4)
+    turn = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)]
+    length, draws = 64 + 19 * settings.hop, 400
+    relative: list[float] = []
+    uncorrected: list[float] = []
+    for _ in range(draws):
+        motion = 10 * rng.standard_normal((length, 3))
+        samples = np.hstack([motion @ q for q in turn]) + rng.standard_normal((length, 9))
+        spectra = CrossSpectra(settings, 9)
+        spectra.add(samples, np.arange(20) * settings.hop)
+        for correct, results in ((True, relative), (False, uncorrected)):
+            found = three_sensor(
+                spectra.csm()[2:-2], dims=(3,) * 3, n_effective=spectra.n_effective, correct=correct
+            )
+            results.append(float(found.noise_psd.mean()) / 2)
+    error = np.std(relative) / np.sqrt(draws)
+    assert error < 0.01
+    # two sides of the same: what is left is of order (d / n_eff)**2
+    left = (3 / spectra.n_effective) ** 2
+    assert abs(np.mean(relative) - 1) < 4 * error + left / 2
+    assert np.mean(uncorrected) - 1 == pytest.approx(
+        -3 / spectra.n_effective, abs=4 * error + left / 2
+    )
 
 
 def test_intervals_hold_where_estimates_come_out_negative() -> None:

@@ -1,0 +1,238 @@
+"""Long segments for low frequencies, short ones for high frequencies, in one pass.
+
+The samples pass down a ladder of stages, each at half the sampling rate of the one above. All
+stages cut segments of the same number of samples, so that each is twice as long in time, and has
+half as many averages, as the one above. Of its spectrum a stage contributes the octave from 0.2 to
+0.4 of its rate; the top stage goes up to half, the bottom one down to 0. The filter between stages
+lets nothing through that would fold into what is used; what it does to the octave itself is divided
+out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.methods import self_noise
+from estimator.self_noise import SelfNoise
+from estimator.spectra import CrossSpectra, WelchSettings
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray
+
+LOW, HIGH = 0.2, 0.4  # of its own rate: the octave that a stage contributes
+TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down
+KAISER_BETA = 12.3
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """What one stage contributes.
+
+    Attributes
+    ----------
+    settings : WelchSettings
+        Those of the stage, with its own sampling rate.
+    frequencies : float64, shape (n_freqs,)
+        In Hz, ascending.
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided, in unit**2/Hz.
+    n_segments : int
+    n_effective : float
+    """
+
+    settings: WelchSettings
+    frequencies: FloatArray
+    csm: ComplexArray
+    n_segments: int
+    n_effective: float
+
+
+class MultiResolution:
+    """Cross-spectra of samples that come in order, octave by octave.
+
+    Parameters
+    ----------
+    settings : WelchSettings
+        Those of the top stage: the shortest segments.
+    n_channels : int
+    n_stages : int
+        How many; the longest segments are ``2**(n_stages - 1)`` times as long as the shortest.
+    """
+
+    def __init__(self, settings: WelchSettings, n_channels: int, *, n_stages: int) -> None:
+        if n_stages < 1:
+            raise EstimatorError(f"{n_stages} stages: at least one is needed")
+        if settings.segment_length < 16:
+            raise EstimatorError(
+                f"segment length {settings.segment_length}: an octave needs 16 samples or more"
+            )
+        self._stages = [
+            _Stage(replace(settings, sampling_rate=settings.sampling_rate / 2**level), n_channels)
+            for level in range(n_stages)
+        ]
+
+    def add(self, samples: FloatArray, complete: BoolArray | None = None) -> None:
+        """Take the next samples.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+            Those that follow the ones before, gaps included.
+        complete : bool, shape (n_samples,), optional
+            False where any sensor has a gap; what stands there is not used.
+        """
+        samples = np.array(samples, dtype=np.float64)
+        if complete is None:
+            complete = np.ones(len(samples), dtype=bool)
+        self._stages[0].spectra.check(samples, np.zeros(0, dtype=np.int64))
+        if complete.shape != samples.shape[:1]:
+            raise EstimatorError(
+                f"completeness of shape {complete.shape}, expected {samples.shape[:1]}"
+            )
+        samples[~complete] = 0  # might be NaN, which would spread through the filter
+        for stage in self._stages:
+            stage.take(samples, complete)
+            if stage is not self._stages[-1]:
+                samples, complete = stage.halve(samples, complete)
+
+    def bands(self, least_effective: float = 1.0) -> tuple[Band, ...]:
+        """Return what the stages contribute, from the lowest frequencies up.
+
+        Parameters
+        ----------
+        least_effective : float
+            Stages with fewer effective averages than this are left out; the lowest of the
+            others then goes down to 0 in their stead.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no stage has as many.
+        """
+        used = [s for s in self._stages if s.spectra.n_effective >= max(least_effective, 1.0)]
+        if not used:
+            raise InsufficientDataError(
+                f"no segment length has {least_effective:g} effective averages yet"
+            )
+        bands = []
+        for level in reversed(range(len(used))):
+            stage = used[level]
+            frequencies = stage.settings.frequencies
+            rate = stage.settings.sampling_rate
+            inside = np.ones(len(frequencies), dtype=bool)
+            if level > 0:
+                inside &= frequencies <= HIGH * rate
+            if level < len(used) - 1:
+                inside &= frequencies > LOW * rate
+            gain = np.prod(
+                [_response(frequencies[inside], above.settings) for above in used[:level]], axis=0
+            )
+            csm = stage.spectra.csm()[inside] / np.reshape(gain, (-1, 1, 1)) ** 2
+            bands.append(
+                Band(
+                    stage.settings,
+                    frequencies[inside],
+                    csm,
+                    stage.spectra.n_segments,
+                    stage.spectra.n_effective,
+                )
+            )
+        return tuple(bands)
+
+
+def self_noise_by_band(
+    method: str,
+    bands: tuple[Band, ...],
+    *,
+    dims: tuple[int, ...],
+    correct: bool = True,
+    **options: Any,  # noqa: ANN401 - each method's own
+) -> tuple[FloatArray, SelfNoise]:
+    """Self-noise PSD over all bands, each with its own number of averages.
+
+    Parameters
+    ----------
+    method, dims, correct, **options
+        As `estimator.methods.self_noise` takes them.
+    bands : tuple of Band
+        As `MultiResolution.bands` returns them.
+
+    Returns
+    -------
+    frequencies : float64, shape (n_freqs,)
+        Of all bands, ascending.
+    SelfNoise
+        At these frequencies.
+    """
+    results = [
+        self_noise(
+            method, band.csm, dims=dims, n_effective=band.n_effective, correct=correct, **options
+        )
+        for band in bands
+    ]
+    joined = (
+        np.concatenate([getattr(result, name) for result in results])
+        for name in ("noise_psd", "cov", "low", "high", "flags")
+    )
+    return np.concatenate([band.frequencies for band in bands]), SelfNoise(method, *joined)
+
+
+class _Stage:
+    """Cuts segments at one rate, and makes the samples of the next."""
+
+    def __init__(self, settings: WelchSettings, n_channels: int) -> None:
+        self.settings = settings
+        self.spectra = CrossSpectra(settings, n_channels)
+        self._samples = np.zeros((0, n_channels))  # those that the next segment begins with
+        self._complete = np.zeros(0, dtype=bool)
+        # before the first sample there is nothing: the filter begins inside a gap
+        self._tail = np.zeros((TAPS - 1, n_channels)), np.zeros(TAPS - 1, dtype=bool)
+
+    def take(self, samples: FloatArray, complete: BoolArray) -> None:
+        """Add the segments that these samples finish."""
+        self._samples = np.concatenate([self._samples, samples])
+        self._complete = np.concatenate([self._complete, complete])
+        n = (len(self._samples) - self.settings.segment_length) // self.settings.hop + 1
+        if n <= 0:
+            return
+        starts = np.arange(n) * self.settings.hop
+        missing = np.concatenate([[0], np.cumsum(~self._complete)])
+        whole = missing[starts + self.settings.segment_length] == missing[starts]
+        self.spectra.add(self._samples, starts[whole])
+        self._samples = self._samples[n * self.settings.hop :]
+        self._complete = self._complete[n * self.settings.hop :]
+
+    def halve(self, samples: FloatArray, complete: BoolArray) -> tuple[FloatArray, BoolArray]:
+        """Return what these samples add at half the rate."""
+        from scipy.signal import upfirdn  # noqa: PLC0415 - takes a second to import
+
+        samples = np.concatenate([self._tail[0], samples])
+        complete = np.concatenate([self._tail[1], complete])
+        n = max(0, (len(samples) - TAPS) // 2 + 1)
+        self._tail = samples[2 * n :], complete[2 * n :]
+        if n == 0:
+            return samples[:0], complete[:0]
+        filtered = upfirdn(_taps(), samples, down=2, axis=0)[TAPS // 2 : TAPS // 2 + n]
+        missing = np.concatenate([[0], np.cumsum(~complete)])
+        first = 2 * np.arange(n)
+        return np.asarray(filtered), missing[first + TAPS] == missing[first]
+
+
+def _taps() -> FloatArray:
+    """Half-band low-pass filter, of unit gain at 0 Hz."""
+    n = np.arange(TAPS) - TAPS // 2
+    taps = np.sinc(n / 2) * np.kaiser(TAPS, KAISER_BETA)
+    return np.asarray(taps / taps.sum())
+
+
+def _response(frequencies: FloatArray, settings: WelchSettings) -> FloatArray:
+    """Gain of the filter below a stage; real, as the filter is symmetric."""
+    n = np.arange(TAPS) - TAPS // 2
+    phase = 2 * np.pi * frequencies[:, None] / settings.sampling_rate * n
+    return np.asarray(np.cos(phase) @ _taps())
