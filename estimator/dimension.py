@@ -15,17 +15,19 @@ import numpy as np
 from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import max_factors, maximise, testable
-from estimator.likelihood import NOISE_SPREAD, alike, standard_error
-from estimator.model_test import BandTest, model_test, pool
+from estimator.likelihood import standard_error
+from estimator.model_test import HANN_HALF, BandTest, ModelTest, model_test, pool
+from estimator.prior import expected_noise, maximise_expecting
 
 if TYPE_CHECKING:
-    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-    from estimator.factor_analysis import Maximum
+    from estimator.arrays import ComplexArray, FloatArray, IntArray
 
 LEVEL = 0.05
 """A dimension is accepted when its pooled p value is above this. An unneeded factor costs
 precision, a missing one is a bias: one band in twenty pays rather than all risk it."""
 LEAST_BINS = 8
+MOST_BINS = 64
+"""Frequencies of a band that are tested: of more, every second, third, …"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,12 +162,13 @@ def choose_dimension(
     Notes
     -----
     Beyond ``max(dims)`` factors the likelihood carries the weak prior of
-    `estimator.likelihood.alike`, in the test as in the estimate. Three sensors are given
+    `estimator.prior`, in the test as in the estimate. Three sensors are given
     no more than ``max(dims)``: whatever one of them feels alone is noise to the other two, so
     further factors would take noise for motion; the test can only warn.
     """
     check_dims(dims)
-    matrix = testable(coherency(csm, dims))
+    given = coherency(csm, dims)
+    matrix = testable(given)
     if frequency.shape != (len(csm),):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
     if n_effective <= sum(dims):
@@ -177,23 +180,25 @@ def choose_dimension(
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number a frequency, never falling")
     most = _most_testable(sum(dims)) if len(dims) > 3 else min(max(dims), _most_testable(sum(dims)))
-    search = _Search(matrix, number, dims, n_effective, neighbours)
+    stride = {int(b): -(-int(np.sum(number == b)) // MOST_BINS) for b in np.unique(number)}
+    taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])
+    search = _Search(matrix[taken], given.psd[taken], number[taken], dims, n_effective)
+    r = HANN_HALF if neighbours is None else neighbours
     usual = max(dims)
-    open_bands = list(np.unique(number))
-    tried: dict[int, list[BandTest]] = {int(b): [] for b in open_bands}
-    fitted: dict[int, float] = {}
+    open_bands = list(stride)
+    tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
+    cov: dict[int, float] = {}
     usual_cov: dict[int, float] = {}
     for q in range(most + 1):
-        needed = open_bands if q != usual else list(tried)
-        maximum, rows = search.fit(q, needed)
-        for b in needed:
-            inside = number[rows] == b
-            if q == usual:
-                usual_cov[b] = search.cov(maximum, inside)
-            if b in open_bands:
-                tried[b].append(search.test(maximum, rows, b))
-                fitted[b] = search.cov(maximum, inside)
+        fit = search.fit(q, open_bands if q != usual else list(tried))
+        for b in open_bands:
+            distant = r[stride[b] - 1 :: stride[b]]
+            tried[b].append(pool(fit.test, fit.number == b, neighbours=distant))
+            cov[b] = fit.median_cov(b)
         open_bands = [b for b in open_bands if not tried[b][-1].p_value > level]
+        if q == usual:
+            usual_cov = {b: fit.median_cov(b) for b in tried}
+            search.expect(fit, open_bands)
         if not open_bands and q >= usual:
             break
     choices = tuple(
@@ -205,7 +210,7 @@ def choose_dimension(
             accepted=b not in open_bands,
             test=tests[-1],
             tried=tuple(tests),
-            cov=fitted[b],
+            cov=cov[b],
             usual_cov=usual_cov.get(b, float("nan")),
         )
         for b, tests in tried.items()
@@ -221,32 +226,60 @@ def _most_testable(n_channels: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
+class _Fit:
+    """One dimension in some bands; a row a frequency of these."""
+
+    number: IntArray
+    psi: FloatArray
+    cov: FloatArray
+    test: ModelTest
+
+    def median_cov(self, band: int) -> float:
+        """Median c.o.v. in one band, infinite where the noise is undetermined; NaN for none."""
+        known = self.cov[(self.number == band) & np.isfinite(self.psi).all(axis=1)]
+        return float(np.median(np.nan_to_num(known, nan=np.inf))) if len(known) else float("nan")
+
+
 class _Search:
     """The averages in their bands, and how one dimension does in some of these."""
 
-    matrix: ComplexArray
-    number: IntArray
-    dims: tuple[int, ...]
-    n_effective: float
-    neighbours: FloatArray | None
+    def __init__(
+        self,
+        matrix: ComplexArray,
+        psd: FloatArray,
+        number: IntArray,
+        dims: tuple[int, ...],
+        n_effective: float,
+    ) -> None:
+        self._matrix = matrix
+        self._psd = psd
+        self._number = number
+        self._dims = dims
+        self._n_effective = n_effective
+        self._expected = 1 / psd  # in units of the coherency matrix
 
-    def fit(self, q: int, some: list[int]) -> tuple[Maximum, IntArray]:
-        """Maximise the likelihood of q factors in some bands; the rows of these."""
-        rows = np.flatnonzero(np.isin(self.number, some))
-        penalty = None
-        if q > max(self.dims):
-            penalty = alike(self.dims, NOISE_SPREAD, self.n_effective)
-        return maximise(self.matrix[rows], q, penalty=penalty), rows
+    def fit(self, q: int, some: list[int]) -> _Fit:
+        """Maximise the likelihood of q factors in some bands."""
+        rows = np.flatnonzero(np.isin(self._number, some))
+        if q <= max(self._dims):
+            maximum = maximise(self._matrix[rows], q)
+        else:
+            maximum = maximise_expecting(
+                self._matrix[rows],
+                q,
+                self._expected[rows],
+                dims=self._dims,
+                n_effective=self._n_effective,
+            )
+        error = standard_error(maximum, n_effective=self._n_effective)
+        return _Fit(
+            number=self._number[rows],
+            psi=maximum.psi,
+            cov=error / maximum.psi,
+            test=model_test(maximum, n_effective=self._n_effective),
+        )
 
-    def test(self, maximum: Maximum, rows: IntArray, band: int) -> BandTest:
-        """Pool the model test over one band."""
-        whole = model_test(maximum, n_effective=self.n_effective)
-        return pool(whole, self.number[rows] == band, neighbours=self.neighbours)
-
-    def cov(self, maximum: Maximum, inside: BoolArray) -> float:
-        """Median c.o.v. of the noise at one frequency of a band; NaN if there is none."""
-        if (maximum.singular | ~inside).all():
-            return float("nan")
-        cov = standard_error(maximum, n_effective=self.n_effective) / maximum.psi
-        known = cov[inside & ~maximum.singular]
-        return float(np.median(np.where(np.isfinite(known), known, np.inf)))
+    def expect(self, fit: _Fit, open_bands: list[int]) -> None:
+        """Take the noise of the bands that are explained for what to expect of the others."""
+        usual = ~np.isin(self._number, open_bands)
+        self._expected = expected_noise(fit.psi * self._psd, usual, self._dims) / self._psd

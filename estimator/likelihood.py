@@ -10,13 +10,12 @@ from estimator import fisher
 from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError
 from estimator.factor_analysis import Maximum, max_factors, maximise
+from estimator.prior import NOISE_SPREAD, expected_noise, maximise_expecting
 from estimator.self_noise import Flag, SelfNoise
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
     from estimator.coherency import Coherency
-
-NOISE_SPREAD = 0.5
 
 
 def maximum_likelihood(
@@ -45,9 +44,10 @@ def maximum_likelihood(
     n_factors : int or int64, shape (n_freqs,), optional
         Dimension of the common motion; ``max(dims)`` by default, `estimator.dimension` finds it.
     noise_spread : float
-        Only where `n_factors` exceeds ``max(dims)``: standard deviation of ln psi among the
-        channels of one number in their sensors, expected beforehand. There the matrix alone
-        may not tell their noise apart (see `alike`).
+        Only where `n_factors` exceeds ``max(dims)``: standard deviation of ln psi expected
+        beforehand among like channels, about the ratios at frequencies of fewer factors. There
+        the matrix alone may not tell their noise apart, and c.o.v. and interval rest on this
+        (see `estimator.prior`).
 
     Returns
     -------
@@ -96,11 +96,18 @@ def maximum_likelihood(
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
     for q in np.unique(factors[~few]):
         here = np.flatnonzero((factors == q) & ~few)
-        maximum = maximise(
-            matrix[here],
-            int(q),
-            penalty=alike(dims, noise_spread, n_effective) if q > max(dims) else None,
-        )
+        if q <= max(dims):
+            maximum = maximise(matrix[here], int(q))
+        else:  # np.unique rises: what was usual has been fitted
+            expected = expected_noise(noise_psd * given.psd, factors <= max(dims), dims)
+            maximum = maximise_expecting(
+                matrix[here],
+                int(q),
+                expected[here] / given.psd[here],
+                dims=dims,
+                n_effective=n_effective,
+                spread=noise_spread,
+            )
         psi = np.where(maximum.boundary, 0.0, maximum.psi)
         error = standard_error(maximum, n_effective=n_effective)
         cov[here] = np.where(maximum.boundary, np.nan, error / maximum.psi)
@@ -133,33 +140,6 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
     i = np.arange(p)
     matrix[:, i, i] += absent
     return matrix, absent
-
-
-def alike(dims: tuple[int, ...], spread: float, n_effective: float) -> FloatArray:
-    """Return the penalty, shape (n_channels, n_channels), that keeps like channels alike.
-
-    Parameters
-    ----------
-    dims : tuple of int
-        Channels of each sensor; the first channels of all sensors are alike, and so on.
-    spread : float
-        Standard deviation of their ln psi.
-    n_effective : float
-        Averages.
-
-    Notes
-    -----
-    With gradients of the motion among the factors, sensors that point the same way see three
-    problems of N channels and three factors (the motion of one direction and its two
-    gradients) that do not mix. For five sensors the information on their noise then has rank
-    three: their mean is known, how it divides among them is not, and maximum likelihood
-    arbitrarily runs to zero in one or other channel. A prior as weak as `spread` = 0.5 (a
-    factor of 1.6) takes that freedom away and does nothing where the averages say more than it:
-    it counts as much as 4 of them.
-    """
-    position = np.concatenate([np.arange(d) for d in dims])
-    same = (position[:, None] == position[None, :]).astype(np.float64)
-    return np.asarray((np.eye(len(position)) - same / same.sum(axis=1)) / (spread**2 * n_effective))
 
 
 def small_sample_correction(maximum: Maximum, *, n_effective: float) -> FloatArray:

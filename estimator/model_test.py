@@ -183,7 +183,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
     so they are correlated by ``r_h**2`` themselves. The sum is taken as a multiple of a
     chi-square of the same mean and variance (Satterthwaite).
     """
-    r = _HANN_HALF if neighbours is None else neighbours
+    r = HANN_HALF if neighbours is None else neighbours
     taken = band & np.isfinite(test.statistic)
     count = int(taken.sum())
     total = float(test.statistic[taken].sum())
@@ -196,4 +196,4 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
     return BandTest(total, degrees, p_value, count)
 
 
-_HANN_HALF = neighbour_correlation(get_window("hann", 64), 32, 1000)
+HANN_HALF = neighbour_correlation(get_window("hann", 64), 32, 1000)

@@ -8,6 +8,7 @@ import pytest
 from estimator.dimension import bands, choose_dimension
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood import maximum_likelihood
+from estimator.prior import expected_noise
 from estimator.three_sensor import three_sensor
 from tests.estimator.models import pentagon, plane_waves, random_bench, rotation, wishart
 
@@ -47,6 +48,41 @@ def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     for choice in choices[3:]:
         assert choice.cov > choice.usual_cov  # the price
         assert all(test.p_value < 0.05 for test in choice.tried[:-1])
+
+
+def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:
+    """Aligned sensors whose noise spans a factor of 12, told apart where the motion is one."""
+    noise_psd = np.repeat([1, 0.5, 2, 1, 3.0], 3) * np.tile([1, 1, 2.0], 5)
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 20 * np.linspace(0.95, 1.05, 40)])
+    csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
+    averages = wishart(csm, 1080, np.random.default_rng(7))[0]
+    n_factors, (_, above) = choose_dimension(
+        averages,
+        frequency,
+        dims=FIVE,
+        n_effective=1080,
+        band=np.repeat([0, 1], 40),
+        neighbours=INDEPENDENT,
+    )
+    assert above.n_factors == 9
+    found = maximum_likelihood(averages, dims=FIVE, n_effective=1080, n_factors=n_factors)
+    ratio = found.noise_psd[40:] / noise_psd
+    assert ratio.mean() == pytest.approx(1, abs=0.05)
+    assert np.all(np.abs(ratio.mean(axis=0) - 1) < 0.25)
+    covered = (found.low[40:] < noise_psd) & (noise_psd < found.high[40:])
+    assert covered.mean() > 0.9
+
+
+def test_ratios_come_from_the_nearest_frequencies() -> None:
+    noise_psd = np.ones((200, 3))
+    noise_psd[:100, 1] = 4.0
+    noise_psd[100:, 1] = 0.25
+    usual = np.arange(200) % 100 >= 60
+    noise_psd[~usual] = np.nan
+    expected = expected_noise(noise_psd, usual, (1, 1, 1))
+    np.testing.assert_allclose(expected[70, 1] / expected[70, 0], 4)
+    np.testing.assert_allclose(expected[190, 1] / expected[190, 0], 0.25)
+    np.testing.assert_array_equal(expected_noise(noise_psd, usual & False, (1, 1, 1)), 1)
 
 
 def test_three_sensors_have_no_room_and_say_so() -> None:

@@ -158,7 +158,7 @@ def test_precise_as_the_bound_unbiased_and_sure_of_it(geometry: str, n_averages:
     A sample c.o.v. of m draws scatters by 1/sqrt(2 m) (more for the skewed: 1.5 allows it),
     the mean by cov/sqrt(m), coverage by sqrt(.05 .95/m).
     """
-    n_draws = 1500
+    n_draws = 1000
     csm, noise_psd, dims = GEOMETRIES[geometry]
     bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=n_averages)[0]
     draws = wishart(csm, n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
@@ -189,7 +189,7 @@ def test_five_triaxial_sensors_reach_four_percent() -> None:
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [10.0, 1e6])
 def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
-    n_draws = 2500
+    n_draws = 1500
     rng = np.random.default_rng(16)
     csm = equal_noise(17, dims=(d,) * 3, snr=snr)
     found = maximum_likelihood(
@@ -204,7 +204,7 @@ def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
-@pytest.mark.parametrize("snr", [1e-1, 1.0, 1e2, 1e6])
+@pytest.mark.parametrize("snr", [1e-1, 1.0, 1e6])
 def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
     n_draws = 1000
     csm = equal_noise(18, dims=(d,) * 3, snr=snr)
@@ -290,8 +290,8 @@ def test_dimension_may_differ_from_frequency_to_frequency() -> None:
     flat = np.concatenate([turned, np.eye(3), turned.T])
     csm = wishart(common_motion(flat, np.ones(9), snr=100), 200, rng, n_draws=4)
     mixed = maximum_likelihood(
-        csm, dims=(3, 3, 3), n_effective=200, n_factors=np.array([3, 4, 3, 4])
+        csm, dims=(3, 3, 3), n_effective=200, n_factors=np.array([3, 2, 3, 2])
     )
-    for q, rows in ((3, [0, 2]), (4, [1, 3])):
+    for q, rows in ((3, [0, 2]), (2, [1, 3])):
         alone = maximum_likelihood(csm[rows], dims=(3, 3, 3), n_effective=200, n_factors=q)
         np.testing.assert_array_equal(mixed.noise_psd[rows], alone.noise_psd)
