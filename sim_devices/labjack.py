@@ -220,7 +220,9 @@ class LabJack:
             raise RefusedError(4, 2605)
         addresses = [self._value(reg.STREAM_SCANLIST + 2 * k) for k in range(n_columns)]
         rate = reg.actual_scan_rate(self._real(reg.STREAM_SCANRATE_HZ))
-        source = self._source if rate == self._source.sampling_rate else self._source.at_rate(rate)
+        overlap = rate * n_columns > MAX_SAMPLE_RATE
+        as_is = overlap or rate == self._source.sampling_rate
+        source = self._source if as_is else self._source.at_rate(rate)
         columns = Columns(addresses, self._inputs, rate)
         capacity = (self._value(reg.STREAM_BUFFER_SIZE_BYTES) or 4096) // 2
         stream = Stream(
@@ -231,7 +233,7 @@ class LabJack:
             now=now,
         )
         stream.wanted = self._value(reg.STREAM_NUM_SCANS) or None
-        if rate * n_columns > MAX_SAMPLE_RATE:
+        if overlap:
             stream.breaks_off = (1, SCAN_OVERLAP)
         elif self._ends_with and not self.stream_started:
             stream.breaks_off = (self._ends_after, int(self._ends_with))

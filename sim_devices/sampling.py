@@ -38,6 +38,11 @@ class Samples:
         self._times: FloatArray = np.empty(0)
         self._counts: NDArray[np.float64] = np.empty((0, 0))
 
+    @property
+    def n_channels(self) -> int:
+        """Columns."""
+        return int(self.counts(0, 1).shape[1])
+
     def first_after(self, now: float) -> int:
         """Index of the first sample taken at or after world time ``now``."""
         return self._source.first_sample_after(self._sensors[0], now)

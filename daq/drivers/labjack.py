@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from daq.drivers.base import DeviceInformation
     from daq.protocols.block import Block, Event
 
-STALLED = 1.0
+STALLED = 3.0
 """Beyond two packets, how long nothing may come, s."""
 POLL_INTERVAL = 0.05
 """Between two reads of a stream by command, s, once it has been read up."""

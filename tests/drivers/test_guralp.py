@@ -13,6 +13,7 @@ from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices import launch
+from tests.drivers import reading
 from tests.sim_devices.bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -54,17 +55,7 @@ def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Se
 
 
 async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]:
-    blocks: list[Block] = []
-    events: list[Event] = []
-    async with DRIVER.open([one], SystemClock(SPEED)) as session:
-        async for item in session.read():
-            if isinstance(item, Event):
-                events.append(item)
-                continue
-            blocks.append(item)
-            if item.end_sample >= n_samples:
-                break
-    return blocks, events
+    return await reading.record(DRIVER, one, n_samples, speed=SPEED)
 
 
 @pytest.mark.parametrize("index", range(4))
@@ -143,10 +134,9 @@ async def test_nothing_listens() -> None:
 
 async def test_a_digitizer_that_vanishes_ends_the_session() -> None:
     with launch.start(spec(TABLES[0], speed=SPEED)) as (one,):
-        async with DRIVER.open(sensors(one, TABLES[0]), SystemClock(SPEED)) as session:
-            stream = session.read()
-            assert isinstance(await anext(stream), (Block, Event))
+        async with reading.reading(DRIVER, sensors(one, TABLES[0]), speed=SPEED) as items:
+            assert isinstance(await anext(items), (Block, Event))
             one.process.kill()
             with pytest.raises(NotConnectedError, match="the port closed"):
-                async for _ in stream:
+                async for _ in items:
                     pass

@@ -21,6 +21,7 @@ from daq.errors import (
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.labjack_registers import actual_scan_rate
 from sim_devices import launch
+from tests.drivers.reading import reading
 from tests.sim_devices.bench import scenario, spec
 
 if TYPE_CHECKING:
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
 
     from sim_devices.launch import RunningDevice
 
-SPEED = 8.0
-RATE = 500.0
+SPEED = 4.0
+RATE = 200.0
+TICKS = 200_000
 COUNTS = 3166.5 * 100
 CENTER = 33523
 DRIVER = driver_type("labjack")
@@ -54,7 +56,7 @@ def table(names: Sequence[str] = NAMES, **changes: Any) -> dict[str, Any]:  # no
 def running() -> Iterator[tuple[RunningDevice, ...]]:
     tables = [
         table(serial_number="470001234"),
-        table(["F"], settings={"ends_with": 2945, "ends_after": 700}),
+        table(["F"], settings={"ends_with": 2945, "ends_after": 400}),
     ]
     with launch.start(spec(*tables, speed=SPEED, sampling_rate=RATE)) as devices:
         yield devices
@@ -86,8 +88,8 @@ def bench(
 async def record(some: list[Sensor], n_samples: int) -> tuple[dict[str, list[Block]], list[Event]]:
     blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in some}
     events: list[Event] = []
-    async with DRIVER.open(some, SystemClock(SPEED)) as session:
-        async for item in session.read():
+    async with reading(DRIVER, some, speed=SPEED) as items:
+        async for item in items:
             if isinstance(item, Event):
                 events.append(item)
                 continue
@@ -107,7 +109,7 @@ async def test_three_sensors_on_one_digitizer(
     running: tuple[RunningDevice, ...], mode: str, core_timer: bool
 ) -> None:
     some = bench(running[0], settings={"mode": mode, "core_timer": core_timer})
-    found, events = await record(some, 1500)
+    found, events = await record(some, 400)
     assert not events
     truth = scenario(NAMES, sampling_rate=RATE)
     before = None
@@ -115,27 +117,27 @@ async def test_three_sensors_on_one_digitizer(
         blocks = found[name]
         assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
         assert blocks[0].flags == BlockFlag.CLOCK_RESTART
-        counts = joined(blocks)[:1500]
+        counts = joined(blocks)[:400]
         assert counts.dtype == np.uint16
         if core_timer:
             assert all(
-                b.device_counter == (blocks[0].device_counter or 0) + b.first_sample * 80_000
+                b.device_counter == (blocks[0].device_counter or 0) + b.first_sample * TICKS
                 for b in blocks
             )
-            before = (blocks[0].device_counter or 0) // 80_000 % (2**32 // 80_000)
+            before = (blocks[0].device_counter or 0) // TICKS % (2**32 // TICKS)
         if before is None:
             continue
         index = next(
             i
-            for wraps in range(20)
+            for wraps in range(3)
             if np.abs(
-                truth.samples(name, i := round(before + wraps * 2**32 / 80_000), 1) * COUNTS
+                truth.samples(name, i := round(before + wraps * 2**32 / TICKS), 1) * COUNTS
                 + CENTER
                 - counts[0]
             ).max()
             <= 0.5
         )
-        expected = truth.samples(name, index, 1500) * COUNTS + CENTER
+        expected = truth.samples(name, index, 400) * COUNTS + CENTER
         assert np.abs(expected - counts).max() <= 0.5
 
 
@@ -183,16 +185,16 @@ async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, .
 
 
 async def test_a_stream_that_breaks_off_is_started_anew(running: tuple[RunningDevice, ...]) -> None:
-    found, events = await record(bench(running[1]), 3000)
+    found, events = await record(bench(running[1]), 1200)
     blocks = found["F"]
     assert [e.text for e in events] == ["the buffer is full (2945)"]
     again = next(b for b in blocks if b.reason)
     assert again.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
     assert again.reason == "the buffer is full"
     before = blocks[blocks.index(again) - 1]
-    assert before.end_sample == 700
+    assert before.end_sample == 400
     ticks = (again.device_counter or 0) - (before.device_counter or 0)
-    assert again.first_sample - before.first_sample == pytest.approx(ticks / 80_000, abs=0.5)
+    assert again.first_sample - before.first_sample == pytest.approx(ticks / TICKS, abs=0.5)
 
 
 async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
@@ -202,14 +204,14 @@ async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
     some = bench(running[0], settings={"mode": "command-response", "buffer_bytes": 4096})
     blocks: list[Block] = []
     events: list[Event] = []
-    async with DRIVER.open(some, SystemClock(SPEED)) as session:
-        async for item in session.read():
+    async with reading(DRIVER, some, speed=SPEED) as items:
+        async for item in items:
             if isinstance(item, Event):
                 events.append(item)
             elif item.sensor == "A":
                 blocks.append(item)
                 if len(blocks) == 5:
-                    await asyncio.sleep(0.3)  # the test's own idleness is what is tested
+                    await asyncio.sleep(0.8)  # the test's own idleness is what is tested
                 if len(blocks) > 5 and any(b.reason for b in blocks) and len(events) >= 2:
                     break
     gap = next(b for b in blocks if b.reason)
@@ -218,7 +220,7 @@ async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
     assert gap.flags == BlockFlag.NONE
     assert gap.first_sample - before.end_sample > 100
     elapsed = (gap.device_counter or 0) - (blocks[0].device_counter or 0)
-    assert elapsed == gap.first_sample * 80_000
+    assert elapsed == gap.first_sample * TICKS
     assert "2940" in events[0].text
     assert "2941" in events[1].text
 

@@ -1,0 +1,209 @@
+"""Driver for devices with a block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT).
+
+The sampling rate is written to its register, and the reply compared; then the FIFO is read as fast
+as it fills. There is neither a counter nor a time on the device: samples are numbered as they come
+and placed by arrival (:mod:`daq.protocols.fifo`). Counts are i16; a channel's sensitivity is 8192
+counts/g ÷ 9.80665 = 835.35 counts/(m/s²) by a client's assumption, not by a data sheet.
+
+Public clients disagree on what the first register of a read means: set ``header`` and look at
+``huddle check``, which reads twice the rate, or half, if it is the wrong one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+
+from daq.drivers.base import DeviceInformation
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols import rtu
+from daq.protocols.fifo import MAX_WORDS, RATE_REGISTER, FifoDecoder
+from daq.protocols.rtu import ReplyFinder
+from daq.transport import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.protocols.block import Block, Event
+    from daq.transport import ByteStream
+
+ATTEMPTS = 3
+MOST_UNANSWERED = 5
+"""Reads without a reply, one after the other, after which the device is gone."""
+STALLED = 2.0
+"""Without a sample for so long, in s, the device has stopped."""
+
+
+class FifoSettings(BaseModel):
+    """``[sensors.settings]`` of a device with a block FIFO."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    baud_rate: PositiveInt = 3_000_000
+    parity: Literal["N", "E", "O"] = "N"
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    header: Literal["size", "left"] = "size"
+    """What the first register of a read means: words that waited, or words left after it."""
+    capacity: PositiveInt | None = None
+    """Words the FIFO holds, where known: a level there means that samples were dropped."""
+    set_rate: bool = True
+    """Whether the sampling rate is written to the device."""
+    poll_interval: PositiveFloat = 0.02
+    """Between two reads, s, once the FIFO has been read up."""
+    timeout: PositiveFloat = 0.3
+    """How long a reply may take, s."""
+
+
+class FifoSession:
+    """A device that samples into its FIFO."""
+
+    def __init__(
+        self,
+        stream: ByteStream,
+        settings: FifoSettings,
+        decoder: FifoDecoder,
+        *,
+        information: DeviceInformation,
+        clock: HostClock,
+    ) -> None:
+        self.information = (information,)
+        self._stream = stream
+        self._settings = settings
+        self._decoder = decoder
+        self._clock = clock
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Read the FIFO and yield its blocks."""
+        loop = asyncio.get_running_loop()
+        unanswered, fed = 0, loop.time()
+        while True:
+            items, answered = await self._once()
+            for item in items:
+                yield item
+            unanswered = 0 if answered else unanswered + 1
+            if unanswered > MOST_UNANSWERED:
+                raise NoAnswerError(f"{self._stream.label}: {unanswered} reads without a reply")
+            if (items and answered) or self._decoder.level:
+                fed = loop.time()
+            elif loop.time() - fed > STALLED:
+                raise NoAnswerError(
+                    f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
+                )
+            if self._decoder.level < MAX_WORDS:
+                await asyncio.sleep(self._settings.poll_interval)
+
+    async def _once(self) -> tuple[list[Block | Event], bool]:
+        """Read once; return what came, and whether it was a reply."""
+        decoder, stream = self._decoder, self._stream
+        stream.discard()  # a late reply to an earlier read is none to this one
+        await stream.write(decoder.request())
+        items: list[Block | Event] = []
+        try:
+            async with asyncio.timeout(self._settings.timeout):
+                while decoder.waiting:
+                    received, at = await stream.read()
+                    items += decoder.receive(received, at)
+        except TimeoutError:
+            return [*items, *decoder.timed_out(self._clock.now())], False
+        return items, True
+
+
+class FifoDriver:
+    """See :class:`daq.drivers.base.DriverType`."""
+
+    name = "fifo"
+    summary = "Block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT vibration units)"
+    settings = FifoSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return int16."""
+        return np.dtype(np.int16)
+
+    @contextlib.asynccontextmanager
+    async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
+        """Open the port, see that the device answers, and set its sampling rate."""
+        sensor = sensors[0]
+        settings = FifoSettings.model_validate(sensor.settings)
+        if len(sensors) > 1:
+            names = ", ".join(repr(other.name) for other in sensors)
+            raise BenchFileError(
+                f"port {sensor.port} is given to {names}; reading one FIFO takes all of a line"
+            )
+        if settings.set_rate and not 1 <= sensor.sampling_rate == round(sensor.sampling_rate):
+            raise BenchFileError(
+                f"sensor {sensor.name!r}: sampling_rate = {sensor.sampling_rate:g}; expected whole"
+                " Hz, as the device's register holds (or settings.set_rate = false)"
+            )
+        async with open_port(
+            sensor.port,
+            clock,
+            label=f"sensor {sensor.name!r} on {sensor.port}",
+            baud_rate=settings.baud_rate,
+            parity=settings.parity,
+        ) as stream:
+            await _set_up(stream, sensor, settings)
+            decoder = FifoDecoder(
+                sensor.name,
+                sensor.sampling_rate,
+                n_channels=len(sensor.channels),
+                header=settings.header,
+                unit=settings.unit,
+                capacity=settings.capacity,
+            )
+            information = DeviceInformation(
+                sensor=sensor.name,
+                sampling_rate=sensor.sampling_rate,
+                details={"unit": str(settings.unit), "header": settings.header},
+            )
+            yield FifoSession(stream, settings, decoder, information=information, clock=clock)
+
+
+async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:
+    """Set the sampling rate, or read the FIFO's level, until the device answers."""
+    request = rtu.read_request(settings.unit, 2, 1)
+    if settings.set_rate:
+        rate = round(sensor.sampling_rate)
+        request = rtu.write_request(settings.unit, RATE_REGISTER, rate)
+    finder = ReplyFinder()
+    n_skipped = 0
+    for _ in range(ATTEMPTS):
+        stream.discard()
+        finder.expect(request)
+        await stream.write(request)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(settings.timeout):
+                while True:
+                    reply = finder.receive((await stream.read())[0])
+                    if reply is not None:
+                        break
+            if reply.exception is not None:
+                why = rtu.EXCEPTIONS.get(reply.exception, f"exception {reply.exception}")
+                raise WrongDeviceError(
+                    f"{stream.label}: the device refused {_said(settings)}: {why}"
+                )
+            if settings.set_rate and reply.payload != request[2:-2]:
+                raise WrongDeviceError(
+                    f"{stream.label}: set {sensor.sampling_rate:g} Hz, the device says"
+                    f" {int.from_bytes(reply.payload[2:4], 'big')}"
+                )
+            return
+        n_skipped += finder.n_skipped
+    what = f"{n_skipped} bytes that are no reply" if n_skipped else "nothing"
+    raise NoAnswerError(
+        f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}, got {what};"
+        " check cable, power, settings.baud_rate and settings.unit"
+    )
+
+
+def _said(settings: FifoSettings) -> str:
+    return "setting the sampling rate" if settings.set_rate else "reading the FIFO's level"
+
+
+DRIVER = FifoDriver()

@@ -1,0 +1,231 @@
+"""Driver for devices that send delimited text over a serial line, TCP or UDP.
+
+``preset`` gives a known device's format, and any setting beside it changes that; see
+:mod:`daq.protocols.text` for what a format is made of. Ports: serial, ``socket://host:port``, and
+``udp://address:port`` to listen at (``udp://0.0.0.0:8888`` for any interface).
+
+A device that is quiet until told sends after ``start``, and ``stop`` is sent in the end: LILY
+tiltmeters take ``*9900XYC2`` and ``*9900XYC-OFF``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+
+from daq.datagrams import open_datagrams
+from daq.drivers.base import DeviceInformation
+from daq.errors import BenchFileError, DeviceError, NoAnswerError
+from daq.protocols import text
+from daq.protocols.block import Block
+from daq.protocols.text import TextDecoder, TextFormat
+from daq.transport import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    import numpy as np
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.datagrams import DatagramStream
+    from daq.protocols.block import Event
+    from daq.transport import ByteStream
+
+PRESETS = {"raspberry-shake": text.RASPBERRY_SHAKE, "lily": text.LILY, "none": TextFormat()}
+
+
+class TextSettings(BaseModel):
+    """``[sensors.settings]`` of a device that sends text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: Literal["none", "raspberry-shake", "lily"] = "none"
+    layout: Literal["row", "channel"] | None = None
+    """"row": a line is one sample of every channel. "channel": name, time, samples of one."""
+    delimiter: str | None = None
+    terminator: Annotated[str, Field(min_length=1)] | None = None
+    prefix: str | None = None
+    suffix: str | None = None
+    tag: str | None = None
+    """What the first field of a row must be."""
+    columns: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    """Field of each channel, counted from 0 (layout "row"); the first ones, if not given."""
+    channel_names: tuple[str, ...] | None = None
+    """Name of each channel in the messages (layout "channel"); the channels' own, if not given."""
+    time_column: Annotated[int, Field(ge=0)] | None = None
+    time_format: str | None = None
+    """"epoch" (seconds since 1970) or as Python's strptime has it; UTC."""
+    counter_column: Annotated[int, Field(ge=0)] | None = None
+    counter_modulus: PositiveInt | None = None
+    nmea_checksum: bool | None = None
+    whole: bool | None = None
+    """Whether samples are whole numbers."""
+    device_time: bool | None = None
+    """Whether the device's time is the clock, instead of arrival."""
+    start: str = ""
+    """Sent to the device to make it send."""
+    stop: str = ""
+    """Sent in the end."""
+    baud_rate: PositiveInt = 19200
+    parity: Literal["N", "E", "O"] = "N"
+    patience: PositiveFloat = 2.0
+    """How long nothing may come, s, beyond twice the time between messages."""
+
+    def format_for(self, sensor: Sensor) -> TextFormat:
+        """Return the format these settings come to.
+
+        Raises
+        ------
+        BenchFileError
+            There is not one column, or one name, for each channel.
+        """
+        given = {
+            field.name: value
+            for field in fields(TextFormat)
+            if (value := getattr(self, field.name)) is not None
+        }
+        format_ = replace(PRESETS[self.preset], **given)
+        n_channels = len(sensor.channels)
+        if format_.layout == "channel":
+            names = self.channel_names or tuple(channel.name for channel in sensor.channels)
+            format_ = replace(format_, channel_names=names)
+        elif not format_.columns:
+            format_ = replace(format_, columns=tuple(range(n_channels)))
+        places = format_.channel_names if format_.layout == "channel" else format_.columns
+        if len(places) != n_channels:
+            what = "channel_names" if format_.layout == "channel" else "columns"
+            raise BenchFileError(
+                f"sensor {sensor.name!r}: settings.{what} = {list(places)};"
+                f" expected one for each of its {n_channels} channels"
+            )
+        return format_
+
+
+class _Source(Protocol):
+    """Where the text comes from."""
+
+    async def receive(self) -> list[Block | Event]: ...
+    async def send(self, payload: bytes) -> None: ...
+
+
+class _StreamSource:
+    def __init__(self, stream: ByteStream, decoder: TextDecoder) -> None:
+        self._stream = stream
+        self._decoder = decoder
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        return self._decoder.receive(received, at)
+
+    async def send(self, payload: bytes) -> None:
+        await self._stream.write(payload)
+
+
+class _DatagramSource:
+    def __init__(self, stream: DatagramStream, decoder: TextDecoder) -> None:
+        self._stream = stream
+        self._decoder = decoder
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        return self._decoder.receive_datagram(received, at)
+
+    async def send(self, payload: bytes) -> None:
+        """Do nothing: it listens only."""
+
+
+class TextSession:
+    """A port at which text comes, or will when asked for."""
+
+    def __init__(
+        self,
+        source: _Source,
+        settings: TextSettings,
+        *,
+        label: str,
+        information: DeviceInformation,
+    ) -> None:
+        self.information = (information,)
+        self._source = source
+        self._settings = settings
+        self._label = label
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Ask for samples and yield blocks of them."""
+        if self._settings.start:
+            await self._source.send(self._settings.start.encode())
+        loop = asyncio.get_running_loop()
+        last, between = loop.time(), 0.0  # of blocks
+        while True:
+            patience = last + self._settings.patience + 2 * between
+            try:
+                async with asyncio.timeout_at(patience):
+                    items = await self._source.receive()
+            except TimeoutError as error:
+                raise NoAnswerError(
+                    f"{self._label}: no samples for {patience - last:.2g} s; check cable, power,"
+                    " settings.baud_rate and settings.start"
+                ) from error
+            for item in items:
+                if isinstance(item, Block):
+                    between = max(0.9 * between, loop.time() - last)
+                    last = loop.time()
+                yield item
+
+
+class TextDriver:
+    """See :class:`daq.drivers.base.DriverType`."""
+
+    name = "text"
+    summary = "Delimited text over serial, TCP or UDP (Raspberry Shake, LILY, any format)"
+    settings = TextSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
+        """Return int32 for whole numbers, float64 else."""
+        return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
+
+    @contextlib.asynccontextmanager
+    async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[TextSession]:
+        """Open the port."""
+        sensor = sensors[0]
+        settings = TextSettings.model_validate(sensor.settings)
+        if len(sensors) > 1:
+            names = ", ".join(repr(other.name) for other in sensors)
+            raise BenchFileError(f"port {sensor.port} is given to {names}; text comes from one")
+        label = f"sensor {sensor.name!r} on {sensor.port}"
+        format_ = settings.format_for(sensor)
+        decoder = TextDecoder(sensor.name, format_, sampling_rate=sensor.sampling_rate)
+        information = DeviceInformation(
+            sensor=sensor.name,
+            details={"format": settings.preset if settings.preset != "none" else format_.layout},
+        )
+        async with _opened(sensor.port, clock, settings, decoder, label=label) as source:
+            try:
+                yield TextSession(source, settings, label=label, information=information)
+            finally:
+                if settings.stop:
+                    with contextlib.suppress(DeviceError):
+                        await source.send(settings.stop.encode())
+
+
+@contextlib.asynccontextmanager
+async def _opened(
+    port: str, clock: HostClock, settings: TextSettings, decoder: TextDecoder, *, label: str
+) -> AsyncIterator[_Source]:
+    if port.startswith("udp://"):
+        async with open_datagrams(port, clock, listen=True, label=label) as datagrams:
+            yield _DatagramSource(datagrams, decoder)
+    else:
+        async with open_port(
+            port, clock, label=label, baud_rate=settings.baud_rate, parity=settings.parity
+        ) as stream:
+            yield _StreamSource(stream, decoder)
+
+
+DRIVER = TextDriver()

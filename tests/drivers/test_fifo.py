@@ -1,0 +1,133 @@
+"""Block FIFO driver and simulated unit over a pseudo-terminal and TCP."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.block import Block, BlockFlag, Event
+from sim_devices import launch
+from tests.drivers.reading import reading
+from tests.sim_devices.bench import device, scenario, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench import Sensor
+    from sim_devices.launch import RunningDevice
+
+RATE = 2000.0
+COUNTS = 100_000.0
+DRIVER = driver_type("fifo")
+CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]
+
+
+def table(name: str, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
+    return device(name, "fifo", channels={name: CHANNELS}, sampling_rate=RATE, **changes)
+
+
+TABLES = [
+    table("A", settings={"capacity": 6000}),
+    table("B", port="tcp", settings={"header": "left", "unit": 7}),
+]
+SETTINGS: list[dict[str, Any]] = [{"capacity": 6000}, {"header": "left", "unit": 7}]
+
+
+SPEC = spec(*TABLES, sampling_rate=RATE)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with launch.start(SPEC) as devices:
+        yield devices
+
+
+def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Sensor:  # noqa: ANN401
+    settings = {**SETTINGS[index], **changes.pop("settings", {})}
+    return sensors(running[index], TABLES[index], settings=settings, **changes)[0]
+
+
+async def record(
+    one: Sensor, n_samples: int, *, idle_after: int | None = None
+) -> tuple[list[Block], list[Event]]:
+    blocks: list[Block] = []
+    events: list[Event] = []
+    async with reading(DRIVER, [one]) as items:
+        async for item in items:
+            if isinstance(item, Event):
+                events.append(item)
+                continue
+            blocks.append(item)
+            if idle_after is not None and item.end_sample >= idle_after:
+                idle_after = None
+                await asyncio.sleep(1.3)  # the test's own idleness is what is tested
+            if blocks[-1].end_sample >= n_samples and idle_after is None:
+                break
+    return blocks, events
+
+
+@pytest.mark.parametrize("index", [0, 1])
+async def test_the_fifo_is_read_as_fast_as_it_fills(
+    running: tuple[RunningDevice, ...], index: int
+) -> None:
+    """Every sample once: the counts are the world's, in one piece."""
+    blocks, events = await record(sensor(running, index), 1500)
+    assert not events
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[0].flags == BlockFlag.CLOCK_RESTART
+    assert {b.flags for b in blocks[1:]} == {BlockFlag.NONE}
+    counts = np.concatenate([b.counts for b in blocks])[:1500]
+    assert counts.dtype == np.int16
+    assert counts.std(axis=0) == pytest.approx(np.full(3, COUNTS * 0.03), rel=0.3)
+    truth = scenario("AB", sampling_rate=RATE)
+    name = "AB"[index]
+    elapsed = round((blocks[0].received.monotonic_ns - SPEC["epoch_ns"]) * 1e-9 * RATE)
+    first = max(0, elapsed - 6000)
+    world = truth.samples(name, first, elapsed - first + 200) * COUNTS
+    start = int(np.abs(world - counts[0]).max(axis=1).argmin())
+    expected = truth.samples(name, first + start, 1500) * COUNTS
+    assert np.abs(expected - counts).max() <= 0.5
+
+
+async def test_an_overflow_is_told_and_the_gap_estimated(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    """2000 samples fit; nobody reads for 1.3 s, 2600 samples."""
+    blocks, events = await record(sensor(running, 0), 3500, idle_after=400)
+    assert [e.kind for e in events] == ["overflow"]
+    gap = next(b for b in blocks if b.reason)
+    before = blocks[blocks.index(gap) - 1]
+    assert gap.reason == "FIFO full"
+    assert gap.flags == BlockFlag.MISSING_ESTIMATED
+    assert gap.first_sample - before.end_sample > 300
+    # by the host, all samples of the time are there or missing
+    elapsed = (blocks[-1].received.monotonic_ns - blocks[0].received.monotonic_ns) * 1e-9 * RATE
+    assert blocks[-1].end_sample - blocks[0].end_sample == pytest.approx(elapsed, abs=150)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9, got nothing; check cable"),
+        ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal value"),
+        ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
+    ],
+)
+async def test_what_does_not_fit_is_named(
+    running: tuple[RunningDevice, ...], changes: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        await record(sensor(running, 0, **changes), 1)
+
+
+async def test_two_sensors_do_not_share_a_line(running: tuple[RunningDevice, ...]) -> None:
+    some = [sensor(running, 0, name=name) for name in ("P", "Q")]
+    with pytest.raises(BenchFileError, match="'P', 'Q'; reading one FIFO takes all of a line"):
+        async with DRIVER.open(some, SystemClock()):
+            pass
