@@ -72,8 +72,11 @@ class ByteStream:
         self._paused = False
         self._wire: _Wire
 
-    async def read(self) -> tuple[bytes, HostTime]:
+    async def read(self, gather: float = 0.0) -> tuple[bytes, HostTime]:
         """Return all that has come, at least one byte, and when the last of it came.
+
+        With ``gather`` what comes in so many seconds after the first byte is taken together: the
+        time is no less exact, and decoding costs once instead of once a frame.
 
         Raises
         ------
@@ -88,6 +91,8 @@ class ByteStream:
                 await self._waiter
             finally:
                 self._waiter = None
+        if gather and self._failure is None:
+            await asyncio.sleep(gather)
         received, at = b"".join(self._chunks), cast("HostTime", self._at)
         self._chunks.clear()
         self._size = 0

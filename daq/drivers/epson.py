@@ -39,6 +39,8 @@ SETTLE_TIMEOUT = 3.0
 """For the device to get ready (flash, reset) or change its mode or filter, s."""
 STALLED = 1.0
 """Without a frame for so long, in s, the device has stopped sending."""
+GATHER = 0.04
+"""Frames of so many seconds are decoded together."""
 WRITE_INTERVAL = 0.001
 """Between two commands, s; the data sheet asks for 350 µs."""
 
@@ -320,7 +322,7 @@ class EpsonSession:
         while True:
             try:
                 async with asyncio.timeout(patience):
-                    received, at = await self._stream.read()
+                    received, at = await self._stream.read(GATHER)
             except TimeoutError as error:
                 raise NoAnswerError(
                     f"{self._stream.label}: nothing came for {patience:g} s;"

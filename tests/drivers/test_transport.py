@@ -13,6 +13,7 @@ import pytest
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.errors import NotConnectedError
+from daq.protocols.block import HostTime
 from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
@@ -130,6 +131,14 @@ async def test_a_port_without_descriptor_is_read_by_a_thread() -> None:
         received = b""
         while received != b"round":
             received += (await stream.read())[0]
+
+
+async def test_what_comes_soon_after_is_taken_together_with_its_own_time() -> None:
+    async with _pseudo_terminal() as (port, _), open_port(port, SystemClock()) as stream:
+        reading = asyncio.create_task(stream.read(gather=0.01))
+        stream.feed(b"first", HostTime(1, 1))
+        asyncio.get_running_loop().call_later(0.001, stream.feed, b"second", HostTime(2, 2))
+        assert await reading == (b"firstsecond", HostTime(2, 2))
 
 
 async def test_discard_forgets_what_was_not_read() -> None:
