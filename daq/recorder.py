@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 QUEUE_LENGTH = 4096
 COMMIT_INTERVAL = 0.5
-_LONGEST_WAIT = 0.1
+_BATCH_INTERVAL = 0.1
 _LAST_BLOCKS = 1.0
 _Result = TypeVar("_Result")
 
@@ -241,12 +241,11 @@ class _Recorder:
                 return
 
     async def _batch(self) -> list[Item]:
-        """Return what waits in the queue, and wait a moment if nothing does."""
-        batch: list[Item] = []
+        """Return what has come in the next moment: one trip to the thread for many blocks."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_LONGEST_WAIT):
-                batch.append(await self._queue.get())
-        return batch + self._waiting()
+            async with asyncio.timeout(_BATCH_INTERVAL):
+                await self._stop.wait()
+        return self._waiting()
 
     def _waiting(self) -> list[Item]:
         batch: list[Item] = []

@@ -123,6 +123,24 @@ class _Chunked:
         self.n_written += len(rows)
 
 
+@dataclass(slots=True)
+class _Row:
+    """A block that may still grow."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+    received: HostTime
+    device_counter: int
+    flags: int
+
+    def array(self) -> NDArray[np.void]:
+        """Return its row, without checksum."""
+        at = self.received.monotonic_ns, self.received.utc_ns
+        begin = self.first_sample, self.first_row, self.n_samples
+        return np.array([(*begin, *at, self.device_counter, self.flags, 0)], layout.BLOCK_DTYPE)
+
+
 class _SensorWriter:
     """The rows of one sensor.
 
@@ -139,7 +157,7 @@ class _SensorWriter:
         self.gaps = _Table(group["gaps"])
         self._layout = sensor
         self._merged_length = max(1, round(sensor.sampling_rate * _MERGED_SECONDS))
-        self._current: NDArray[np.void] | None = None
+        self._current: _Row | None = None
         self._crc32 = 0
         self._whole: list[NDArray[np.void]] = []
         self._n_rows = 0
@@ -185,45 +203,38 @@ class _SensorWriter:
         """Number of rows up to the end of the last block that was collected."""
         if self._whole:
             return int(self._whole[0]["first_row"][0])
-        return self._n_rows if self._current is None else int(self._current["first_row"][0])
+        return self._n_rows if self._current is None else self._current.first_row
 
     def _merge(self, block: Block) -> bool:
         """Continue the current block with this one, or end it and begin another."""
         current = self._current
         if (
             current is not None
-            and block.first_sample == current["first_sample"][0] + current["n_samples"][0]
-            and int(block.flags) == current["flags"][0]
+            and block.first_sample == current.first_sample + current.n_samples
+            and int(block.flags) == current.flags
             and not block.reason
-            and current["n_samples"][0] + block.n_samples <= self._merged_length
+            and current.n_samples + block.n_samples <= self._merged_length
         ):
-            current["n_samples"] += block.n_samples
-            current["monotonic_ns"] = block.received.monotonic_ns
-            current["utc_ns"] = block.received.utc_ns
+            current.n_samples += block.n_samples
+            current.received = block.received
             return True
         self._end_current()
         counter = layout.NO_COUNTER if block.device_counter is None else block.device_counter
-        self._current = np.array(
-            [
-                (
-                    block.first_sample,
-                    self._n_rows,
-                    block.n_samples,
-                    block.received.monotonic_ns,
-                    block.received.utc_ns,
-                    counter,
-                    int(block.flags),
-                    0,
-                )
-            ],
-            layout.BLOCK_DTYPE,
+        self._current = _Row(
+            block.first_sample,
+            self._n_rows,
+            block.n_samples,
+            block.received,
+            counter,
+            int(block.flags),
         )
         return False
 
     def _end_current(self) -> None:
         if self._current is not None:
-            self._current["crc32"] = layout.block_crc32(self._current, self._crc32)
-            self._whole.append(self._current)
+            row = self._current.array()
+            row["crc32"] = layout.block_crc32(row, self._crc32)
+            self._whole.append(row)
             self._current = None
 
     def _converted(self, block: Block) -> NDArray[Any]:

@@ -1,0 +1,175 @@
+"""The largest bench, through real sockets into HDF5: what is lost (nothing), what it costs.
+
+One process plays all devices (Epson accelerometers behind serial-to-network adapters that send
+every 50 ms), another is the recorder, and only that one is measured.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.row import Row
+from daq.bench import Bench, Channel, Sensor, parse
+from daq.protocols import epson
+from daq.recorder import run as record
+from daq.recording.healing import verify
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+SEND_INTERVAL = 0.05
+AXES = tuple(Channel(name=axis, sensitivity=epson.COUNTS_PER_UNIT) for axis in "xyz")
+
+
+class Noise:
+    """What the played sensors read: white noise of a million counts, the same again every 8 s."""
+
+    def __init__(self, sampling_rate: float) -> None:
+        self.sampling_rate = sampling_rate
+        rng = np.random.default_rng(1)
+        self._counts = rng.normal(0, 1e6, (round(8 * sampling_rate), 3))
+
+    def at_rate(self, sampling_rate: float) -> Noise:
+        """Return such noise at another rate."""
+        return Noise(sampling_rate)
+
+    def counts(self, _: str, first: int, n: int) -> NDArray[np.float64]:
+        """Return counts, shape (n, 3)."""
+        return self._counts.take(np.arange(first, first + n), axis=0, mode="wrap")
+
+    def times(self, _: str, first: int, n: int) -> NDArray[np.float64]:
+        """Return when samples are taken, in s."""
+        return np.arange(first, first + n) / self.sampling_rate
+
+    def first_sample_after(self, _: str, now: float) -> int:
+        """Return the sample that is taken next."""
+        return int(np.ceil(now * self.sampling_rate))
+
+
+async def play(n_sensors: int, sampling_rate: float) -> None:
+    """Be the devices until standard input is closed."""
+    from sim_devices import serve  # noqa: PLC0415  (only the process that plays them)
+    from sim_devices.device import ChannelSpec, DeviceSpec, Line  # noqa: PLC0415
+    from sim_devices.epson import EpsonDevice  # noqa: PLC0415
+    from sim_devices.faults import LineFaults  # noqa: PLC0415
+    from sim_devices.pacing import WorldClock  # noqa: PLC0415
+
+    serve.LEAST_INTERVAL = SEND_INTERVAL
+    clock = WorldClock(time.monotonic_ns())
+    source: Any = Noise(sampling_rate)
+    channels = tuple(ChannelSpec(axis, epson.COUNTS_PER_UNIT) for axis in "xyz")
+    served = []
+    for number in range(n_sensors):
+        name = f"s{number:02}"
+        spec = DeviceSpec((name,), "epson", "tcp", sampling_rate, {name: channels})
+        line = Line(EpsonDevice(spec, source), "tcp")
+        one = serve.Served(line, clock, LineFaults((), name, begin=0.0), lambda *_: None)
+        await one.wire.open()
+        served.append(one)
+    print(json.dumps([one.wire.address for one in served]), flush=True)
+    await asyncio.to_thread(sys.stdin.read)
+    for one in served:
+        await one.close()
+
+
+def measure(bench_file: str, path: str, duration: float) -> None:
+    """Be the recorder, and say what it took."""
+    bench = parse(Path(bench_file).read_text(encoding="utf-8"), check=False)
+    begin: list[float] = []
+
+    def used() -> float:
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        return usage.ru_utime + usage.ru_stime
+
+    def acknowledged(_: object) -> None:
+        if not begin:  # everything is connected and flows
+            begin.extend((used(), time.monotonic()))
+
+    status = record(bench, path, duration=duration, acknowledged=acknowledged)
+    cpu = (used() - begin[0]) / (time.monotonic() - begin[1])
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    missing = sum(sensor.missing for sensor in status.sensors.values())
+    samples = sum(sensor.samples for sensor in status.sensors.values())
+    print(json.dumps({"cpu": cpu, "memory": memory, "missing": missing, "samples": samples}))
+
+
+@contextlib.contextmanager
+def played(n_sensors: int, sampling_rate: float) -> Iterator[Bench]:
+    """Give a bench of devices that are played."""
+    command = [sys.executable, "-m", "benchmarks.recorder", "play", str(n_sensors)]
+    with subprocess.Popen(
+        [*command, str(sampling_rate)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as player:
+        assert player.stdout is not None
+        ports = json.loads(player.stdout.readline())
+        sensors = tuple(
+            Sensor(
+                name=f"s{number:02}",
+                driver="epson",
+                port=port,
+                sampling_rate=sampling_rate,
+                channels=AXES,
+                settings={"temperature_stabilisation": False},
+            )
+            for number, port in enumerate(ports)
+        )
+        yield Bench(name="played", sampling_rate=sampling_rate, sensors=sensors)
+
+
+def case(n_sensors: int, sampling_rate: float, duration: float) -> dict[str, float]:
+    """Record a bench of so many triaxial sensors; return what it took."""
+    with tempfile.TemporaryDirectory() as folder, played(n_sensors, sampling_rate) as bench:
+        bench_file, path = Path(folder) / "bench.toml", Path(folder) / "r.h5"
+        bench_file.write_text(bench.text, encoding="utf-8")
+        command = [sys.executable, "-m", "benchmarks.recorder", "record", str(bench_file)]
+        said = subprocess.run(
+            [*command, str(path), str(duration)], check=True, stdout=subprocess.PIPE, text=True
+        ).stdout
+        found: dict[str, float] = json.loads(said)
+        report = verify(path)
+        found["bad"] = sum(len(sensor.bad_blocks) for sensor in report.sensors)
+        found["size"] = path.stat().st_size
+        return found
+
+
+def run() -> list[Row]:
+    """Return what the largest and a usual bench take."""
+    rows = []
+    for n_sensors, rate, duration, most_cpu in ((64, 1000.0, 20.0, None), (5, 200.0, 10.0, 5.0)):
+        found = case(n_sensors, rate, duration)
+        what = f"{n_sensors} triaxial sensors × {rate:g} Hz for {duration:g} s"
+        per_sample = found["size"] / (found["samples"] * 3)
+        rows += [
+            Row(f"{what}: samples lost or damaged", found["missing"] + found["bad"], "", 0),
+            Row(
+                f"{what}: recorded",
+                found["samples"],
+                "samples",
+                at_least=n_sensors * rate * duration,
+            ),
+            Row(f"{what}: one core", found["cpu"] * 100, "%", most_cpu, note="recorder alone"),
+            Row(f"{what}: memory", found["memory"], "MB"),
+            Row(f"{what}: file", per_sample, "bytes/count", note="white noise, 21 bits"),
+        ]
+    return rows
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["play", n, rate]:
+            asyncio.run(play(int(n), float(rate)))
+        case ["record", bench_file, path, duration]:
+            measure(bench_file, path, float(duration))
