@@ -67,8 +67,10 @@ class Smoothed:
 
     Attributes
     ----------
-    lateness, rate, std : float64, shape (n,)
-        Lateness in s, its rate in s/s, and the lateness's standard deviation in s.
+    lateness, rate : float64, shape (n,)
+        Lateness in s, and its rate in s/s.
+    std : float64, shape (n,)
+        Standard deviation in s of the lateness, up to a constant where samples were observed.
     constant, constant_std : float
         By how much observations from the samples lie above those from arrivals, in s.
     walk, noise : float
@@ -99,10 +101,13 @@ def smooth(observations: Observations) -> Smoothed:
     track = _Track.empty(len(observations.seconds))
     _filter(observations, walks[best : best + 1], noises[best : best + 1], track)
     state, covariance = _backwards(track)
+    variance = covariance[:, 0, 0]
+    if observations.from_samples.any():
+        variance = variance + 2 * covariance[:, 0, 2] + covariance[:, 2, 2]
     return Smoothed(
         lateness=state[:, 0],
         rate=state[:, 1],
-        std=np.sqrt(np.maximum(covariance[:, 0, 0], 0.0)),
+        std=np.sqrt(np.maximum(variance, 0.0)),
         constant=float(state[-1, 2]),
         constant_std=float(np.sqrt(max(covariance[-1, 2, 2], 0.0))),
         walk=walk,

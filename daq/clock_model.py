@@ -49,6 +49,7 @@ _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes 
 _CONSTANT_KNOWN = 0.02  # samples
 _ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
 _RATE_OFF = 0.02  # share by which a rate may be off
+_STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
 _LEVEL = 10  # groups over which a slope can be told from jitter
 _UTC_JUMP = 0.01  # samples
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
@@ -229,6 +230,7 @@ class ArrivalTimes:
     _epoch: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _end_sample: int = 0
     _device_utc: bool = False
+    _lowest: float = np.inf
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -254,14 +256,15 @@ class ArrivalTimes:
             index = first + length - 1
             elapsed = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
         late = elapsed - index / self.sampling_rate
-        before = late[:1] if begins else self._late[-1:]
-        earlier = np.concatenate([before, late[:-1]]) - late
         if self._device_utc:
-            breaks = np.abs(earlier) > _UTC_JUMP / self.sampling_rate
+            step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
+            breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
         else:
-            since = np.diff(index, prepend=index[:1] if begins else self._index[-1:])
-            asleep = earlier > _ASLEEP + _RATE_OFF * since / self.sampling_rate
-            breaks = ((flags & int(_BREAKS)) != 0) | asleep
+            # Far below all before, even if the rate is off: the host's clock stood still.
+            level = late + _RATE_OFF * index / self.sampling_rate
+            lowest = np.minimum.accumulate(np.append(self._lowest, level))
+            self._lowest = float(lowest[-1])
+            breaks = ((flags & int(_BREAKS)) != 0) | (level < lowest[:-1] - _ASLEEP)
         breaks[0] |= begins
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
@@ -407,7 +410,9 @@ def _earliest(index: IntArray, late: FloatArray, epoch: IntArray, length: float)
     group = (index / length).astype(np.int64)
     # A sensor whose rate is off by per cent would otherwise keep each group's last, or first.
     if len(index) > 2 and np.ptp(index) > _LEVEL * length:
-        late = late - np.polynomial.polynomial.polyfit(index - index[0], late, 1)[1] * index
+        slope = float(np.polynomial.polynomial.polyfit(index - index[0], late, 1)[1])
+        if abs(slope * length) > _STEEP:
+            late = late - slope * index
     order = np.lexsort((late, group, epoch))
     kept = np.ones(len(order), dtype=bool)
     kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)

@@ -175,6 +175,9 @@ class Snapshot:
         sensor's own count of time then lags, in seconds: what the clocks do. Of the last recording.
     closed : bool
         Whether nothing more will come.
+    diagnostics : dict
+        ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
+        ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
     """
 
     frequency: FloatArray
@@ -475,7 +478,30 @@ class Estimation:
             clocks=self._passes[-1].aligned.clocks,
             drift=self._passes[-1].drift(),
             closed=all(recording.closed for recording in self._recordings),
+            diagnostics=self._diagnostics(csm, results),
         )
+
+    def _diagnostics(self, csm: ComplexArray, results: dict[str, SelfNoise]) -> dict[str, Any]:
+        """Say what is left between the clocks, and what it does to the noise estimate.
+
+        A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the
+        common motion, and so into its noise.
+        """
+        aligned = self._passes[-1].aligned
+        residual = np.array([state.residual for state in aligned.clocks])
+        diagnostics: dict[str, Any] = {
+            "synchronisation": {
+                "residual": dict(zip((s.sensor for s in aligned.clocks), residual, strict=True))
+            }
+        }
+        if results and len(residual) == len(aligned.dims):
+            noise = next(iter(results.values())).noise_psd
+            coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
+            delay = np.repeat(residual, aligned.dims)
+            turn = 2 * np.pi * self._passes[0].welch.frequencies[:, None] * delay
+            with np.errstate(invalid="ignore", divide="ignore"):
+                diagnostics["synchronisation"]["noise_bias"] = turn**2 * coherent / np.abs(noise)
+        return diagnostics
 
     def _n_effective(self) -> float:
         window = get_window(self.settings.window, self._passes[0].welch.segment_length)
