@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
-from daq.drivers.registry import driver_type
-from daq.errors import DeviceError
+from daq.probe import probe_bench
 from tui.output import console, for_people, write_json
+from tui.results import plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daq.bench import Bench, Sensor
-    from daq.drivers.base import DeviceInformation
+    from daq.bench import Bench
+    from daq.errors import DeviceError
+    from daq.probe import SensorCheck
 
 
 def write_template(out: Path, *, force: bool) -> None:
@@ -50,17 +50,18 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
     bench = load(path)
     screen = for_people(json)
     screen.print(_summary(bench))
-    found: list[DeviceInformation] = []
+    found: list[SensorCheck] = []
     errors: list[DeviceError] = []
     if devices:
-        found, errors = asyncio.run(_ask_all(bench))
+        found, errors = asyncio.run(probe_bench(bench, SystemClock(bench.speed)))
         if found:
-            screen.print(_information_table(found))
+            screen.print(_device_table(found))
+            screen.print(_channel_table(found))
     write_json(
         json,
         {
             "bench": bench.name,
-            "sensors": [asdict(information) for information in found],
+            "sensors": plain(found),
             "errors": [str(error) for error in errors],
         },
     )
@@ -82,34 +83,45 @@ def _summary(bench: Bench) -> str:
     )
 
 
-async def _ask_all(bench: Bench) -> tuple[list[DeviceInformation], list[DeviceError]]:
-    answers = await asyncio.gather(
-        *(_ask(sensors) for sensors in bench.ports().values()), return_exceptions=True
-    )
-    found: list[DeviceInformation] = []
-    errors: list[DeviceError] = []
-    for answer in answers:
-        if isinstance(answer, DeviceError):
-            errors.append(answer)
-        elif isinstance(answer, BaseException):
-            raise answer
-        else:
-            found.extend(answer)
-    return found, errors
-
-
-async def _ask(sensors: Sequence[Sensor]) -> tuple[DeviceInformation, ...]:
-    async with driver_type(sensors[0].driver).open(sensors, SystemClock()) as session:
-        return session.information
-
-
-def _information_table(found: Sequence[DeviceInformation]) -> Table:
+def _table(columns: Sequence[str]) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column in ("sensor", "model", "serial number", "firmware", "rate", "temperature"):
+    for column in columns:
         table.add_column(column)
+    return table
+
+
+def _device_table(found: Sequence[SensorCheck]) -> Table:
+    table = _table(
+        ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature", "")
+    )
     for entry in found:
-        row: list[Any] = [entry.sensor, entry.model, entry.serial_number, entry.firmware]
-        row.append("" if entry.sampling_rate is None else f"{entry.sampling_rate:g} Hz")
-        row.append("" if entry.temperature is None else f"{entry.temperature:.1f} °C")
-        table.add_row(*row)
+        told = entry.information
+        remarks = [*(["clipped"] if entry.clipped else []), *entry.events]
+        if entry.n_missing:
+            remarks.append(f"{entry.n_missing} samples missing")
+        table.add_row(
+            told.sensor,
+            told.model,
+            told.serial_number,
+            told.firmware,
+            "" if told.sampling_rate is None else f"{told.sampling_rate:g} Hz",
+            "" if entry.measured_rate is None else f"{entry.measured_rate:.1f} Hz",
+            "" if told.temperature is None else f"{told.temperature:.1f} °C",
+            "; ".join(remarks),
+        )
+    return table
+
+
+def _channel_table(found: Sequence[SensorCheck]) -> Table:
+    table = _table(("channel", "mean", "rms", "range", "unit", ""))
+    for entry in found:
+        for channel in entry.channels:
+            table.add_row(
+                f"{entry.information.sensor}.{channel.name}",
+                f"{channel.mean:.4g}",
+                f"{channel.rms:.3g}",
+                f"{channel.least:.4g} … {channel.largest:.4g}",
+                channel.unit,
+                "stuck: nothing connected?" if channel.is_stuck else "",
+            )
     return table

@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from daq.bench import dump, format_duration, parse
-from daq.estimation import Settings
+from daq.estimation import Settings, estimate
 from tui.bands import band_edges, band_means
 from tui.devices import scenario_of, simulated
 from tui.output import for_people, notices, write_json
 from tui.recorder_process import RecorderProcess
 from tui.results import band_of, correlation_of
-from tui.running import finish_recording, follow_to_end
+from tui.running import follow_to_end
 from tui.text import interval, level
 
 if TYPE_CHECKING:
-    from daq.bench import Bench
     from daq.estimation import Snapshot
     from sim_devices.scenario import Scenario
 
@@ -63,17 +62,23 @@ def run_demo(
     bench = parse(text, "demo")
     speed = bench.speed if speed is None else speed
     duration = bench.recording.duration if duration is None else duration
-    on_screen = sys.stdout.isatty() and sys.stdin.isatty() and not table and json is None
+    terminal = all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr))
+    on_screen = terminal and not table and json is None
     with tempfile.TemporaryDirectory(prefix="huddle-demo-") as folder:
         with simulated(bench, speed=speed) as reachable:
             path = Path(folder) / "demo.toml"
             path.write_text(dump(reachable), encoding="utf-8")
+            settings = replace(Settings.of(reachable), methods=METHODS[::-1])
             if on_screen:
-                _open(path, keep)
-                return
-            snapshot, settings = _record(path, reachable, duration or 60.0, speed)
+                out = _show(path, settings)
+            else:
+                out = path.with_suffix(".h5")
+                _record(path, out, settings, duration or 60.0, speed)
+        if out is None or not out.exists():
+            return
+        snapshot = estimate([out], settings)
         if keep is not None:
-            shutil.copyfile(Path(folder) / "demo.h5", keep)
+            shutil.copyfile(out, keep)
             notices().print(f"recording kept as {keep}")
     scenario = scenario_of(bench)
     compared = compare(snapshot, settings, scenario)
@@ -89,33 +94,27 @@ def run_demo(
     write_json(json, _document(compared, snapshot))
 
 
-def _open(path: Path, keep: Path | None) -> None:
-    from tui.application import main  # noqa: PLC0415 - Textual only where there is a screen
+def _show(path: Path, settings: Settings) -> Path | None:
+    from tui.application.main import show_demo  # noqa: PLC0415 - Textual only where it is shown
 
-    main.open_bench(path, methods=METHODS, start=True, out=keep)
+    return show_demo(path, settings)
 
 
-def _record(path: Path, bench: Bench, duration: float, speed: float) -> tuple[Snapshot, Settings]:
-    settings = replace(Settings.of(bench), methods=METHODS)
-    names = ", ".join(sensor.name for sensor in bench.sensors)
+def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> None:
     notices().print(
-        f"Three simulated accelerometers ({names}) on their serial protocol, "
+        "Three simulated accelerometers on their serial protocol, "
         f"{format_duration(duration)} at {speed:g} × life."
     )
-    out = path.with_suffix(".h5")
     recorder = RecorderProcess(path, out, duration=duration)
     try:
         recorder.wait_for_file()
-        snapshot, _ = follow_to_end(recorder, settings, duration=duration)
+        follow_to_end(recorder, settings, duration=duration)
         recorder.check()
-        finish_recording(out, snapshot)
     except KeyboardInterrupt:
-        recorder.interrupt()
-        recorder.wait()
+        recorder.stop()
         raise
     finally:
         recorder.close()
-    return snapshot, settings
 
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:

@@ -11,8 +11,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from daq.control import ask
 from daq.errors import HuddleError
 
 if TYPE_CHECKING:
@@ -107,6 +109,20 @@ class RecorderProcess:
             self._process.send_signal(signal.CTRL_BREAK_EVENT)
         else:
             self._process.send_signal(signal.SIGINT)
+
+    def stop(self) -> None:
+        """Stop it and wait until it has closed its file."""
+        if not self.ended:
+            self.request_stop()
+        self.wait()
+
+    def request_stop(self) -> None:
+        """Ask it to stop: over the control channel, or by a signal where that does not answer."""
+        try:
+            ask(self.out, "stop")
+        except HuddleError:
+            with suppress(OSError):
+                self.interrupt()
 
     def wait(self, timeout: float = STOP_TIMEOUT) -> None:
         """Wait until it has ended; kill it if it does not."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,6 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
-from daq.control import ask
-from daq.errors import HuddleError
 from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
@@ -75,7 +73,7 @@ def run_test(
         if interrupted:
             raise typer.Exit(130)
     except KeyboardInterrupt:
-        _stop(recorder)
+        recorder.request_stop()
         raise
     finally:
         recorder.close()
@@ -112,13 +110,13 @@ def follow_to_end(
                     notices().print("[red]the recorder was ended from outside")
                     break
                 if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
-                    _stop(recorder)
+                    recorder.request_stop()
                 time.sleep(max(INTERVAL, (time.perf_counter() - began) / SHARE))
             except KeyboardInterrupt:
                 if interrupted:
                     raise
                 interrupted = True
-                _stop(recorder)
+                recorder.request_stop()
         recorder.wait()
         if not snapshot.closed:
             heal(recorder.out)
@@ -149,14 +147,6 @@ def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) ->
             f"{format_duration(settings.segment)}, too few for {needed - 1} channels per sensor; "
             f"expected {format_duration(math.ceil(shortest))} at least, or shorter segments"
         )
-
-
-def _stop(recorder: RecorderProcess) -> None:
-    try:
-        ask(recorder.out, "stop")
-    except HuddleError:
-        with suppress(OSError):
-            recorder.interrupt()
 
 
 @contextmanager

@@ -29,7 +29,7 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
     RecordingError
         The recording cannot be read (any more).
     """
-    if json is None and sys.stdout.isatty():
+    if json is None and sys.stdout.isatty() and sys.stdin.isatty():
         from tui.application.main import open_recording  # noqa: PLC0415 - Textual where it is shown
 
         open_recording(file, method=method)

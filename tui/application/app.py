@@ -150,8 +150,10 @@ class HuddleApp(App[None]):
     @on(Fresh)
     def _on_fresh(self, message: Fresh) -> None:
         self._settings = message.settings
-        if not self.choice.methods and message.snapshot.results:
-            self.choice = replace(self.choice, methods=(next(iter(message.snapshot.results)),))
+        if not self.choice.methods:
+            names = tuple(name for name in message.settings.methods if name != "all")
+            names = names or tuple(message.snapshot.results)
+            self.choice = replace(self.choice, methods=names if len(names) < 3 else names[:1])
         self.snapshot = message.snapshot
 
     @on(Trouble)
@@ -243,7 +245,7 @@ class HuddleApp(App[None]):
         names = tuple(self.snapshot.results)
         turns: list[tuple[str, ...]] = [(name,) for name in names]
         if len(names) > 1:
-            turns.append(names)
+            turns.insert(0, names)
         place = turns.index(self.choice.methods) if self.choice.methods in turns else -1
         self.choice = replace(self.choice, methods=turns[(place + 1) % len(turns)])
 

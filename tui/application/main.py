@@ -35,7 +35,6 @@ class BenchControls:
     path: Path
     bench: Bench
     settings: Settings
-    out: Path | None = None
     can_start: bool = True
     started: list[RecorderProcess] = field(default_factory=list)
 
@@ -56,7 +55,7 @@ class BenchControls:
 
     def start(self) -> Path:
         """Start a recorder; returns its file once that is there."""
-        out = self.out or recording_path(self.bench, SystemClock().now())
+        out = recording_path(self.bench, SystemClock().now())
         recorder = RecorderProcess(self.path, out, duration=self.bench.recording.duration)
         self.started.append(recorder)
         recorder.wait_for_file()
@@ -122,22 +121,34 @@ def open_application(source: Path, *, method: str | None) -> None:
         open_bench(source, methods=None if method is None else (str(method),))
 
 
-def open_bench(
-    path: Path,
-    *,
-    methods: tuple[str, ...] | None = None,
-    start: bool = False,
-    out: Path | None = None,
-) -> None:
-    """Open the application on a bench file; ``start`` begins a recording at once."""
+def open_bench(path: Path, *, methods: tuple[str, ...] | None = None) -> None:
+    """Open the application on a bench file."""
     bench = load(path)
     settings = Settings.of(bench)
     settings = replace(settings, methods=methods or _beside(settings.methods))
-    controls = BenchControls(path, bench, settings, out)
+    controls = BenchControls(path, bench, settings)
     try:
-        HuddleApp(controls, start=start).run()
+        HuddleApp(controls).run()
     finally:
         controls.release()
+
+
+def show_demo(path: Path, settings: Settings) -> Path | None:
+    """Open the application on a simulated bench, recording at once; stop with the application.
+
+    Returns
+    -------
+    Path or None
+        The last recording, closed.
+    """
+    controls = BenchControls(path, load(path), settings)
+    try:
+        HuddleApp(controls, start=True).run()
+        for recorder in controls.started:
+            recorder.stop()
+    finally:
+        controls.release()
+    return controls.started[-1].out if controls.started else None
 
 
 def open_recording(path: Path, *, method: str | None = None) -> None:
