@@ -12,7 +12,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from estimator.advice import Advice, advise
 from estimator.coherency import check_dims, coherency
@@ -241,7 +241,7 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
         scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
         statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
         r = np.arange(coherence.shape[1])
-        limit = stats.chi2.isf(DIMENSION_LEVEL / len(pairs), 2 * (dims[j] - r) * (dims[k] - r))
+        limit = special.chdtri(2 * (dims[j] - r) * (dims[k] - r), DIMENSION_LEVEL / len(pairs))
         found[usable] = np.maximum(found[usable], (statistic > limit).sum(axis=1))
     return np.where(usable, found, np.nan)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from estimator.errors import InvalidMatrixError
 
@@ -148,7 +148,7 @@ def interval(
         upper end grows with c and no longer with its exponential, so that it stays finite
         when the estimate stands at zero.
     """
-    z = float(stats.norm.isf((1 - level) / 2))
+    z = float(special.ndtri((1 + level) / 2))
     positive = np.where(noise_psd > 0, noise_psd, 1.0)
     c = np.where(noise_psd > 0, standard_error / positive, np.inf)
     low = np.where(noise_psd > 0, noise_psd * np.exp(-z * c), 0.0)

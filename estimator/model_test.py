@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from estimator import fisher
 from estimator.errors import InsufficientDataError
@@ -114,7 +114,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     degrees = order**2 - estimated
     mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
     statistic = 2 * averages * maximum.discrepancy * degrees / mean
-    return ModelTest(statistic, degrees, np.asarray(stats.chi2.sf(statistic, degrees)))
+    return ModelTest(statistic, degrees, np.asarray(special.chdtrc(degrees, statistic)))
 
 
 def _estimated_parameters(maximum: Maximum) -> FloatArray:
@@ -192,7 +192,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
         return BandTest(total, degrees, float("nan"), count)
     pairs = np.array([np.sum(taken[h:] & taken[:-h]) for h in range(1, len(r) + 1)])
     spread = 1 + 2 * float(pairs @ r**2) / count
-    p_value = float(stats.chi2.sf(total / spread, degrees / spread))
+    p_value = float(special.chdtrc(degrees / spread, total / spread))
     return BandTest(total, degrees, p_value, count)
 
 
