@@ -150,6 +150,18 @@ def test_bias_scatter_and_coverage_from_twenty_averages_on(
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
+def test_ten_times_less_motion_than_noise_biases_by_less_than_one_percent(d: int) -> None:
+    csm, noise_psd = bench((d,) * 3, 0.1)
+    sample = wishart(csm, 1080, np.random.default_rng(6), n_draws=6000)
+    found = three_sensor(sample, dims=(d,) * 3, n_effective=1080)
+    relative = found.noise_psd / noise_psd
+    error = relative.std(axis=0) / np.sqrt(len(sample))
+    assert np.all(np.abs(relative.mean(axis=0) - 1) < 0.01 + 4.5 * error)
+    covers = (found.low < noise_psd) & (noise_psd < found.high)
+    assert 0.93 < covers.mean() < 0.99  # too wide where the motion drowns, never too narrow
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
 def test_uncorrected_bias_is_minus_d_over_n(d: int) -> None:
     csm, noise_psd = bench((d,) * 3, 100)
     sample = wishart(csm, 20, np.random.default_rng(5), n_draws=20_000)
