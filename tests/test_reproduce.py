@@ -184,6 +184,17 @@ def test_an_unknown_study_is_refused_before_anything_is_simulated() -> None:
     assert set(STUDIES) >= {"fig4", "fig5", "fig9", "fig12", "fig13", "setup1", "setup2", "fig14"}
 
 
+def test_the_command_line_refuses_an_unknown_study() -> None:
+    said = subprocess.run(
+        [sys.executable, "-m", "tui", "reproduce", "fig6"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert said.returncode == 2
+    assert "no study 'fig6'" in said.stderr
+
+
 def test_naming_a_study_loads_no_matplotlib() -> None:
     code = "import sys, tui.reproduce; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

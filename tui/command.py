@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from tui.commands import EXAMPLES, acquisition, recordings, setup
+from tui.commands import EXAMPLES, acquisition, recordings, setup, studies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -113,7 +113,7 @@ _PANELS = {
         acquisition.serve,
     ),
     "Recordings": (recordings.estimate, recordings.import_),
-    "Without hardware": (setup.demo, setup.devices, recordings.simulate),
+    "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),
 }
 for _panel, _commands in _PANELS.items():
     for _command in _commands:
