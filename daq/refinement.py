@@ -16,7 +16,7 @@ frequencies under the window.
 
 P is averaged over segments already freed of their delays. The first batch does so by iteration and
 thereby defines a frame; later batches are measured in that frame, which makes the delays of a whole
-recording comparable. The frame's own delay is the slope of P's phase.
+recording comparable. The frame's own delay is the one that makes P most nearly real.
 """
 
 from __future__ import annotations
@@ -132,19 +132,17 @@ class DelayMeter:
         return delays, std
 
     def frame_delays(self) -> FloatArray:
-        """Return the delay of each frame, from the slope of its phase, in seconds."""
-        step = self.omega[0]
+        """Return the delay of each frame, that of a real relative response, in seconds."""
         delays = np.zeros(len(self.columns) - 1)
         for number, frame in enumerate(self._frames):
             response, left = _prediction(frame)
+            # A rotation with gains is real: the sum of squares turns with twice the delay.
+            squares = np.einsum("fpq,fpq->f", response, response)
+            size = np.einsum("fpq,fpq->f", response, response.conj()).real
+            own = np.einsum("fpp->f", frame.own).real / frame.n_segments
             # How much of the sensor is predicted, as a weight that noise cannot raise.
-            predicted = np.einsum("fpp->f", frame.own).real - np.einsum("fpp->f", left).real
-            weight = np.maximum(predicted, 0) / np.einsum("fpp->f", frame.own).real
-            weight = np.minimum(weight[1:], weight[:-1])
-            turn = np.einsum("fpq,fpq->f", response[1:], response[:-1].conj())
-            size = np.abs(turn)
-            turn = np.sum(weight * turn / np.where(size > 0, size, 1.0))
-            delays[number] = -np.angle(turn) / step
+            weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
+            delays[number] = self._peak((weight * squares / size)[:, None])[0] / 2
         return delays
 
     def _spectra(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
@@ -170,12 +168,7 @@ class DelayMeter:
         weighted = np.matmul(predicted.conj(), weight)
         crossed = np.einsum("fsp,fsp->fs", weighted, xj)
         energy = np.einsum("fsp,fsp->fs", weighted, predicted).real
-        tau = self._search(crossed)
-        for _ in range(_NEWTON_STEPS):
-            turned = crossed * _turn(omega, tau)
-            curvature = omega**2 @ turned.real
-            step = (omega @ turned.imag) / np.where(curvature > 0, curvature, np.inf)
-            tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
+        tau = self._peak(crossed)
         # Neighbouring frequencies share samples of the window: κ of them count as one.
         w2 = self.window**2
         kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
@@ -185,6 +178,17 @@ class DelayMeter:
             std = np.sqrt(kappa / (2 * (omega**2 @ energy)))
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
+
+    def _peak(self, crossed: ComplexArray) -> FloatArray:
+        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column."""
+        omega = self.omega
+        tau = self._search(crossed)
+        for _ in range(_NEWTON_STEPS):
+            turned = crossed * _turn(omega, tau)
+            curvature = omega**2 @ turned.real
+            step = (omega @ turned.imag) / np.where(curvature > 0, curvature, np.inf)
+            tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
+        return tau
 
     def _search(self, crossed: ComplexArray) -> FloatArray:
         """Return the best delay on a grid of a fraction of a period of the highest frequency."""

@@ -1,0 +1,84 @@
+"""Delays from the common motion: known ones in any orientation, and silence where there is none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.refinement import DelayMeter
+from daq.resampling import resample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+RATE, LENGTH, HOP = 200.0, 1000, 500
+WINDOW = np.hanning(LENGTH + 1)[:-1]
+COLUMNS = (slice(0, 2), slice(2, 4))
+
+
+def shifted(n: int, delays: FloatArray) -> FloatArray:
+    """White motion in two directions, read late by a curve given at the middles of segments."""
+    motion = np.random.default_rng(5).standard_normal((n + 200, 2))
+    middles = np.arange(len(delays)) * HOP + LENGTH / 2
+    rows = np.arange(n) - RATE * np.interp(np.arange(n), middles, delays)
+    return resample(motion, 100.5 + rows)
+
+
+def huddle(n_segments: int, delays: FloatArray, noise: float, seed: int) -> FloatArray:
+    """Two sensors, the second turned by 25° and delayed."""
+    rng = np.random.default_rng(seed)
+    n = (n_segments - 1) * HOP + LENGTH
+    cos, sin = np.cos(0.44), np.sin(0.44)
+    second = shifted(n, delays) @ np.array([[cos, -sin], [sin, cos]])
+    samples = np.hstack([shifted(n, np.zeros(n_segments)), 1.02 * second])
+    return np.asarray(samples + noise * rng.standard_normal(samples.shape))
+
+
+def test_known_delays_are_measured_as_well_as_stated() -> None:
+    n = 80
+    delays = 4e-4 + 2e-4 * np.sin(np.arange(n) / 9.0)
+    samples = huddle(n, delays, 0.03, 1)
+    meter = DelayMeter(RATE, WINDOW, COLUMNS)
+    measured, std = meter.measure(samples, np.arange(n) * HOP)
+    whole = measured[:, 0] + meter.frame_delays()[0]
+    # The curve bends by some 1 µs within a segment.
+    error = whole - delays
+    assert abs(error.mean()) < 5e-6
+    assert np.std(error) < 1.3 * np.median(std) + 1e-6
+    assert np.std(error) > 0.5 * np.median(std)
+    assert np.median(std) < 2e-5
+
+
+def test_later_batches_are_measured_in_the_frame_of_the_first() -> None:
+    n = 80
+    delays = np.concatenate([np.zeros(40), np.full(40, 3e-3)])  # more than half a sample
+    samples = huddle(n, delays, 0.03, 2)
+    meter = DelayMeter(RATE, WINDOW, COLUMNS)
+    starts = np.arange(n) * HOP
+    first, _ = meter.measure(samples, starts[:38])
+    second, _ = meter.measure(samples, starts[42:])
+    assert second.mean() - first.mean() == pytest.approx(3e-3, abs=5e-6)
+
+
+def test_without_common_motion_nothing_is_claimed() -> None:
+    rng = np.random.default_rng(3)
+    n = 120
+    samples = rng.standard_normal(((n - 1) * HOP + LENGTH, 4))
+    meter = DelayMeter(RATE, WINDOW, COLUMNS)
+    starts = np.arange(n) * HOP
+    first, _ = meter.measure(samples, starts[:60])
+    later, std = meter.measure(samples, starts[60:])
+    assert np.all(np.abs(first[np.isfinite(first)]) < 5e-3)  # in its own sums: about nothing
+    assert np.mean(np.isinf(std)) > 0.8
+    assert np.isnan(later[np.isinf(std)]).all()
+
+
+def test_too_few_segments_define_no_frame() -> None:
+    samples = huddle(10, np.zeros(10), 0.03, 4)
+    measured, std = DelayMeter(RATE, WINDOW, COLUMNS).measure(samples, np.arange(10) * HOP)
+    assert np.isnan(measured).all()
+    assert np.isinf(std).all()

@@ -1,0 +1,33 @@
+"""Free-running sensors, from their samples and block times to their noise: the short study."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tui.clock_study import Latency, study
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
+def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Latency) -> None:
+    rows = {
+        row.clocks: row for row in study(tmp_path, snr=1e4, duration=400.0, latency=latency, seed=3)
+    }
+    assert np.abs(rows["face value"].against_oracle[3:]).min() > 10  # garbage
+    assert rows["refined"].residual_us.max() < 2.0
+    assert np.abs(rows["refined"].against_oracle).max() < 0.02
+    assert rows["refined"].cov == pytest.approx(rows["oracle"].cov, rel=0.05)
+    if latency.kind == "batching":
+        assert np.abs(rows["arrival times"].against_oracle).max() > 0.1
+
+
+def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:
+    rows = {row.clocks: row for row in study(tmp_path, snr=0.3, duration=400.0, seed=4)}
+    alone, refined = rows["arrival times"], rows["refined"]
+    assert np.all(refined.residual_us < alone.residual_us + 1.0)
+    assert np.abs(refined.against_oracle).max() < np.abs(alone.against_oracle).max() + 1e-3
