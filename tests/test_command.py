@@ -32,6 +32,9 @@ COMMANDS = (
     "estimate",
     "tui",
     "serve",
+    "repair",
+    "plan",
+    "reproduce",
 )
 
 

@@ -106,13 +106,14 @@ _PANELS = {
     "On the bench": (
         setup.init,
         setup.check,
+        setup.plan,
         acquisition.tui,
         acquisition.run,
         acquisition.record,
         acquisition.watch,
         acquisition.serve,
     ),
-    "Recordings": (recordings.estimate, recordings.import_),
+    "Recordings": (recordings.estimate, recordings.import_, recordings.repair),
     "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),
 }
 for _panel, _commands in _PANELS.items():

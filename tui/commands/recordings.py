@@ -1,4 +1,4 @@
-"""``estimate``, ``import``, ``simulate``."""
+"""``estimate``, ``import``, ``simulate``, ``repair``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -13,6 +13,7 @@ from tui.options import (
     CsvOption,
     DetrendOption,
     DurationOption,
+    FileArgument,
     FilesArgument,
     JsonOption,
     MethodOption,
@@ -147,3 +148,19 @@ def simulate(
     from tui.simulate import simulate_recording
 
     simulate_recording(scenario, out=out, duration=duration, json=json)
+
+
+@examples("huddle repair killed.h5", "huddle repair night.h5 --check --json -")
+def repair(
+    file: FileArgument,
+    *,
+    check: Annotated[bool, typer.Option("--check", help="Only look, change nothing.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Check a recording's checksums, and close what a crash left open.
+
+    Everything that had been acknowledged is kept; a tail that had not is cut off.
+    """
+    from tui.repairing import repair_recording
+
+    repair_recording(file, check=check, json=json)

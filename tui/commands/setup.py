@@ -1,4 +1,4 @@
-"""``init``, ``check``, ``devices``, ``demo``."""
+"""``init``, ``check``, ``plan``, ``devices``, ``demo``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -97,3 +97,24 @@ def demo(
     from tui.demo import run_demo
 
     run_demo(duration=duration, speed=speed, keep=keep, table=table, json=json)
+
+
+@examples("huddle plan lab.toml --snr 1000 --cov 0.05")
+def plan(
+    bench: BenchArgument,
+    *,
+    snr: Annotated[
+        float, typer.Option("--snr", min=1e-6, help="Motion over noise, as ratio of PSDs.")
+    ] = 1000.0,
+    cov: Annotated[
+        float, typer.Option("--cov", min=1e-4, max=1.0, help="Wanted scatter of one frequency.")
+    ] = 0.05,
+    json: JsonOption = None,
+) -> None:
+    """Say how long to record for a wanted precision, with each method.
+
+    The sensors stand as the bench file's simulation says, or along common axes.
+    """
+    from tui.planning import plan_test
+
+    plan_test(bench, snr=snr, cov=cov, json=json)

@@ -1,0 +1,89 @@
+"""``huddle plan``: how long to record for a wanted precision."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+
+from daq.bench import format_duration, load
+from estimator.planning import plan, planned_csm
+from estimator.spectra import WelchSettings
+from tui.devices import scenario_of
+from tui.output import for_people, write_json
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.bench import Bench
+    from estimator.planning import Plan
+    from tui.bands import FloatArray
+
+
+def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
+    """Show what every method needs on a bench; the sensors stand as its simulation says."""
+    bench = load(path)
+    settings = WelchSettings(
+        sampling_rate=bench.sampling_rate,
+        segment_length=round(bench.estimate.segment * bench.sampling_rate),
+        overlap=bench.estimate.overlap,
+        window=bench.estimate.window,
+    )
+    csm, noise = planned_csm(_directions(bench), snr=snr)
+    dims = tuple(sensor.n_main_channels for sensor in bench.sensors)
+    plans = plan(csm, noise, dims=dims, settings=settings, cov=cov)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("method")
+    for name in ("record for", "segments", "bias that stays"):
+        table.add_column(name, justify="right")
+    for entry in plans:
+        table.add_row(entry.method, *_row(entry))
+    screen = for_people(json)
+    screen.print(
+        f"For a c.o.v. of {cov:g} per frequency in every channel, at motion {snr:g} × noise, "
+        f"{format_duration(bench.estimate.segment)} {settings.window} segments:"
+    )
+    screen.print(table)
+    write_json(
+        json,
+        {
+            "snr": snr,
+            "cov": cov,
+            "methods": [
+                {
+                    "method": entry.method,
+                    "duration": _worst(entry.duration),
+                    "segments": _worst(entry.n_segments),
+                    "bias": entry.bias[0].tolist(),
+                }
+                for entry in plans
+            ],
+        },
+    )
+
+
+def _directions(bench: Bench) -> FloatArray:
+    """Return where the channels point: as simulated, or along common axes."""
+    if bench.simulation:
+        scenario = scenario_of(bench)
+        return np.vstack([scenario.directions(sensor.name) for sensor in bench.sensors])
+    most = max(sensor.n_main_channels for sensor in bench.sensors)
+    return np.vstack([np.eye(most)[: sensor.n_main_channels] for sensor in bench.sensors])
+
+
+def _worst(values: FloatArray) -> float:
+    return float(np.max(values)) if np.isfinite(values).all() else float("nan")
+
+
+def _row(entry: Plan) -> tuple[str, str, str]:
+    duration, segments = _worst(entry.duration), _worst(entry.n_segments)
+    if np.isnan(duration):
+        return "says nothing", "", ""
+    low, high = float(entry.bias.min()), float(entry.bias.max())
+    none = max(-low, high) < 1e-3
+    return (
+        format_duration(duration),
+        f"{segments:.0f}",
+        "none" if none else f"{low:+.0%} to {high:+.0%}",
+    )
