@@ -167,7 +167,7 @@ def maximise(
             f"{n_factors} factors of motion cannot be told from the noise of {p} channels: "
             f"at most {max_factors(p)} can"
         )
-    usable, partial = _partial_spectra(csm)
+    usable, precision, rounding = _precision(csm)
     n_freqs = len(csm)
     found = Maximum(
         psi=np.full((n_freqs, p), np.nan),
@@ -183,15 +183,17 @@ def maximise(
         penalty=np.zeros((p, p)) if penalty is None else penalty,
     )
     if usable.any():
-        x0 = np.log(partial[usable] * (1 - n_factors / (2 * p)))
+        partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
+        x0 = np.log(partial * (1 - n_factors / (2 * p)))
         if start is not None:
             given = start[usable]
             x0 = np.where(given > 0, np.log(np.where(given > 0, given, 1.0)), x0)
-        lowest = np.log(partial[usable] * BOUNDARY)
+        lowest = np.log(partial * BOUNDARY)
         _search(
-            csm[usable],
+            precision[usable],
             np.maximum(x0, lowest),
             lowest=lowest,
+            rounding=rounding[usable],
             found=found,
             where=np.flatnonzero(usable),
             max_iterations=max_iterations,
@@ -199,36 +201,38 @@ def maximise(
     return found
 
 
-def _partial_spectra(csm: ComplexArray) -> tuple[BoolArray, FloatArray]:
-    """Where the matrices are positive definite, and 1 / (S^-1)_ii, what no channel predicts."""
+def _precision(csm: ComplexArray) -> tuple[BoolArray, ComplexArray, FloatArray]:
+    """Where the matrices are positive definite, their inverses, and the rounding of these."""
     p = csm.shape[-1]
     power = np.real(np.einsum("fii->fi", csm))
     usable = np.isfinite(csm).all(axis=(1, 2)) & (power > 0).all(axis=1)
     scale = 1 / np.sqrt(np.where(usable[:, None], power, 1.0))
-    coherency = np.where(
-        usable[:, None, None], csm * scale[:, :, None] * scale[:, None, :], np.eye(p)
-    )
-    w, u = np.linalg.eigh(coherency)
-    usable &= w[:, 0] > 4 * p * np.finfo(np.float64).eps
-    w = np.where(usable[:, None], w, 1.0)
-    inverse = np.einsum("fik,fk->fi", np.abs(u) ** 2, 1 / w)
-    return usable, power / inverse
+    outer = scale[:, :, None] * scale[:, None, :]
+    identity = np.eye(p)
+    coherency = np.where(usable[:, None, None], csm * outer, identity)
+    least = np.linalg.eigvalsh(coherency)[:, 0]
+    usable &= least > 4 * p * np.finfo(np.float64).eps
+    inverse = np.linalg.inv(np.where(usable[:, None, None], coherency, identity))
+    inverse = (inverse + inverse.conj().swapaxes(1, 2)) / 2
+    rounding = 1e-15 * p / np.where(usable, least, 1.0)
+    return usable, np.asarray(inverse * outer, np.complex128), np.asarray(rounding, np.float64)
 
 
 def _search(
-    csm: ComplexArray,
+    precision: ComplexArray,
     x0: FloatArray,
     *,
     lowest: FloatArray,
+    rounding: FloatArray,
     found: Maximum,
     where: IntArray,
     max_iterations: int,
 ) -> None:
     """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
     q = found.n_factors
-    n = len(csm)
+    n = len(precision)
     penalty = found.penalty
-    best = _evaluate(csm, x0, q)
+    best = _evaluate(precision, x0, q)
     gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
     radius = np.full(n, _MAX_STEP)
     iterations = np.ones(n, np.int64)
@@ -240,14 +244,15 @@ def _search(
         size = np.abs(step[going]).max(axis=1)
         shrink = np.minimum(1.0, radius[going] / np.maximum(size, _MIN_RADIUS))
         trial_step = step[going] * shrink[:, None]
-        trial = _evaluate(csm[going], np.maximum(best.x[going] + trial_step, lowest[going]), q)
+        trial = _evaluate(
+            precision[going], np.maximum(best.x[going] + trial_step, lowest[going]), q
+        )
         iterations[going] += 1
         expected = decrement[going] * shrink * (1 - shrink / 2)
         gain = best.discrepancy[going] - trial.discrepancy
         gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
-        rounding = 1e-13 * best.eigenvalues[going, 0] + 1e-12
-        accept = gain >= 1e-4 * expected - rounding
-        poor = gain < 0.25 * expected - rounding
+        accept = gain >= 1e-4 * expected - rounding[going]
+        poor = gain < 0.25 * expected - rounding[going]
         radius[going] = np.where(
             poor,
             0.25 * np.minimum(size, radius[going]),
@@ -273,13 +278,17 @@ def _search(
     found.boundary[where] = at_boundary
 
 
-def _evaluate(csm: ComplexArray, x: FloatArray, q: int) -> _Point:
-    scale = np.exp(-0.5 * x)
-    w, u = np.linalg.eigh(csm * scale[:, :, None] * scale[:, None, :])
-    w, u = w[:, ::-1], u[:, :, ::-1]
-    w = np.maximum(w, np.finfo(np.float64).tiny)
+def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
+    """Whiten by psi and diagonalise, on the inverse matrix.
+
+    There the residual eigenvalues are the large ones, and keep their digits however strong the
+    motion is and however small one psi becomes.
+    """
+    scale = np.exp(0.5 * x)
+    inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])
+    w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
     terms = np.where(_residual(w, q), w - np.log(w) - 1, 0.0)
-    return _Point(x.copy(), terms.sum(axis=1), w.copy(), u.copy())
+    return _Point(x.copy(), terms.sum(axis=1), w, u)
 
 
 def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:

@@ -98,6 +98,25 @@ def test_arrives_where_fixed_points_crawl(csm: ComplexArray, n_factors: int) -> 
     assert found.gradient_norm.max() < 1e-3
 
 
+def test_arrives_wherever_it_starts_from() -> None:
+    """Three to five sensors, SNR 0.01 to 1e6, noise 1e4 apart, few averages, any factors."""
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        n_sensors, d = int(rng.integers(3, 6)), int(rng.integers(1, 4))
+        p = n_sensors * d
+        n_averages = int(rng.choice([p + 1, 2 * p, 100, 1080, 100_000]))
+        n_factors = d if rng.random() < 0.5 else int(rng.integers(0, max_factors(p) + 1))
+        csm = random_bench(
+            rng,
+            dims=(d,) * n_sensors,
+            snr=10 ** rng.uniform(-2, 6),
+            noise_psd=10 ** rng.uniform(-2, 2, p),
+        )
+        found = maximise(wishart(csm, n_averages, rng, n_draws=10), n_factors)
+        assert found.converged.all()
+        assert found.iterations.max() < 150
+
+
 def test_second_order_means_few_iterations() -> None:
     draws = wishart(
         equal_noise(9, dims=(3, 3, 3), snr=1e3), 1080, np.random.default_rng(9), n_draws=100
