@@ -49,7 +49,6 @@ _WORDS = {
     reg.STREAM_TRIGGER_INDEX: 0,
     reg.STREAM_START_TIME_STAMP: 0,
     reg.STREAM_ENABLE: 0,
-    reg.LAST_ERROR_DETAIL: 0,
     reg.TEST: reg.TEST_VALUE,
     reg.FLASH_READ_POINTER: 0,
     43903: 0,
@@ -98,6 +97,7 @@ class LabJack:
             self._store(address, struct.pack(">f", value))
         for address, value in _WORDS.items():
             self._store(address, struct.pack(">I", value))
+        self._store(reg.LAST_ERROR_DETAIL, bytes(2))
         for k in range(128):
             self._store(reg.STREAM_SCANLIST + 2 * k, bytes(4))
         for n in range(14):
@@ -115,7 +115,7 @@ class LabJack:
         try:
             pdu = bytes((function,)) + self._function(function, adu.pdu, now)
         except RefusedError as refused:
-            self._store(reg.LAST_ERROR_DETAIL, struct.pack(">I", refused.reason))
+            self._store(reg.LAST_ERROR_DETAIL, struct.pack(">H", refused.reason))
             pdu = bytes((function | 0x80, refused.exception))
         except (RemoteProtocolError, struct.error):
             pdu = bytes((function | 0x80, 3))

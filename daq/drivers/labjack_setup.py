@@ -123,7 +123,7 @@ class Registers:
 
     async def _reason(self) -> str:
         with contextlib.suppress(RemoteProtocolError):
-            values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 2))
+            values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 1))
             return f", reason {int.from_bytes(values, 'big')}"
         return ""
 

@@ -1,0 +1,88 @@
+"""The Rust client async_labjack reads our simulated LabJack, in both stream modes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from sim_devices import launch
+from tests.sim_devices.bench import scenario, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sim_devices.launch import RunningDevice
+
+pytestmark = [pytest.mark.peer, pytest.mark.timeout(600)]
+
+RATE = 1000.0
+COUNTS = 3166.5 * 100
+CENTER = 33523
+TICKS = 40_000
+
+
+@pytest.fixture(scope="module")
+def peer() -> Path:
+    """Compile the client, once for this user: it takes half a minute."""
+    cargo = shutil.which("cargo")
+    if cargo is None:
+        pytest.skip("no cargo to build the async_labjack peer with")
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    target = cache / "huddle-tests" / "async_labjack"
+    manifest = Path(__file__).with_name("async_labjack_peer") / "Cargo.toml"
+    built = subprocess.run(
+        [cargo, "build", "--quiet", "--manifest-path", str(manifest)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "CARGO_TARGET_DIR": str(target)},
+    )
+    if built.returncode and ("failed to download" in built.stderr or "registry" in built.stderr):
+        pytest.skip("async_labjack 0.1.0 (crates.io) cannot be fetched here")
+    assert built.returncode == 0, built.stderr
+    return target / "debug" / "async_labjack_peer"
+
+
+@pytest.fixture(scope="module")
+def digitizer() -> Iterator[RunningDevice]:
+    table: dict[str, Any] = {
+        "sensors": ["A"],
+        "driver": "labjack",
+        "port": "tcp",
+        "sampling_rate": RATE,
+        "channels": {"A": [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]},
+    }
+    with launch.start(spec(table, sampling_rate=RATE)) as (one,):
+        yield one
+
+
+@pytest.mark.parametrize("mode", ["spontaneous", "command-response"])
+def test_async_labjack_reads_our_device(peer: Path, digitizer: RunningDevice, mode: str) -> None:
+    n_scans = 730  # not a whole number of packets
+    control = digitizer.port.removeprefix("modbus-tcp://")
+    stream = f"127.0.0.1:{digitizer.settings['stream_port']}"
+    said = subprocess.run(
+        [str(peer), control, stream, mode, str(n_scans)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert said.returncode == 0, said.stderr
+    calibration, *lines = said.stdout.splitlines()
+    assert [float(v) for v in calibration.split()] == pytest.approx(
+        [33523, 3.158e-4, -3.158e-4], rel=1e-4
+    )
+    scans = np.array([line.split() for line in lines], dtype=np.int64)
+    assert scans.shape == (n_scans, 4)
+    timer = scans[:, 0] + 65536 * scans[:, 1]
+    assert set(np.diff(timer).tolist()) == {TICKS}
+    first = int(timer[0]) // TICKS
+    truth = scenario("A", sampling_rate=RATE).samples("A", first, n_scans)[:, :2] * COUNTS + CENTER
+    assert np.abs(truth - scans[:, 2:]).max() <= 0.5
