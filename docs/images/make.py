@@ -1,0 +1,128 @@
+"""Make the pictures of the README: `python docs/images/make.py` from the root of the repository.
+
+The application is photographed while it looks at a recording simulated from the demo's bench; the
+figure is made from the real recording (USGS, public domain) in $HUDDLE_DATA or ../shared/data.
+Needs rsvg-convert (Debian: librsvg2-bin) for the first, ObsPy for the second.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.estimation import Settings, estimate
+from daq.formats.import_ import import_files
+from tui.application.app import HuddleApp
+from tui.application.main import RecordingControls
+from tui.bands import band_means, log_edges
+from tui.results import correlation_of
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+DATA = Path(os.environ.get("HUDDLE_DATA", ROOT.parent / "shared" / "data")) / "usgs-tst-huddle"
+BRAILLE = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3))
+METHODS = ("three-sensor", "three-channel")
+
+
+_TEXT = re.compile(
+    r'<text class="([^"]*)" x="([\d.]+)" y="([\d.]+)" textLength="[\d.]+" '
+    r'clip-path="[^"]*">(.*?)</text>'
+)
+CELL, LINE = 12.2, 24.4  # of a character in the picture
+
+
+def placed(run: re.Match[str]) -> str:
+    """Put every character of a run of text into its own cell, and draw Braille as dots."""
+    name, x, y = run[1], float(run[2]), float(run[3])
+    parts = []
+    for column, character in enumerate(html.unescape(run[4])):
+        left = x + column * CELL
+        dots = ord(character) - 0x2800
+        if 0 < dots < 256:
+            for bit, (across, down) in enumerate(BRAILLE):
+                if dots >> bit & 1:
+                    cx, cy = left + CELL * (across + 0.5) / 2, y - 18.6 + LINE * (down + 0.5) / 4
+                    parts.append(f'<circle class="{name}" cx="{cx:.1f}" cy="{cy:.1f}" r="1.9"/>')
+        elif character.strip("\xa0 "):
+            text = html.escape(character)
+            parts.append(f'<text class="{name}" x="{left:.1f}" y="{y}">{text}</text>')
+    return "".join(parts)
+
+
+async def photograph(recording: Path, out: Path, *, size: tuple[int, int], keys: tuple[str, ...]):
+    settings = Settings(segment=2.0, methods=METHODS, band=(2.0, 20.0), target_cov=0.15)
+    app = HuddleApp(RecordingControls(recording, settings), path=recording)
+    async with app.run_test(size=size) as pilot:
+        while app.snapshot is None:
+            await pilot.pause(0.1)
+        await pilot.press(*keys)
+        await pilot.pause(0.5)
+        picture = app.export_screenshot(title="huddle")
+    picture = _TEXT.sub(placed, picture.replace("Fira Code", "DejaVu Sans Mono"))
+    with tempfile.NamedTemporaryFile("w", suffix=".svg") as file:
+        file.write(picture)
+        file.flush()
+        subprocess.run(["rsvg-convert", file.name, "-o", str(out)], check=True)
+
+
+def application(folder: Path) -> None:
+    recording = folder / "lab.h5"
+    bench = ROOT / "tui" / "resources" / "demo.toml"
+    command = [sys.executable, "-m", "tui", "simulate", str(bench), "--duration", "300s"]
+    subprocess.run([*command, "--out", str(recording)], check=True)
+    asyncio.run(photograph(recording, HERE / "application.png", size=(100, 30), keys=("down",)))
+
+
+def real_recording(folder: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    recording = folder / "tst.h5"
+    import_files(sorted(DATA.glob("*.mseed")), recording, response=DATA / "T-compact_Q330HR_BH_40")
+    settings = Settings(segment=409.6, detrend="none", methods=METHODS, unit="m/s²")
+    snapshot = estimate([recording], settings)
+    frequency, correlation = snapshot.frequency, correlation_of(settings)
+    edges = log_edges(frequency, 220)
+    edges = edges[frequency[edges] <= 16.0]
+    centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
+    figure, axes = plt.subplots(1, 3, figsize=(11, 4.2), sharey=True, layout="constrained")
+    for axis, name, title in zip(
+        axes, ("BH0", "BH1", "BH2"), ("vertical", "horizontal", "horizontal"), strict=True
+    ):
+        column = [label.channel for label in snapshot.channels].index(name)
+        data = np.add.reduceat(snapshot.data_psd[: edges[-1], column], edges[:-1])
+        axis.plot(centre, 10 * np.log10(data / np.diff(edges)), color="0.6", label="data")
+        for method, colour in zip(METHODS, ("#0a7ea4", "#e07b39"), strict=True):
+            noise = snapshot.results[method]
+            mean = band_means(noise.noise_psd[:, column], noise.cov[:, column], edges, correlation)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                level, low, high = (10 * np.log10(v) for v in (mean.mean, mean.low, mean.high))
+            axis.fill_between(centre, low, high, color=colour, alpha=0.25, lw=0)
+            axis.plot(centre, level, color=colour, lw=1.2, label=method)
+        axis.set(xscale="log", xlabel="frequency in Hz", title=f"{name}, {title}")
+        axis.set_xlim(0.005, 16)
+        axis.grid(which="both", color="0.92")
+    axes[0].set(ylabel="PSD in dB re 1 (m/s²)²/Hz", ylim=(-195, -120))
+    axes[1].legend(loc="upper right")
+    figure.savefig(HERE / "usgs.png", dpi=110)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        application(Path(folder))
+        real_recording(Path(folder))
+
+
+if __name__ == "__main__":
+    main()
