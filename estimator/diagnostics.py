@@ -150,7 +150,7 @@ def diagnose(
         [matched_coherence(given.matrix, dims, j, k).min(axis=1) for j, k in pairs], axis=1
     )
     condition = np.stack([_condition(given.matrix, dims, j, k) for j, k in pairs], axis=1)
-    matrix = testable(given)
+    matrix = testable(given, frequency)
     model, snr = _model(matrix, dims, n_effective)
     dimension = _dimension(matrix, dims, n_effective)
     number = bands(frequency)

@@ -168,7 +168,6 @@ def choose_dimension(
     """
     check_dims(dims)
     given = coherency(csm, dims)
-    matrix = testable(given)
     if frequency.shape != (len(csm),):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
     if n_effective <= sum(dims):
@@ -179,6 +178,7 @@ def choose_dimension(
     number = bands(frequency) if band is None else band
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number a frequency, never falling")
+    matrix = testable(given, frequency)
     most = _most_testable(sum(dims)) if len(dims) > 3 else min(max(dims), _most_testable(sum(dims)))
     stride = {int(b): -(-int(np.sum(number == b)) // MOST_BINS) for b in np.unique(number)}
     taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])

@@ -109,9 +109,9 @@ def max_factors(n_channels: int) -> int:
     return int(np.floor(n_channels - np.sqrt(n_channels) + 1e-12))
 
 
-def testable(given: Coherency) -> ComplexArray:
-    """Return the coherency matrix, NaN again where the averages are not finite."""
-    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1)
+def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
+    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not finite."""
+    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1) | (frequency <= 0)
     return np.where(lost[:, None, None], np.nan, given.matrix)
 
 

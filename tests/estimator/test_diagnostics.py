@@ -126,6 +126,15 @@ def test_dead_copied_and_broken_channels_do_not_stop_the_report() -> None:
     assert np.isnan(found.model.statistic[5])
 
 
+def test_zero_frequency_is_no_part_of_the_test() -> None:
+    """There the spectra are real, and their scatter another."""
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    frequency = FREQUENCY - FREQUENCY[0]
+    found = diagnose(csm, frequency, dims=THREE, n_effective=1080, neighbours=INDEPENDENT)
+    assert np.isnan(found.model.statistic[0])
+    assert found.bands[0].test.n_frequencies == np.sum(frequency <= found.bands[0].high) - 1
+
+
 def test_early_averages_leave_the_model_open() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)), n=9)
     found = of(csm, n=9)
