@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -88,7 +88,7 @@ class GaussianSeries:
         impulse = fft.irfft(np.moveaxis(amplitude, 0, -1), 2 * block)
         impulse = np.roll(impulse, block // 2, axis=-1)  # lag −block/2 comes first
         impulse[..., block:] = 0
-        impulse[..., :block] *= signal.windows.tukey(block, 0.5, sym=False)
+        impulse[..., :block] *= _faded(block)
         self._filters: ComplexArray = fft.rfft(impulse)
         self._used = [np.flatnonzero(np.any(row, axis=1)) for row in self._filters]
         self._blocks: dict[int, FloatArray] = {}
@@ -120,6 +120,12 @@ class GaussianSeries:
             both = fft.irfft(shaped, 2 * self._sources.block)
             _keep(self._blocks, index, both[:, self._sources.block :])
         return self._blocks[index]
+
+
+def _faded(length: int) -> FloatArray:
+    """Window that is one in its middle half and a cosine towards both ends (Tukey)."""
+    outward = np.abs(np.arange(length) - length / 2) / (length / 2)
+    return np.asarray((1 + np.cos(2 * np.pi * np.maximum(outward - 0.5, 0))) / 2)
 
 
 def _keep(cache: dict[int, _Kept], index: int, value: _Kept) -> None:
