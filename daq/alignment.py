@@ -247,7 +247,9 @@ class AlignedRecording:
                 seen.add(_clock_name(source))
         return (reference, *free) if free else ()
 
-    def learn(self, at: FloatArray, delays: FloatArray, std: FloatArray) -> None:
+    def learn(
+        self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FloatArray
+    ) -> None:
         """Take delays that have been measured from what was read.
 
         Parameters
@@ -257,12 +259,15 @@ class AlignedRecording:
         delays, std : float64, shape (n, n_measurable - 1)
             By how much each sensor that is `measurable` lags the reference, in seconds; an
             infinite standard deviation where that is not known.
+        frame_delays : float64, shape (n_measurable - 1,)
+            What is to be added to all delays since `forget`, in seconds.
         """
         seconds = (self._start or 0.0) + at / self.sampling_rate
         at_reference = _known(self._sources[self._reference]).position(seconds)
         for column, number in enumerate(self.measurable[1:]):
             source = self._sources[number]
             index = _known(source).position(seconds)
+            source.frame_delay = float(frame_delays[column])
             source.learnt.append(_Learnt(index, at_reference, delays[:, column], std[:, column]))
 
     def forget(self) -> None:
@@ -270,17 +275,34 @@ class AlignedRecording:
         for source in self._sources:
             source.learnt.clear()
 
-    def set_clocks(self, frame_delays: FloatArray) -> None:
-        """Set every clock by all that is known now.
-
-        Parameters
-        ----------
-        frame_delays : float64, shape (n_measurable - 1,)
-            The constant part of the delays that were learnt.
-        """
-        for number, delay in zip(self.measurable[1:], frame_delays, strict=True):
-            self._sources[number].frame_delay = float(delay)
-        self._set_clocks()
+    def set_clocks(self) -> None:
+        """Set every clock by all that is known now."""
+        sources = self._sources
+        together = len({_clock_name(source) for source in sources}) == 1 and not any(
+            source.device_utc or source.polled for source in sources
+        )
+        if together and len({source.record.sampling_rate for source in sources}) == 1:
+            for source in sources:
+                source.clock = nominal(
+                    source.record.name,
+                    _clock_name(source),
+                    end_sample=source.end_sample,
+                    sampling_rate=source.record.sampling_rate,
+                )
+            return
+        reference = sources[self._reference]
+        solved: dict[str, Clock] = {}
+        for source in [reference, *sources]:
+            name = source.record.name
+            known = solved.get(_clock_name(source))
+            if source.polled:
+                source.clock = self._polled(source)
+            elif known is None or source.device_utc:
+                measured = None if source is reference else _measured(source, _known(reference))
+                source.clock = source.arrivals.solve(name, measured)
+                solved[_clock_name(source)] = source.clock
+            elif known.state.sensor != name:
+                source.clock = known.shared_by(name).extended(source.end_sample)
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""
@@ -297,7 +319,7 @@ class AlignedRecording:
         n_runs = sum(len(source.runs) for source in self._sources)
         if n_runs > self._set_at[1] or n_samples > (1 + _GROWTH) * self._set_at[0]:
             self._set_at = (n_samples, n_runs)
-            self._set_clocks()
+            self.set_clocks()
         else:
             for source in self._sources:
                 source.clock = _known(source).extended(source.end_sample)
@@ -382,34 +404,6 @@ class AlignedRecording:
                 samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
                 valid |= usable
         return samples, valid
-
-    def _set_clocks(self) -> None:
-        sources = self._sources
-        together = len({_clock_name(source) for source in sources}) == 1 and not any(
-            source.device_utc or source.polled for source in sources
-        )
-        if together and len({source.record.sampling_rate for source in sources}) == 1:
-            for source in sources:
-                source.clock = nominal(
-                    source.record.name,
-                    _clock_name(source),
-                    end_sample=source.end_sample,
-                    sampling_rate=source.record.sampling_rate,
-                )
-            return
-        reference = sources[self._reference]
-        solved: dict[str, Clock] = {}
-        for source in [reference, *sources]:
-            name = source.record.name
-            known = solved.get(_clock_name(source))
-            if source.polled:
-                source.clock = self._polled(source)
-            elif known is None or source.device_utc:
-                measured = None if source is reference else _measured(source, _known(reference))
-                source.clock = source.arrivals.solve(name, measured)
-                solved[_clock_name(source)] = source.clock
-            elif known.state.sensor != name:
-                source.clock = known.shared_by(name).extended(source.end_sample)
 
     @property
     def _reference(self) -> int:

@@ -5,7 +5,7 @@ Theory of operation
 Segments lie on a fixed lattice of the common grid; one that touches a gap is left out, for every
 sensor, and nothing else is. Each new segment is transformed once, with what is known about the
 clocks by then. When what is known has become materially better for segments already taken (looked
-at whenever their number has doubled), they are taken again.
+at whenever their number has grown by a quarter), they are taken again.
 
 ``finish`` is one pass over the whole recording with the final clocks: a function of the file
 alone. So what is shown when a run ends is what ``huddle estimate`` says about its file.
@@ -51,7 +51,10 @@ _Piece = TypeVar("_Piece")
 _Read = TypeVar("_Read")
 
 _VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
-_MATERIAL = 3e-7  # seconds rms; clocks that move less than this change nothing one could see
+_LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are taken again
+_FINAL_TOLERANCE = 1e-7
+_REVIEW = 1.25  # growth after which that is looked at
+_FIRST_REVIEW = 8  # segments
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 _MOST_PASSES = 4
 
@@ -277,18 +280,24 @@ class _Pass:
     def set_clocks(self) -> None:
         """Set the clocks by what the segments taken say."""
         if self._meter is not None:
-            self.aligned.set_clocks(self._meter.frame_delays())
+            self.aligned.set_clocks()
 
-    def is_outdated(self) -> bool:
-        """Whether the clocks, as known now, differ materially from those segments were taken by."""
-        if not self.taken_at:
+    def is_outdated(self, tolerance: float) -> bool:
+        """Whether clocks, as known now, differ from those that segments were taken by.
+
+        By more than `tolerance` in seconds rms, that is; or whether delays could be measured now
+        and could not yet when segments came one by one.
+        """
+        if not self.taken_at or self.aligned.is_exact:
             return False
+        if self._meter is not None and not self._meter.has_frame:
+            return self.n_seen >= self._meter.fewest
         before = np.concatenate(self.taken_at)
         moved = self._positions(np.arange(len(before))) - before
         moved -= moved.mean(axis=1, keepdims=True)  # all sensors alike: no delay between them
         constant = moved.mean(axis=0)
         varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
-        return varying > _MATERIAL or bool(
+        return varying > tolerance or bool(
             np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
         )
 
@@ -311,7 +320,12 @@ class _Pass:
             self._meter = DelayMeter(self.welch.sampling_rate, window, columns)
         delays, std = self._meter.measure(samples, starts)
         at = first + starts + self.welch.segment_length / 2
-        self.aligned.learn(np.asarray(at, dtype=np.float64), delays, std)
+        self.aligned.learn(
+            np.asarray(at, dtype=np.float64),
+            delays,
+            std=std,
+            frame_delays=self._meter.frame_delays(),
+        )
 
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
         middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
@@ -353,7 +367,7 @@ class Estimation:
         except BaseException:
             self.close()
             raise
-        self._next_review = 2
+        self._next_review = _FIRST_REVIEW
 
     def close(self) -> None:
         """Close the recordings."""
@@ -390,10 +404,10 @@ class Estimation:
             each.advance()
         seen = self.n_seen
         if seen >= self._next_review:
-            self._next_review = 2 * seen
+            self._next_review = math.ceil(_REVIEW * seen)
             for each in self._passes:
                 each.set_clocks()
-                if each.is_outdated():
+                if each.is_outdated(_LIVE_TOLERANCE):
                     each.restart()
                     each.advance()
         return seen > before
@@ -428,7 +442,7 @@ class Estimation:
             each.advance(count)
             for _ in range(_MOST_PASSES - 1):
                 each.set_clocks()
-                if not each.is_outdated():
+                if not each.is_outdated(_FINAL_TOLERANCE):
                     break
                 total += each.n_seen
                 each.restart()

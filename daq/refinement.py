@@ -80,6 +80,17 @@ class DelayMeter:
     _frames: list[_Frame] = field(default_factory=list)
 
     @property
+    def fewest(self) -> int:
+        """Segments of one batch that can define a frame."""
+        reference: slice = self.columns[0]
+        return _FEWEST_SEGMENTS * int(reference.stop - reference.start)
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether a batch has defined the frame."""
+        return bool(self._frames)
+
+    @property
     def omega(self) -> FloatArray:
         """Angular frequencies that are looked at, from the first above zero."""
         length = len(self.window)
@@ -103,8 +114,7 @@ class DelayMeter:
         """
         shape = (len(starts), len(self.columns) - 1)
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
-        d = self.columns[0].stop - self.columns[0].start
-        if len(starts) == 0 or (not self._frames and len(starts) < _FEWEST_SEGMENTS * d):
+        if len(starts) == 0 or (not self.has_frame and len(starts) < self.fewest):
             return delays, std
         spectra = self._spectra(samples, starts)
         x0 = spectra[:, :, self.columns[0]]
