@@ -178,18 +178,22 @@ def test_overlapping_segments_are_worth_n_effective_for_the_bias_too(overlap: fl
     rng = np.random.default_rng(4)
     turn = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)]
     length, draws = 64 + 19 * settings.hop, 400
-    relative: list[float] = []
-    uncorrected: list[float] = []
+    csm = []
     for _ in range(draws):
         motion = 10 * rng.standard_normal((length, 3))
         samples = np.hstack([motion @ q for q in turn]) + rng.standard_normal((length, 9))
         spectra = CrossSpectra(settings, 9)
         spectra.add(samples, np.arange(20) * settings.hop)
-        for correct, results in ((True, relative), (False, uncorrected)):
-            found = three_sensor(
-                spectra.csm()[2:-2], dims=(3,) * 3, n_effective=spectra.n_effective, correct=correct
-            )
-            results.append(float(found.noise_psd.mean()) / 2)
+        csm.append(spectra.csm()[2:-2])
+    relative, uncorrected = (
+        three_sensor(
+            np.concatenate(csm), dims=(3,) * 3, n_effective=spectra.n_effective, correct=correct
+        )
+        .noise_psd.reshape(draws, -1)
+        .mean(axis=1)
+        / 2
+        for correct in (True, False)
+    )
     error = np.std(relative) / np.sqrt(draws)
     assert error < 0.01
     # two sides of the same: what is left is of order (d / n_eff)**2
