@@ -5,8 +5,9 @@ as it fills. There is neither a counter nor a time on the device: samples are nu
 and placed by arrival (:mod:`daq.protocols.fifo`). Counts are i16; a channel's sensitivity is 8192
 counts/g ÷ 9.80665 = 835.35 counts/(m/s²) by a client's assumption, not by a data sheet.
 
-Public clients disagree on what the first register of a read means: set ``header`` and look at
-``huddle check``, which reads twice the rate, or half, if it is the wrong one.
+Public clients disagree on what the first register of a read means, so ``header`` says it. With
+``"left"`` for a device that means ``"size"`` words are asked for that do not wait; the other way
+round the FIFO is read too slowly and runs full.
 """
 
 from __future__ import annotations
