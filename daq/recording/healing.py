@@ -79,7 +79,7 @@ def verify(path: str | Path) -> Report:
     """
     path = Path(path)
     being_written = is_being_written(path) if path.is_file() else False
-    with Recording.open(path) as recording:
+    with Recording.open(path, alone=True) as recording:
         sensors = tuple(_verify_sensor(sensor) for sensor in recording.sensors)
         return Report(path, recording.closed, being_written, sensors, len(recording.events))
 

@@ -42,7 +42,13 @@ class _Rows:
         """Read up to ``n_rows``."""
         if n_rows > self.n_rows:
             self._dataset.refresh()
-            self._parts.append(self._dataset[self.n_rows : n_rows])
+            part = self._dataset[self.n_rows : n_rows]
+            if len(part) < n_rows - self.n_rows:
+                raise OSError(
+                    f"{self._dataset.name} has {self.n_rows + len(part)} rows where {n_rows} were"
+                    " committed"
+                )
+            self._parts.append(part)
             self.n_rows = n_rows
 
     def rows(self) -> NDArray[np.void]:
@@ -200,8 +206,15 @@ class Recording:
         self.refresh()
 
     @classmethod
-    def open(cls, path: str | Path) -> Recording:
+    def open(cls, path: str | Path, *, alone: bool = False) -> Recording:
         """Open a recording, whether it grows, was killed, or is closed.
+
+        Parameters
+        ----------
+        alone : bool
+            Read a file that nobody is writing by itself. HDF5 lets all readers of a file in one
+            process share what it remembers of it; beside a reader that has not been refreshed, a
+            second one may see zeros where there are samples.
 
         Raises
         ------
@@ -211,7 +224,7 @@ class Recording:
             If it cannot be read.
         """
         path = Path(path)
-        file = _open_file(path)
+        file = _open_file(path, alone=alone)
         try:
             check_format(path, file)
             return cls(path, file)
@@ -295,18 +308,19 @@ class Recording:
         self.close()
 
 
-def _open_file(path: Path) -> h5py.File:
+def _open_file(path: Path, *, alone: bool) -> h5py.File:
     superblock = Superblock.of(path)
-    cut_short = superblock.end > superblock.n_bytes and not is_being_written(path)
+    at_rest = not is_being_written(path)
+    cut_short = superblock.end > superblock.n_bytes and at_rest
     if cut_short and not superblock.is_open:
         raise NotARecordingError(
             f"{path}: truncated: {superblock.n_bytes} of {superblock.end} bytes are there;"
             " fetch it again"
         )
     try:
-        if cut_short:
-            # A killed file that lost its end. A SWMR reader would try to read that again and again,
-            # in case the writer is about to complete it.
+        if cut_short or (alone and at_rest and superblock.version == 3):
+            # Of a killed file that lost its end, a SWMR reader would try to read that again and
+            # again, in case the writer is about to complete it.
             return h5py.File(ClearedFile(path, superblock), "r")
         return h5py.File(path, "r", libver="latest", swmr=True, locking=False)
     except (OSError, RuntimeError) as error:

@@ -121,6 +121,22 @@ def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
+def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        with Recording.open(path) as lagging:
+            lagging.sensors[0].counts()
+            lines = [writer.stdout.readline() for _ in range(40)]
+            writer.send_signal(signal.SIGKILL)
+            writer.stdout.read()
+            healed = heal(path, now=NOW)
+    assert healed.intact
+    for sensor in healed.sensors:
+        assert sensor.n_samples >= json.loads(lines[-1])[sensor.name] > 0
+
+
 @pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])
 def test_a_killed_file_that_lost_its_end(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "r.h5"
