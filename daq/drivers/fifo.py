@@ -6,8 +6,7 @@ and placed by arrival (:mod:`daq.protocols.fifo`). Counts are i16; a channel's s
 counts/g ÷ 9.80665 = 835.35 counts/(m/s²) by a client's assumption, not by a data sheet.
 
 Public clients disagree on what the first register of a read means, so ``header`` says it. With
-``"left"`` for a device that means ``"size"`` words are asked for that do not wait; the other way
-round the FIFO is read too slowly and runs full.
+``"left"`` for a device that means ``"size"`` words are asked for that do not wait.
 """
 
 from __future__ import annotations
