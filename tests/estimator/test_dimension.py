@@ -73,6 +73,23 @@ def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:
     assert covered.mean() > 0.9
 
 
+def test_known_ratios_spare_factors() -> None:
+    """A prior of equal noise would ask for ten to explain noise a hundred times apart."""
+    noise_psd = np.repeat([1, 0.2, 5, 1, 20.0], 3)
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 10 * np.linspace(0.95, 1.05, 40)])
+    csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
+    _, choices = choose_dimension(
+        wishart(csm, 1080, np.random.default_rng(3))[0],
+        frequency,
+        dims=FIVE,
+        n_effective=1080,
+        band=np.repeat([0, 1], 40),
+        neighbours=INDEPENDENT,
+    )
+    assert choices[0].n_factors == 3
+    assert 7 <= choices[1].n_factors <= 9
+
+
 def test_ratios_come_from_the_nearest_frequencies() -> None:
     noise_psd = np.ones((200, 3))
     noise_psd[:100, 1] = 4.0
