@@ -39,7 +39,7 @@ SETTLE_TIMEOUT = 3.0
 """For the device to get ready (flash, reset) or change its mode or filter, s."""
 STALLED = 1.0
 """Without a frame for so long, in s, the device has stopped sending."""
-GATHER = 0.04
+GATHER = 0.05
 """Frames of so many seconds are decoded together."""
 WRITE_INTERVAL = 0.001
 """Between two commands, s; the data sheet asks for 350 µs."""
@@ -317,12 +317,13 @@ class EpsonSession:
         )
         self._stream.discard()
         await self._stream.write(epson.write(epson.MODE_CTRL, epson.SAMPLING, high=True))
+        self._stream.expect(round(GATHER * configuration.sampling_rate) * configuration.burst.size)
         # filters settle before the first frame
         patience = STALLED + 1.0
         while True:
             try:
                 async with asyncio.timeout(patience):
-                    received, at = await self._stream.read(GATHER)
+                    received, at = await self._stream.read()
             except TimeoutError as error:
                 raise NoAnswerError(
                     f"{self._stream.label}: nothing came for {patience:g} s;"
@@ -393,6 +394,7 @@ class EpsonDriver:
                 information = replace(information, sampling_rate=actual)
                 yield EpsonSession(sensor, stream, configuration, information)
             finally:
+                stream.expect(1)
                 with contextlib.suppress(DeviceError):
                     await device.stop()
 

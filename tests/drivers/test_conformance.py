@@ -31,7 +31,7 @@ N = 150
 XYZ = [{"name": axis, "sensitivity": 1e6} for axis in "xyz"]
 CASES: dict[str, dict[str, Any]] = {
     "epson": {"sensitivity": epson.COUNTS_PER_UNIT, "settings": {}},
-    "registers": {"sampling_rate": 50.0, "settings": {"address": 0, "timeout": 0.2}},
+    "registers": {"sampling_rate": 50.0, "settings": {"address": 0, "timeout": 1.0}},
     "labjack": {"port": "tcp", "sensors": ["labjack 1", "labjack 2"], "settings": {}},
     "guralp": {"settings": {"patience": 2.0}},
     "fifo": {"settings": {}},

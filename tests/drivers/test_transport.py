@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import tty
 from contextlib import asynccontextmanager
@@ -13,7 +14,6 @@ import pytest
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.errors import NotConnectedError
-from daq.protocols.block import HostTime
 from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
@@ -133,12 +133,24 @@ async def test_a_port_without_descriptor_is_read_by_a_thread() -> None:
             received += (await stream.read())[0]
 
 
-async def test_what_comes_soon_after_is_taken_together_with_its_own_time() -> None:
-    async with _pseudo_terminal() as (port, _), open_port(port, SystemClock()) as stream:
-        reading = asyncio.create_task(stream.read(gather=0.01))
-        stream.feed(b"first", HostTime(1, 1))
-        asyncio.get_running_loop().call_later(0.001, stream.feed, b"second", HostTime(2, 2))
-        assert await reading == (b"firstsecond", HostTime(2, 2))
+@pytest.mark.parametrize("kind", KINDS)
+async def test_it_wakes_when_as_many_bytes_are_there_as_were_expected(kind: str) -> None:
+    async with KINDS[kind]() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(99))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 100
+        stream.expect(100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(1))
+        far.hang_up()  # is seen at once, whatever is expected
+        with contextlib.suppress(NotConnectedError):
+            await reading
 
 
 async def test_discard_forgets_what_was_not_read() -> None:
