@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
@@ -28,7 +29,7 @@ from tui.commands import EXAMPLES, acquisition, recordings, setup, studies
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-LIMIT_NOT_MET, USAGE, TROUBLE, INTERRUPTED = 1, 2, 3, 130
+USAGE, TROUBLE, INTERRUPTED = 2, 3, 130
 
 
 _OTHERS = (("estimator.errors", "EstimatorError"), ("sim_devices.errors", "ServeError"))
@@ -48,9 +49,13 @@ class HuddleGroup(TyperGroup):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except Exception as error:
+            if isinstance(error, (typer.Exit, typer.Abort)) or hasattr(error, "show"):
+                raise  # the library's own: usage errors show themselves
             code = exit_code(error)
             if code is None:
-                raise
+                traceback.print_exc()
+                typer.echo("huddle: this is a fault in huddle itself; please report it", err=True)
+                raise typer.Exit(TROUBLE) from None
             for line in messages(error):
                 typer.echo(f"huddle: {line}", err=True)
             raise typer.Exit(code) from None

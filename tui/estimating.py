@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from daq.bench import parse_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
+from tui.limits import exceeded
 from tui.output import for_people, notices, write_json, write_text
 from tui.results import curves_csv, document, remarks, result_table, result_title
 
@@ -19,7 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from daq.bench import Bench
     from daq.estimation import Snapshot
+
+LIMIT_NOT_MET = 1
 
 
 def estimate_recordings(
@@ -37,7 +41,8 @@ def estimate_recordings(
     where not given.
     """
     with Recording.open(files[0]) as recording:
-        settings = chosen(Settings.of(recording.bench), **wanted)
+        bench = recording.bench
+        settings = chosen(Settings.of(bench), **wanted)
         settings = replace(
             settings,
             start=_instant(start, recording.created),
@@ -57,7 +62,8 @@ def estimate_recordings(
             settings,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    show_result(snapshot, settings, json=json, csv=csv)
+    if not show_result(snapshot, settings, json=json, csv=csv, bench=bench):
+        raise typer.Exit(LIMIT_NOT_MET)
 
 
 def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of Settings
@@ -69,9 +75,20 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
 
 
 def show_result(
-    snapshot: Snapshot, settings: Settings, *, json: str | None, csv: str | None
-) -> None:
-    """Print the table for people, and write what programs asked for."""
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    json: str | None,
+    csv: str | None,
+    bench: Bench | None,
+) -> bool:
+    """Print the table for people, and write what programs asked for.
+
+    Returns
+    -------
+    bool
+        Whether every channel meets the limits of the bench file.
+    """
     screen = for_people(json, csv)
     screen.print(result_title(snapshot, settings))
     screen.print(result_table(snapshot, settings))
@@ -80,6 +97,13 @@ def show_result(
     write_json(json, document(snapshot))
     if csv is not None:
         write_text(csv, curves_csv(snapshot))
+    failures = exceeded(bench, snapshot, settings)
+    for failure in failures:
+        screen.print(f"[red]{failure}[/]")
+    if bench is not None and bench.limits and not failures:
+        names = ", ".join(limit.name for limit in bench.limits)
+        screen.print(f"[green]every channel meets {names}[/]")
+    return not failures
 
 
 def _instant(text: str | None, created: datetime) -> datetime | None:

@@ -90,6 +90,9 @@ DetrendOption: TypeAlias = Annotated[
 NoCorrectionOption: TypeAlias = Annotated[
     bool, typer.Option("--no-correction", help="Leave the small-sample bias in.")
 ]
+NoRefinementOption: TypeAlias = Annotated[
+    bool, typer.Option("--no-refinement", help="Set clocks by arrival times alone.")
+]
 UnitOption: TypeAlias = Annotated[
     str | None,
     typer.Option("--unit", metavar="UNIT", help="As in m/s², m/s, µg: spectra are in UNIT²/Hz."),

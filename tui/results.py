@@ -100,12 +100,21 @@ def remarks(snapshot: Snapshot) -> list[str]:
         for sensor in snapshot.sensors
         if sensor.n_gaps
     ]
+    fitted = [clock for clock in snapshot.clocks if clock.source == "arrival times"]
+    if fitted:
+        rates = ", ".join(f"{clock.sensor} {clock.ppm:+.1f} ppm" for clock in fitted)
+        worst = max(clock.residual for clock in fitted) * 1e6
+        lines.append(
+            f"clocks {rates}, aligned to about {max(worst, 0.1):.{0 if worst > 10 else 1}f} µs".replace(
+                "-", "−"
+            )
+        )
     for method, noise in snapshot.results.items():
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
                 f"{method}: {negative} of {noise.noise_psd[1:-1].size} values came out at or below "
-                "zero: noise lost in scatter, or misalignment"
+                "zero, and are kept so"
             )
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines

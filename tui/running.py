@@ -16,7 +16,7 @@ from daq.clock import SystemClock
 from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
-from tui.estimating import chosen, show_result
+from tui.estimating import LIMIT_NOT_MET, chosen, show_result
 from tui.output import notices
 from tui.recorder_process import RecorderProcess
 from tui.results import reached_cov, result_arrays
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from daq.bench import Bench
     from daq.estimation import Snapshot
 
+INTERRUPTED = 130
 INTERVAL = 0.2
 SHARE = 0.1
 """Of the time, at most, that estimating live may take."""
@@ -51,7 +52,7 @@ def run_test(
     HuddleError
         Whatever kept the recorder from going on; the result of what was recorded is shown before.
     typer.Exit
-        130 after Ctrl-C, when the result has been shown.
+        130 after Ctrl-C, 1 where a limit is not met: when the result has been shown.
     """
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
@@ -68,10 +69,12 @@ def run_test(
             recorder, settings, duration=duration, until_cov=until_cov
         )
         finish_recording(out, snapshot)
-        show_result(snapshot, settings, json=json, csv=csv)
+        met = show_result(snapshot, settings, json=json, csv=csv, bench=bench)
         recorder.check()
         if interrupted:
-            raise typer.Exit(130)
+            raise typer.Exit(INTERRUPTED)
+        if not met:
+            raise typer.Exit(LIMIT_NOT_MET)
     except KeyboardInterrupt:
         recorder.request_stop()
         raise

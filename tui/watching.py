@@ -50,7 +50,7 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
     if trouble:
         raise RecordingError(trouble[0])
     if json is None and last and last[0].results:
-        show_result(last[0], settings, json=None, csv=None)
+        show_result(last[0], settings, json=None, csv=None, bench=None)
 
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:

@@ -18,6 +18,7 @@ from tui.options import (
     JsonOption,
     MethodOption,
     NoCorrectionOption,
+    NoRefinementOption,
     OverlapOption,
     SegmentOption,
     UnitOption,
@@ -40,6 +41,7 @@ def estimate(
     window: WindowOption = None,
     detrend: DetrendOption = None,
     no_correction: NoCorrectionOption = False,
+    no_refinement: NoRefinementOption = False,
     start: Annotated[
         str | None,
         typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
@@ -66,6 +68,7 @@ def estimate(
         window=window,
         detrend=detrend,
         correct=False if no_correction else None,
+        refine=False if no_refinement else None,
         start=start,
         end=end,
         unit=unit,
