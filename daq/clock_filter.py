@@ -71,7 +71,7 @@ class Smoothed:
         Lateness in s, and its rate in s/s.
     std : float64, shape (n,)
         Standard deviation in s of the lateness, up to a constant where samples were observed.
-    constant, constant_std : float
+    constant : float
         By how much observations from the samples lie above those from arrivals, in s.
     walk, noise : float
         Most likely strength of the random walk (s/s per √s), and of arrival noise (s).
@@ -81,7 +81,6 @@ class Smoothed:
     rate: FloatArray
     std: FloatArray
     constant: float
-    constant_std: float
     walk: float
     noise: float
 
@@ -109,7 +108,6 @@ def smooth(observations: Observations) -> Smoothed:
         rate=state[:, 1],
         std=np.sqrt(np.maximum(variance, 0.0)),
         constant=float(state[-1, 2]),
-        constant_std=float(np.sqrt(max(covariance[-1, 2, 2], 0.0))),
         walk=walk,
         noise=noise,
     )

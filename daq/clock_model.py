@@ -46,7 +46,7 @@ _NANO = 1e-9
 _NODE = 10.0  # seconds of arrival times that make one observation
 _MOST_NODES = 3000
 _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
-_CONSTANT_KNOWN = 0.02  # samples
+_WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
 _RATE_OFF = 0.02  # share by which a rate may be off
 _STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
@@ -366,11 +366,11 @@ class ArrivalTimes:
             restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
         )
         smoothed = smooth(observations)
-        curve = smoothed.lateness
-        # The constant is worth following only where it is known to a small part of a sample.
+        residual = float(np.sqrt(np.mean(smoothed.std**2)))
         refined = bool(observations.from_samples.any())
-        if refined and smoothed.constant_std < _CONSTANT_KNOWN / self.sampling_rate:
-            curve = curve + smoothed.constant
+        if refined and residual > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
+            return self._filtered(sensor, slope, anchors, None)
+        curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs = []
         for number, (first, end) in enumerate(self._bounds()):
             mine = np.flatnonzero(epoch == number)
@@ -390,7 +390,6 @@ class ArrivalTimes:
             increasing = np.concatenate([[True], np.diff(nodes) > 0])
             epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
         drift = slope * self.sampling_rate + float(smoothed.rate.mean())
-        residual = float(np.sqrt(np.mean(smoothed.std**2)))
         state = ClockState(
             sensor=sensor,
             source="arrival times",
