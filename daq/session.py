@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from daq.drivers.base import DeviceInformation, DriverType, Session
 
 FIRST_PATIENCE = 10.0
-"""How long to wait for the first block of a session, in s; drivers know better and say so."""
+"""How long to wait for the first block of a session, in s, if it is short; drivers know better."""
+LONGEST_FIRST_BLOCK = 1100
+"""Samples a first block may have: one block of GCF holds up to a thousand."""
 LEAST_PATIENCE = 0.5
 FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
 
@@ -44,25 +46,26 @@ Item = Block | Event | Connected
 class _Patience:
     """How long the next block may take: twice as long as blocks took so far."""
 
-    def __init__(self, now: float) -> None:
+    def __init__(self, now: float, first: float) -> None:
         self.last = now
+        self._first = first
         self._longest = 0.0
         self._begun = False
 
     @property
     def seconds(self) -> float:
         """From the last block on."""
-        return max(LEAST_PATIENCE, 2 * self._longest) if self._longest else FIRST_PATIENCE
+        return max(LEAST_PATIENCE, 2 * self._longest) if self._begun else self._first
 
-    def block_came(self, now: float) -> None:
-        """Learn from a block; a long interval is forgotten slowly."""
-        if self._begun:
-            self._longest = max(0.98 * self._longest, now - self.last, 1e-6)
+    def block_came(self, now: float, duration: float) -> None:
+        """Learn from a block and the time its samples took; what was long is forgotten slowly."""
+        interval = now - self.last if self._begun else 0.0
+        self._longest = max(0.98 * self._longest, interval, duration)
         self._begun, self.last = True, now
 
 
 class _Watch:
-    """Interrupts who waits for a block, when that is overdue.
+    """Interrupts who waits for a block, when that is overdue; ``sampling_rates`` in samples per s.
 
     One look every ``TICK`` instead of one timer a block; and when the event loop itself was held
     up, nobody's device is to blame.
@@ -70,11 +73,13 @@ class _Watch:
 
     TICK = 0.1
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self, sampling_rates: dict[str, float]) -> None:
         self._loop = asyncio.get_running_loop()
+        self._rates = sampling_rates
         now = self._loop.time()
-        self._whole = _Patience(now)
-        self._each = {name: _Patience(now) for name in names}
+        first = FIRST_PATIENCE + LONGEST_FIRST_BLOCK / min(sampling_rates.values())
+        self._whole = _Patience(now, first)
+        self._each = {name: _Patience(now, first) for name in sampling_rates}
         self._stalled: set[str] = set()
         self._timeout = asyncio.timeout(None)
         self._is_waiting = False
@@ -110,12 +115,13 @@ class _Watch:
         finally:
             self._is_waiting = False
 
-    def block_came(self, sensor: str) -> None:
+    def block_came(self, block: Block) -> None:
         """Take note of a block."""
         now = self._loop.time()
-        self._whole.block_came(now)
-        self._each[sensor].block_came(now)
-        self._stalled.discard(sensor)
+        duration = block.n_samples / self._rates[block.sensor]
+        self._whole.block_came(now, duration)
+        self._each[block.sensor].block_came(now, duration)
+        self._stalled.discard(block.sensor)
 
     def newly_stalled(self) -> list[str]:
         """Return the sensors that are overdue while others on the port go on, each once."""
@@ -198,7 +204,8 @@ class Connection:
 
     async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
         """Hand on what the session yields; raise if nothing comes for too long."""
-        watch = _Watch(self.names)
+        speed = self._clock.speed
+        watch = _Watch({s.name: s.sampling_rate * speed for s in self.sensors})
         async with contextlib.aclosing(_generator(session)) as items:
             try:
                 async with watch:
@@ -208,7 +215,7 @@ class Connection:
                         if item is None:
                             return
                         if isinstance(item, Block):
-                            watch.block_came(item.sensor)
+                            watch.block_came(item)
                             self._delay = FIRST_DELAY
                         await queue.put(item)
                         for name in watch.newly_stalled():
