@@ -1,0 +1,217 @@
+"""What is fuzzed: one function a decoder, which any bytes must leave as it should be.
+
+Received bytes may raise RemoteProtocolError and nothing else, and once valid frames resume every
+one of them must be decoded. The first byte of an input says how the rest is cut into reads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols import brp, epson, gcf, labjack, rtu
+from daq.protocols.block import Block, Event, HostTime
+from daq.protocols.epson import BurstFormat, CommandDecoder, Read
+from daq.protocols.epson_burst import BurstDecoder
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.fifo import FifoDecoder
+from daq.protocols.guralp import SerialDecoder
+from daq.protocols.labjack import Packet, StreamDecoder
+from daq.protocols.labjack_registers import AduFinder
+from daq.protocols.registers import RegisterDecoder, RegisterMap
+from daq.protocols.scream import PacketFinder
+from daq.protocols.text import RASPBERRY_SHAKE, TextDecoder, TextFormat
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+LATER = 10**6
+"""Host seconds after which the valid frames come: whatever came before is long past."""
+
+
+class NotDecodedError(Exception):
+    """Valid frames were lost."""
+
+
+def _at(seconds: float) -> HostTime:
+    return HostTime(round(seconds * 1e9), round(seconds * 1e9))
+
+
+def _reads(fuzzed: bytes) -> Iterator[tuple[bytes, HostTime]]:
+    size = fuzzed[0] + 1 if fuzzed else 1
+    for k, start in enumerate(range(1, len(fuzzed), size)):
+        yield fuzzed[start : start + size], _at(k / 10)
+
+
+def _feed(receive: Callable[[bytes, HostTime], Iterable[object]], fuzzed: bytes) -> list[object]:
+    found: list[object] = []
+    for read, at in _reads(fuzzed):
+        with contextlib.suppress(RemoteProtocolError):
+            found += list(receive(read, at))
+    return found
+
+
+def _demand(found: Sequence[object], n_samples: int) -> None:
+    """Raise unless so many samples are in blocks of rising index."""
+    blocks = [item for item in found if isinstance(item, Block)]
+    if sum(block.n_samples for block in blocks) < n_samples:
+        raise NotDecodedError(f"{n_samples} samples sent, got {[b.n_samples for b in blocks]}")
+    ends = [block.end_sample for block in blocks]
+    if any(block.first_sample < end for block, end in zip(blocks[1:], ends, strict=False)):
+        raise NotDecodedError("blocks overlap")
+    if any(len(item.text.encode()) > 200 for item in found if isinstance(item, Event)):
+        raise NotDecodedError("an event of more than 200 bytes")
+
+
+ALL = BurstFormat.of("flag", "temperature", "x", "y", "z", "count", "checksum")
+BURSTS = epson.encode_bursts(
+    ALL, flag=0x8E00, temperature=2637, x=np.arange(20), y=-1, z=0x0D80, count=np.arange(20)
+)
+
+
+def epson_bursts(fuzzed: bytes) -> None:
+    """Bursts of an accelerometer."""
+    decoder = BurstDecoder(
+        "A", ALL, fields=("x", "y", "z"), sampling_rate=200.0, full_scale_counts=2**27
+    )
+    _feed(decoder.receive, fuzzed)
+    # zeros end what looked like a frame begun
+    _demand(decoder.receive(bytes(ALL.size) + BURSTS, _at(LATER)), 20)
+
+
+def epson_commands(fuzzed: bytes) -> None:
+    """Commands, as the device hears them."""
+    decoder = CommandDecoder()
+    for read, _ in _reads(fuzzed):
+        decoder.receive(read)
+    decoder.receive(bytes([epson.DELIMITER] * 3))
+    if decoder.receive(epson.read(epson.ID))[-1] != Read(0x4C):
+        raise NotDecodedError("a read was not heard")
+    epson.find_reply(fuzzed, 0x4C)
+
+
+WITMOTION = RegisterMap.of({"preset": "witmotion"}, 3)
+
+
+def polled_registers(fuzzed: bytes) -> None:
+    """Poll replies of any length with any values."""
+    decoder = RegisterDecoder("A", WITMOTION, sampling_rate=20.0)
+    for read, at in _reads(fuzzed):
+        values = struct.unpack(f">{len(read) // 2}H", read[: len(read) // 2 * 2])
+        with contextlib.suppress(RemoteProtocolError):
+            decoder.receive(values, at, at)
+    decoder.flush(_at(LATER))
+    found: list[object] = []
+    for k in range(40):
+        held = WITMOTION.encode(np.array([k, 0, 0]), time_ns=10**18 + k * 50_000_000)
+        at = _at(LATER + 1 + k / 20)
+        found += decoder.receive([held[0x30 + r] for r in range(7)], at, at)
+    _demand(found, 40)
+
+
+SYSTEM = gcf.SystemId("DEMO")
+
+
+def _gcf(k: int) -> bytes:
+    counts = np.arange(40, dtype=np.int32) * 1000 + k
+    start = (1_790_000_000 + k) * 10**9
+    return gcf.encode_block(gcf.SampleBlock(SYSTEM, "DEMOZ0", start, Fraction(40), counts))
+
+
+FRAMES = b"".join(brp.encode_frame(k, _gcf(k)) for k in range(4))
+
+
+def guralp_serial(fuzzed: bytes) -> None:
+    """Framed GCF blocks over a serial line."""
+    decoder = SerialDecoder({"A": ["DEMOZ0"]}, replies=False)
+    _feed(decoder.receive, fuzzed)
+    # a block of the future may have been among them: what is valid now may be too late
+    decoder.receive(bytes(2048) + FRAMES, _at(LATER))
+
+
+def gcf_block(fuzzed: bytes) -> None:
+    """One GCF block."""
+    with contextlib.suppress(RemoteProtocolError):
+        gcf.decode_block(fuzzed)
+
+
+def scream_tcp(fuzzed: bytes) -> None:
+    """Packets of a Scream server."""
+    finder = PacketFinder()
+    for read, _ in _reads(fuzzed):
+        with contextlib.suppress(RemoteProtocolError):
+            list(finder.receive(read))
+
+
+PACKETS = b"".join(
+    labjack.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
+)
+
+
+def labjack_stream(fuzzed: bytes) -> None:
+    """Spontaneous packets of a LabJack."""
+    decoder = StreamDecoder({"A": [0, 2, 4, 6]}, scan_list=[0, 2, 4, 6], scan_rate=1000.0)
+    _feed(decoder.receive, fuzzed)
+
+
+def labjack_registers(fuzzed: bytes) -> None:
+    """Modbus TCP frames, both ways."""
+    finder = AduFinder()
+    for read, _ in _reads(fuzzed):
+        with contextlib.suppress(RemoteProtocolError):
+            list(finder.receive(read))
+    with contextlib.suppress(RemoteProtocolError):
+        labjack.decode_response(fuzzed)
+
+
+def fifo(fuzzed: bytes) -> None:
+    """Read replies of a block FIFO."""
+    decoder = FifoDecoder("A", 7812.0)
+    for read, at in _reads(fuzzed):
+        decoder.request()
+        with contextlib.suppress(RemoteProtocolError):
+            decoder.receive(read, at)
+            whole = rtu.encode(1, bytes((4, len(read) & 0xFE)) + read[: len(read) & 0xFE])
+            decoder.receive(whole, at)
+        if decoder.waiting:
+            decoder.timed_out(at)
+
+
+ROWS = TextFormat(columns=(0, 1, 2), counter_column=3, time_column=4)
+
+
+def text_rows(fuzzed: bytes) -> None:
+    """Rows of text with counter and time."""
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
+    _feed(decoder.receive, fuzzed)
+
+
+def text_packets(fuzzed: bytes) -> None:
+    """Packets of a Raspberry Shake."""
+    decoder = TextDecoder("A", RASPBERRY_SHAKE, sampling_rate=100.0)
+    _feed(decoder.receive, fuzzed)
+    packets = [
+        f"{{'EHZ', {LATER + k / 4:.3f}, {', '.join(map(str, range(25)))}}}" for k in range(4)
+    ]
+    decoder.receive(b"}", _at(LATER))  # ends what was begun
+    _demand([x for packet in packets for x in decoder.receive(packet.encode(), _at(LATER + 1))], 75)
+
+
+TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
+    "epson_bursts": (epson_bursts, [b"\xff" + BURSTS, b"\x10" + BURSTS[5:], bytes(60)]),
+    "epson_commands": (epson_commands, [b"\x02" + epson.read(epson.ID) * 3]),
+    "polled_registers": (polled_registers, [b"\x0d" + bytes(range(70)), b"\x0d" + b"\xff" * 56]),
+    "guralp_serial": (guralp_serial, [b"\xff" + FRAMES, b"\x07" + FRAMES[30:]]),
+    "gcf_block": (gcf_block, [_gcf(0)]),
+    "scream_tcp": (scream_tcp, [b"\xff" + _gcf(0).ljust(1024, b"\0") + bytes(40)]),
+    "labjack_stream": (labjack_stream, [b"\xff" + PACKETS, b"\x05" + PACKETS[9:]]),
+    "labjack_registers": (labjack_registers, [b"\xff" + bytes.fromhex("000100000006ff0400000002")]),
+    "fifo": (fifo, [b"\x10" + rtu.encode(1, bytes((4, 8)) + struct.pack(">4H", 3, 1, 2, 3))]),
+    "text_rows": (text_rows, [b"\xff1,2,3,0,10.0\n2,3,4,1,10.1\n", b"\x03-1e5,nan,inf,x,1\n"]),
+    "text_packets": (text_packets, [b"\xff{'EHZ', 1582315130.292, 14168, 14927, 7}"]),
+}
+"""Name → what to run, and inputs to begin with."""
