@@ -104,11 +104,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
     if fitted:
         rates = ", ".join(f"{clock.sensor} {clock.ppm:+.1f} ppm" for clock in fitted)
         worst = max(clock.residual for clock in fitted) * 1e6
-        lines.append(
-            f"clocks {rates}, aligned to about {max(worst, 0.1):.{0 if worst > 10 else 1}f} µs".replace(
-                "-", "−"
-            )
-        )
+        within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
+        lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
     for method, noise in snapshot.results.items():
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
