@@ -13,7 +13,7 @@ most likely pair is smoothed backwards (Rauch, Tung, Striebel 1965). An innovati
 standard deviations counts as four: an outlier cannot pull, a change that stays is followed.
 A restart of the device's clock forgets the lateness and keeps the rate.
 
-Why a filter, and not a line or pieces of lines: docs/decisions/0007-clock-model.md.
+Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model.md.
 """
 
 from __future__ import annotations
