@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 LIBVER = ("v110", "v110")
 _MERGED_SECONDS = 0.1
+_LEAST_CHUNK_ROWS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -480,7 +481,9 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
             group.attrs[key] = getattr(sensor, key)
         n_channels = len(sensor.channels)
-        n_rows = max(4, round(sensor.sampling_rate * chunk_seconds))
+        # Every chunk costs its reader some 10 µs, however small: at low rates rather two seconds.
+        least = min(_LEAST_CHUNK_ROWS, round(2 * sensor.sampling_rate))
+        n_rows = max(4, least, round(sensor.sampling_rate * chunk_seconds))
         filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
         samples = group.create_dataset(
             "samples",
