@@ -20,7 +20,12 @@ from estimator.dimension import bands
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import maximise, testable
 from estimator.model_test import BandTest, ModelTest, model_test, pool
-from estimator.response import RelativeResponse, matched_coherence, relative_response
+from estimator.response import (
+    RelativeResponse,
+    canonical_coherence,
+    matched_coherence,
+    relative_response,
+)
 
 if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray
@@ -233,26 +238,14 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
     usable = np.isfinite(matrix).all(axis=(1, 2))
     if n_effective <= 2 * max(dims):
         return np.full(len(matrix), np.nan)
-    whitened = [_whitener(matrix[usable], dims, sensor) for sensor in range(len(dims))]
     for j, k in pairs:
-        a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
-        between = whitened[j] @ matrix[usable, a, b] @ whitened[k]
-        coherence = np.clip(np.linalg.svd(between, compute_uv=False) ** 2, 0.0, 1 - 1e-15)
+        coherence = np.minimum(canonical_coherence(matrix, dims, j, k), 1 - 1e-15)
         scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
         statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
         r = np.arange(coherence.shape[1])
         limit = special.chdtri(2 * (dims[j] - r) * (dims[k] - r), DIMENSION_LEVEL / len(pairs))
-        found[usable] = np.maximum(found[usable], (statistic > limit).sum(axis=1))
+        found = np.maximum(found, (statistic > limit).sum(axis=1))
     return np.where(usable, found, np.nan)
-
-
-def _whitener(matrix: ComplexArray, dims: tuple[int, ...], sensor: int) -> ComplexArray:
-    """Inverse root of one sensor's own coherency; a direction without power stays without."""
-    own = slice(sum(dims[:sensor]), sum(dims[: sensor + 1]))
-    w, u = np.linalg.eigh(matrix[:, own, own])
-    alive = w > 1e-12
-    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
-    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
 
 
 def _responses(

@@ -56,7 +56,7 @@ class RelativeResponse:
     delay : float
         Seconds by which `second` lags behind `first`.
     coherence : float
-        Mean over the band of the least coherence between like channels of the two.
+        Mean over the band of the coherence in the direction in which it is least.
     """
 
     first: int
@@ -97,6 +97,40 @@ def matched_coherence(
     power = csm[:, a, a].real * csm[:, b, b].real
     cross = np.abs(csm[:, a, b]) ** 2
     return np.where(power > 0, cross / np.where(power > 0, power, 1.0), np.nan)
+
+
+def canonical_coherence(
+    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
+) -> FloatArray:
+    """Magnitude squared coherence of two sensors' motion, direction by direction.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Coherency or cross-spectral matrix, channels grouped by sensor.
+    dims : tuple of int
+    first, second : int
+
+    Returns
+    -------
+    float64, shape (n_freqs, min(dims[first], dims[second]))
+        Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``. Whatever
+        way the sensors point, the same. Zero where the matrix is not finite.
+    """
+    usable = np.isfinite(csm).all(axis=(1, 2))
+    found = np.zeros((len(csm), min(dims[first], dims[second])))
+    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (first, second))
+    left, right = (_inverse_root(csm[usable, own, own]) for own in (a, b))
+    found[usable] = np.linalg.svd(left @ csm[usable, a, b] @ right, compute_uv=False) ** 2
+    return np.clip(found, 0.0, 1.0)
+
+
+def _inverse_root(matrix: ComplexArray) -> ComplexArray:
+    """Inverse root of Hermitian matrices; a direction without power stays without."""
+    w, u = np.linalg.eigh(matrix)
+    alive = w > 1e-12 * w[:, -1:]
+    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
 
 
 def relative_response(
@@ -145,9 +179,9 @@ def relative_response(
     -----
     ``T = [sum_f w S_jk exp(2 pi i f tau)] [sum_f w S_ik]^-1`` with all the other sensors as k
     (least squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P the mean
-    PSD of sensor i and g the least coherence between like channels, so that every frequency
-    counts by its signal-to-noise ratio and incoherent ones do not count. The delay tau is the
-    slope through the origin of half the phase of ``det(T(f))**2`` over d, weighted alike.
+    PSD of sensor i and g their coherence in the direction in which it is least, so that every
+    frequency counts by its signal-to-noise ratio and incoherent ones do not count. The delay tau
+    is the slope through the origin of half the phase of ``det(T(f))**2`` over d, weighted alike.
     """
     check_dims(dims)
     given = coherency(csm, dims)
@@ -160,12 +194,13 @@ def relative_response(
     low, high = band or (0.0, np.inf)
     usable = (frequency > 0) & (frequency >= low) & (frequency <= high)
     usable &= ~(given.flags != 0).any(axis=1)
-    weight, g = _weights(given.matrix, dims, (first, second))
+    g = canonical_coherence(given.matrix, dims, first, second)[:, -1]
+    weight = g / np.maximum(1 - g, 1e-9)
     weight[~usable | (weight < LEAST_COHERENCE / (1 - LEAST_COHERENCE))] = 0.0
     if not weight.any():
         raise InsufficientDataError(
-            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are like "
-            f"channels alive and coherent by more than {LEAST_COHERENCE}"
+            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
+            f"alive and coherent in all {d} directions by more than {LEAST_COHERENCE}"
         )
     inside = np.flatnonzero(weight)
     f, weight = frequency[inside], weight[inside]
@@ -207,21 +242,6 @@ def relative_response(
         delay=delay,
         coherence=float(g[inside].mean()),
     )
-
-
-def _weights(
-    matrix: ComplexArray, dims: tuple[int, ...], pair: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
-    """Signal-to-noise ratio by coherence, and the least coherence of like channels of a pair."""
-    every = [
-        matched_coherence(matrix, dims, a, b)
-        for a in range(len(dims))
-        for b in range(a)
-        if pair[0] in {a, b} or pair[1] in {a, b}
-    ]
-    least = np.nan_to_num(np.concatenate(every, axis=1).min(axis=1))
-    own = np.nan_to_num(matched_coherence(matrix, dims, *pair).min(axis=1))
-    return least / np.maximum(1 - least, 1e-9), own
 
 
 def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:

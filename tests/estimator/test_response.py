@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from estimator.diagnostics import diagnose
 from estimator.errors import InsufficientDataError
 from estimator.model_test import neighbour_correlation
-from estimator.response import matched_coherence, relative_response
+from estimator.response import canonical_coherence, matched_coherence, relative_response
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.windows import get_window
 from tests.estimator.models import wishart
@@ -125,6 +125,24 @@ def test_coherence_of_like_channels() -> None:
     np.testing.assert_allclose(matched_coherence(csm, (2, 2, 2), 0, 2)[0], expected)
 
 
+def test_coherence_by_direction_does_not_see_orientation() -> None:
+    turned = Rotation.from_rotvec([1.0, 2.0, -1.5]).as_matrix()
+    plain, other = bench([np.eye(3)] * 3, snr=10), bench([np.eye(3), turned, turned.T], snr=10)
+    one, two = (canonical_coherence(csm, (3, 3, 3), 0, 1) for csm in (plain, other))
+    np.testing.assert_allclose(one, two, rtol=1e-9)
+    snr = 10 * np.linalg.eigvalsh(MOTION)[::-1]
+    np.testing.assert_allclose(one[0], (snr / (snr + 1)) ** 2, rtol=1e-9)
+    assert matched_coherence(other, (3, 3, 3), 0, 1).min() < 0.3
+
+
+def test_any_rotation_is_found() -> None:
+    turned = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()
+    csm = bench([np.eye(3), turned, turned.T])
+    found = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
+    assert found.rotation_deg == pytest.approx(np.rad2deg(np.linalg.norm([1, 2, 0.5])), abs=1e-3)
+    np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
+
+
 def test_what_cannot_be_compared() -> None:
     csm = bench([np.eye(3), np.eye(3)[:2], np.eye(3)])
     with pytest.raises(InsufficientDataError, match="3 and 2 channels"):
@@ -207,5 +225,5 @@ def test_the_report_says_where_one_motion_does_not_explain_the_real_recording(
     assert warned[0].band[0] < 0.2 < warned[0].band[1]
     turned = [advice.text for advice in found.advice if "are turned by" in advice.text]
     assert any(
-        "TST5.00 and TST5.10 are turned by 2.4° (2.24° in the horizontal)" in t for t in turned
+        "TST5.00 and TST5.10 are turned by 2.4° (2.26° in the horizontal)" in t for t in turned
     )
