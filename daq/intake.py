@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from daq.recording.writer import Committed, RecordingWriter
     from daq.session import Connected, Item
 
+_SAY_INTERVAL_NS = 1_000_000_000
 LOST_KINDS = frozenset({"disconnected", "refused", "stalled"})
 
 
@@ -41,6 +42,7 @@ class _Sensor:
         self.state = "waiting"
         self.missing = 0
         self.repeated = 0
+        self.said_ns = -_SAY_INTERVAL_NS
 
 
 class Intake:
@@ -109,13 +111,20 @@ class Intake:
         placed = sensor.continuity.place(block)
         if placed.repeated:
             sensor.repeated += placed.repeated
-            text = f"{placed.repeated} samples were recorded already ({sensor.repeated} so far)"
-            self._writer.event(Event(block.sensor, "resynchronised", text, block.received))
+            self._say_repeated(sensor, block)
         if placed.gap is not None:
             self._gap(block.sensor, sensor, placed.gap)
         if placed.block is not None:
             sensor.state = "recording"
             self._writer.append(placed.block)
+
+    def _say_repeated(self, sensor: _Sensor, block: Block) -> None:
+        """Say it at most once a second: a line may repeat everything, for weeks."""
+        at = block.received
+        if at.monotonic_ns - sensor.said_ns >= _SAY_INTERVAL_NS:
+            sensor.said_ns = at.monotonic_ns
+            text = f"{sensor.repeated} samples so far came again and were recorded once"
+            self._writer.event(Event(block.sensor, "resynchronised", text, at))
 
     def _gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
         sensor.missing += gap.missing

@@ -205,11 +205,12 @@ async def test_repeated_blocks_are_recorded_once(tmp_path: Path) -> None:
         run.send("a", 0, 100)
         run.send("a", 0, 100)
         run.send("a", 50, 150)
+        run.send("a", 190, 10)
         await run.until("a", 200)
     with Recording.open(run.path) as recording:
         np.testing.assert_array_equal(recording.sensors[0].counts(), counts(0, 200))
         said = [e.text for e in recording.events if e.kind == "resynchronised"]
-        assert [text.split()[0] for text in said] == ["100", "50"]
+        assert [text.split()[0] for text in said] == ["100", "150"]
 
 
 async def test_a_fault_in_a_driver_concerns_its_device_only(tmp_path: Path) -> None:
