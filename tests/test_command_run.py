@@ -185,3 +185,19 @@ def children_of(pid: int) -> list[int]:
         ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=True
     )
     return [int(line) for line in done.stdout.split()]
+
+
+def test_demo_shows_which_estimate_is_right() -> None:
+    code, said, err = finished(start("demo", "--duration", "30s", "--speed", "8", "--json", "-"))
+    assert code == 0, err
+    channels = json.loads(said)["channels"]
+    covers = {
+        method: [entry["covers"] for entry in channels if entry["method"] == method]
+        for method in ("three-channel", "three-sensor")
+    }
+    assert len(covers["three-sensor"]) == 9
+    assert sum(covers["three-sensor"]) >= 8  # all nine at once in 95 % of runs
+    assert sum(covers["three-channel"]) <= 1
+    for entry in channels:
+        if entry["method"] == "three-channel" and entry["noise_psd"] > 0:
+            assert entry["noise_psd"] > 2 * entry["true_noise_psd"]

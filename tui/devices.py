@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from daq.bench import dump, load
+from daq.bench import dump, load, parse
 from daq.errors import BenchFileError
 from sim_devices.launch import start
 from sim_devices.scenario import Scenario
@@ -93,8 +94,11 @@ def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
 
 
 def _kind(port: str) -> str:
-    scheme = port.partition("://")[0] if "://" in port else ""
-    return "udp" if scheme == "udp" else "tcp" if scheme else "pty"
+    """Return the kind of wire a simulated device is to be served on, after its port's address."""
+    scheme, _, rest = port.partition("://")
+    if rest:
+        return "udp" if scheme == "udp" else "tcp"
+    return "tcp" if sys.platform == "win32" else "pty"
 
 
 @contextmanager
@@ -117,7 +121,8 @@ def connected(bench: Bench, running: Sequence[RunningDevice], *, speed: float) -
         for sensor in bench.sensors
     )
     simulation = bench.simulation | {"speed": speed}
-    return bench.model_copy(update={"sensors": sensors, "simulation": simulation})
+    changed = bench.model_copy(update={"sensors": sensors, "simulation": simulation})
+    return parse(dump(changed), str(bench.source or "simulated"))
 
 
 def serve_devices(path: Path, *, speed: float | None, out: Path | None, json: str | None) -> None:

@@ -14,7 +14,7 @@ from daq.clock import SystemClock
 from daq.errors import BenchFileError, HuddleError
 from daq.recorder import recording_path
 from daq.schedule import due_times, remove_old, serve, utc_now
-from tui.output import console, notices, write_json
+from tui.output import for_people, notices, write_json
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -49,16 +49,12 @@ def serve_bench(path: Path, *, show: bool, json: str | None) -> None:
             'such as "3h"'
         )
     if show:
-        times = [f"{due:%Y-%m-%d %H:%M %Z}" for due in _next(bench)]
-        for line in times:
-            console().print(line)
-        write_json(json, {"next": [due.isoformat() for due in _next(bench)]})
+        times = list(islice(due_times(bench.schedule, utc_now()), SHOWN))
+        for due in times:
+            for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}")
+        write_json(json, {"next": [due.isoformat() for due in times]})
         return
     asyncio.run(_serve(path, bench))
-
-
-def _next(bench: Bench) -> list[datetime]:
-    return list(islice(due_times(bench.schedule, utc_now()), SHOWN))
 
 
 async def _serve(path: Path, bench: Bench) -> None:
