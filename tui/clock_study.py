@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +16,7 @@ from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
 from sim_devices.scenario import Scenario
+from tui.studies import Curve, Panel, Point, Series, Study
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.estimation import Snapshot
+    from tui.studies import Told
 
     FloatArray = NDArray[np.float64]
 
@@ -256,6 +259,66 @@ def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) 
         ),
         cov=np.asarray((psd / truth)[usable].std(axis=0)),
         residual_us=residuals(snapshot, scenario) * 1e6,
+    )
+
+
+def clocks(told: Told, *, length: float = 1.0) -> Study:
+    """Study what free-running clocks do to the three-sensor estimate, and what is left of it.
+
+    Parameters
+    ----------
+    told
+        Takes progress.
+    length
+        Share of an hour to simulate.
+    """
+    cases = [
+        (n_dims, latency)
+        for n_dims in (2, 3)
+        for latency in (Latency(), Latency("batching", 16e-3))
+    ]
+    panels = []
+    for number, (n_dims, latency) in enumerate(cases):
+        kind = {2: "biaxial", 3: "triaxial"}[n_dims]
+        title = f"{kind}, {latency.kind} latency of {latency.spread * 1e3:g} ms"
+        told(f"clocks: {title}", number / len(cases))
+        with tempfile.TemporaryDirectory() as folder:
+            rows = study(
+                Path(folder), n_dims=n_dims, duration=3600 * length, latency=latency, seed=1
+            )
+        panels.append(_panel(title, {row.clocks: row for row in rows}, length))
+    return Study("clocks", "Free-running clocks at SNR 1e4", tuple(panels))
+
+
+def _panel(title: str, rows: dict[str, Row], length: float) -> Panel:
+    edges = np.array(BANDS)
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    settings = Settings()
+    # Independent values in a band: a Hann window leaves one in 1.94 frequencies; three sensors.
+    independent = 3 * np.diff(edges) * settings.segment / 1.94
+    refined = rows["refined"]
+    error = refined.cov.mean() / np.sqrt(independent)
+    points = tuple(
+        Point(*values, allowed=0.02)
+        for values in zip(
+            middle.tolist(),
+            refined.bias.mean(axis=1).tolist(),
+            [0.0] * len(middle),
+            error.tolist(),
+            strict=True,
+        )
+    )
+    left = f"{refined.residual_us.max():.2g} µs left" + ("" if length == 1 else f", {length:g} h")
+    return Panel(
+        f"{title} ({left})",
+        "frequency (Hz)",
+        "bias",
+        series=(Series("clocks refined", "three-sensor", "bias", points),),
+        curves=tuple(
+            Curve(clocks, middle, rows[clocks].bias.mean(axis=1), style)
+            for clocks, style in (("arrival times", "--"), ("oracle", ":"))
+        ),
+        log="x",
     )
 
 

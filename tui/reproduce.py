@@ -11,6 +11,7 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemaining
 from rich.table import Table
 
 from sim_devices.errors import ScenarioError
+from tui.clock_study import clocks
 from tui.laboratory import LABORATORY, Laboratory
 from tui.numerical_studies import NUMERICAL, Ingredients
 from tui.output import for_people, notices, write_json
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
     from tui.studies import Series, Study, Told
 
-STUDIES = (*NUMERICAL, *LABORATORY)
+CLOCKS = "clocks"
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
@@ -57,7 +59,9 @@ def reproduce(names: Sequence[str], *, told: Told, length: float = 1.0) -> Itera
 def _studies(names: tuple[str, ...], told: Told, length: float) -> Iterator[Study]:
     ingredients, laboratory = Ingredients(told, length=length), Laboratory(told, length=length)
     for name in names:
-        if name in NUMERICAL:
+        if name == CLOCKS:
+            yield clocks(told, length=length)
+        elif name in NUMERICAL:
             yield NUMERICAL[name](ingredients)
         else:
             yield LABORATORY[name](laboratory)
