@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -334,6 +336,43 @@ async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
         assert ("a", "checksum", "2 frames") in [
             (e.sensor, e.kind, e.text) for e in recording.events
         ]
+
+
+FULL_DISK = """
+import asyncio, resource, signal, sys
+from daq.errors import RecordingError
+from daq.recorder import record
+from tests.devices import ManualClock, PlayedDevice, PlayedDriver, bench, block
+
+async def main():
+    clock, driver = ManualClock(), PlayedDriver({"a": PlayedDevice()})
+    for first in range(0, 1_000_000, 1000):
+        driver.devices["a"].items.put_nowait(block("a", first, 1000, clock.now()))
+    await record(bench("a"), sys.argv[1], clock=clock, drivers=driver.find)
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+try:
+    asyncio.run(main())
+except RecordingError as error:
+    print(error, flush=True)
+"""
+
+
+def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    # A process of its own: HDF5 may crash the interpreter when it exits with what it cannot write.
+    said = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert said.stdout == f"{path}: cannot be written: File too large\n", said.stderr
+    report = verify(path)
+    assert report.intact
+    assert not report.closed
 
 
 def test_the_usual_path() -> None:
