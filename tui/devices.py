@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
+import tomllib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from daq.bench import dump, load, parse
 from daq.errors import BenchFileError
+from sim_devices.errors import ScenarioError
+from sim_devices.faults import parse as parse_faults
 from sim_devices.launch import start
 from sim_devices.scenario import Scenario
 from tui.output import console, notices, write_json
@@ -125,9 +128,29 @@ def connected(bench: Bench, running: Sequence[RunningDevice], *, speed: float) -
     return parse(dump(changed), str(bench.source or "simulated"))
 
 
-def serve_devices(path: Path, *, speed: float | None, out: Path | None, json: str | None) -> None:
+def with_faults(bench: Bench, path: Path) -> Bench:
+    """Return the bench with the fault script of a TOML file (see ``sim_devices.faults``).
+
+    Raises
+    ------
+    BenchFileError
+        With every fault of the script.
+    """
+    try:
+        script = tomllib.loads(path.read_text(encoding="utf-8")).get("faults", [])
+        parse_faults(script)
+    except (tomllib.TOMLDecodeError, ScenarioError) as error:
+        raise BenchFileError(f"{path}: {error}") from error
+    return bench.model_copy(update={"simulation": bench.simulation | {"faults": script}})
+
+
+def serve_devices(
+    path: Path, *, speed: float | None, faults: Path | None, out: Path | None, json: str | None
+) -> None:
     """Serve a bench's devices until interrupted, and tell how to reach them."""
     bench = load(path)
+    if faults is not None:
+        bench = with_faults(bench, faults)
     speed = bench.speed if speed is None else speed
     with simulated(bench, speed=speed) as reachable:
         text = dump(reachable)

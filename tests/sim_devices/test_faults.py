@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import json
 from contextlib import AsyncExitStack, asynccontextmanager
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from daq.bench import parse as parse_bench
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
-from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols import epson
 from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices import launch
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import LineFaults, SampleFaults, parse
 from tests.sim_devices.bench import device, scenario, sensors, spec
+from tui.devices import specification, with_faults
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -201,3 +204,15 @@ async def test_what_ends_a_session(kind: str, port: str, error: type[Exception])
             except (NotConnectedError, NoAnswerError) as came:
                 ended = ended or (sampled and isinstance(came, error))
             sampled = False
+
+
+def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
+    template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    bench = parse_bench(template)
+    script = tmp_path / "faults.toml"
+    script.write_text('[[faults]]\nkind = "drop"\nat = 3.0\n', encoding="utf-8")
+    wanted = [{"kind": "drop", "at": 3.0}]
+    assert specification(with_faults(bench, script), speed=1.0)["faults"] == wanted
+    script.write_text("[[faults]]\nat = -3.0\n", encoding="utf-8")
+    with pytest.raises(BenchFileError, match=r"(?s)faults\.toml: faults\[0\].*at = -3"):
+        with_faults(bench, script)

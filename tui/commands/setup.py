@@ -58,6 +58,10 @@ def devices(
     bench: BenchArgument,
     *,
     speed: SpeedOption = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option("--faults", metavar="FILE", help="What goes wrong, as [[faults]] in TOML."),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -71,7 +75,7 @@ def devices(
     """
     from tui.devices import serve_devices
 
-    serve_devices(bench, speed=speed, out=out, json=json)
+    serve_devices(bench, speed=speed, faults=faults, out=out, json=json)
 
 
 @examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
