@@ -77,6 +77,8 @@ class Line:
     kind: Kind
     scheme: str = "socket"
     setting: str = ""
+    carries_samples: bool = True
+    """Whether the faults of the script strike here; a pulled cable takes every line of a device."""
 
 
 @dataclass(frozen=True, slots=True)

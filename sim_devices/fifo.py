@@ -70,6 +70,14 @@ class FifoDevice:
             self._to_send.append((ready + TURNAROUND + len(reply) * self._byte_time, reply))
         return self.due(now)
 
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: the FIFO is lost."""
+        if kind == "reset":
+            self._advance(now)
+            self._first = self._end = self._next
+            self._holes.clear()
+        return ()
+
     def due(self, now: float) -> Sequence[bytes]:
         """Return the replies whose last byte has left."""
         sent: list[bytes] = []

@@ -150,6 +150,14 @@ class SerialPort:
             sent += self.due(now)
         return sent
 
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: blocks are numbered anew; it has no buffer to overflow."""
+        if kind == "reset" and self._until != NEVER:
+            self._transmitter = Transmitter()
+            self._frame = None
+            self.connected(now)
+        return ()
+
     def due(self, now: float) -> Sequence[bytes]:
         """Return the frames whose last byte has left up to ``now``."""
         sent: list[bytes] = []
@@ -264,7 +272,7 @@ def create(device: DeviceSpec, source: Source) -> list[Line]:
     if device.port == "udp":
         server = ScreamServer(device, digitizer, sent, udp=True)
         again = ScreamServer(device, digitizer, sent, udp=False)
-        recovery = Line(again, "tcp", setting="recovery_port")
+        recovery = Line(again, "tcp", setting="recovery_port", carries_samples=False)
         return [Line(server, "udp-server", scheme="udp"), recovery]
     if device.port == "tcp" and device.settings.get("link") == "scream":
         return [Line(ScreamServer(device, digitizer, sent, udp=False), "tcp")]

@@ -244,6 +244,14 @@ class LabJack:
         started = int(columns.timer(np.array([stream.first]))[0])
         self._store(reg.STREAM_START_TIME_STAMP, started.to_bytes(4, "big"))
 
+    def fault(self, kind: str, now: float, duration: float) -> None:
+        """Suffer a power failure, or an overflow that lasts."""
+        if kind == "reset":
+            self.stop()
+        elif self.stream is not None:
+            self.stream.advance(now)
+            self.stream.overflow(now + duration)
+
     def stop(self) -> None:
         """End the stream."""
         self.stream = None
@@ -282,6 +290,11 @@ class ControlPort:
             return ()
         return [self._labjack.answer(adu, now) for adu in requests]
 
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Pass a fault of its own on to the device."""
+        self._labjack.fault(kind, now, duration)
+        return ()
+
     def due(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
         """Return nothing: it answers only."""
         return ()
@@ -315,6 +328,11 @@ class StreamPort:
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
         """Ignore what comes: the port sends only."""
         return self.due(now)
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Pass a fault of its own on to the device."""
+        self._labjack.fault(kind, now, duration)
+        return ()
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the packets that are full."""
@@ -356,7 +374,9 @@ class StreamPort:
 def create(device: DeviceSpec, source: Source) -> list[Line]:
     """Return the device's control port and its stream port."""
     labjack = LabJack(device, source)
+    by_command = device.settings.get("mode") == "command-response"
+    control, stream = ControlPort(labjack), StreamPort(labjack)
     return [
-        Line(ControlPort(labjack), "tcp", scheme="modbus-tcp"),
-        Line(StreamPort(labjack), "tcp", setting="stream_port"),
+        Line(control, "tcp", scheme="modbus-tcp", carries_samples=by_command),
+        Line(stream, "tcp", setting="stream_port", carries_samples=not by_command),
     ]

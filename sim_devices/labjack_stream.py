@@ -42,6 +42,7 @@ class Stream:
         self.first = self._next = samples.first_after(now)
         self._buffer = np.empty(0, np.uint16)
         self._recovering = False
+        self._full_until = -NEVER
         self._skipped = 0
         self._mark: int | None = None  # scans skipped before the mark that is in the buffer
         self.wanted: int | None = None
@@ -61,8 +62,17 @@ class Stream:
         while self._next < end:
             self._take(end)
 
+    def overflow(self, until: float) -> None:
+        """Take no more scans before world time ``until``, as if the buffer were full."""
+        self._recovering, self._full_until = True, until
+
     def _take(self, end: int) -> None:
-        if self._recovering and self.n_waiting >= self._packet_size:  # until all that was is sent
+        full = self._samples.time(self._next) < self._full_until
+        if self._recovering and (full or self.n_waiting >= self._packet_size):
+            if full:
+                end = self._samples.end_before(
+                    min(self._full_until, self._samples.time(end - 1)), self._next
+                )
             self._skipped += end - self._next
             self._next = end
             if self._skipped > 65535:

@@ -187,7 +187,11 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
         Served(
             line,
             clock,
-            LineFaults(faults if k == 0 else (), f"{name} {k}", begin=clock.now()),
+            LineFaults(
+                [f for f in faults if line.carries_samples or f.kind == "disconnect"],
+                f"{name} {k}",
+                begin=clock.now(),
+            ),
             tell,
         )
         for k, line in enumerate(lines)
