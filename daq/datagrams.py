@@ -67,6 +67,10 @@ class DatagramStream(asyncio.DatagramProtocol):
             await self._arrived.wait()
         return self._waiting.popleft()
 
+    def discard(self) -> None:
+        """Forget what has come and was not read."""
+        self._waiting.clear()
+
     def send(self, payload: bytes) -> None:
         """Send a datagram to the server."""
         if not self._transport.is_closing():

@@ -53,7 +53,7 @@ class TextDevice:
         self._samples = Samples(source, device.sensors)
         self._received = b""
         self._sends = False
-        self._next = 0
+        self._next = self._counted_from = 0
         self._n_rows = PACKET_SAMPLES if self._format.layout == "channel" else 1
 
     def connected(self, now: float) -> Sequence[bytes]:
@@ -70,13 +70,20 @@ class TextDevice:
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Begin and end as told."""
         self._received = (self._received + received)[-200:]
-        if self._stop and self._stop in self._received:
-            self._sends = False
+        stop = self._received.rfind(self._stop) if self._stop else -1
+        start = self._received.rfind(self._start) if self._start else -1
+        if max(stop, start) >= 0:
             self._received = b""
-        elif self._start and self._start in self._received:
-            self._begin(now)
-            self._received = b""
+            self._sends = self._sends and stop < start
+            if stop < start:
+                self._begin(now)
         return self.due(now)
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: the counter begins anew; it has no buffer to overflow."""
+        if kind == "reset" and self._sends:
+            self._next = self._counted_from = self._samples.first_after(now)
+        return ()
 
     def _begin(self, now: float) -> None:
         if not self._sends:
@@ -127,7 +134,9 @@ class TextDevice:
         if format_.time_column is not None:
             filled[format_.time_column] = self._time(self._next)
         if format_.counter_column is not None:
-            filled[format_.counter_column] = str(self._next % format_.counter_modulus)
+            filled[format_.counter_column] = str(
+                (self._next - self._counted_from) % format_.counter_modulus
+            )
         fields_ = [filled.get(i, "0") for i in range(max(filled) + 1)]
         return encode_fields([*fields_, *self._tail], format_)
 

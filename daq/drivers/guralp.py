@@ -20,6 +20,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import numpy as np
@@ -127,6 +128,7 @@ class _UdpLink:
         self._stream = stream
         self._clock = clock
         self._recovery = recovery
+        self._name = next(iter(ids)) if len(ids) == 1 else ""
         self._decoder = ScreamDecoder(ids)
 
     @property
@@ -160,7 +162,7 @@ class _UdpLink:
         except (OSError, TimeoutError, asyncio.IncompleteReadError) as error:
             self._recovery = None
             text = f"no recovery of lost packets over TCP ({str(error) or 'no answer'})"
-            found.append(Event("", "status", text[:200], at))
+            found.append(Event(self._name, "status", text[:200], at))
         return found
 
 
@@ -334,7 +336,11 @@ async def _discover(
         async with asyncio.timeout(settings.patience):
             while True:
                 found = await link.receive()
-                heard += [i for i in found if isinstance(i, Event) and i.kind != "refused"]
+                heard += [
+                    replace(item, sensor=sensor.name)
+                    for item in found
+                    if isinstance(item, Event) and item.kind != "refused"
+                ]
                 if not link.streams.repeated:
                     continue
                 by_serial: dict[str, list[str]] = {}

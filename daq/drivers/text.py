@@ -111,6 +111,7 @@ class _Source(Protocol):
 
     async def receive(self) -> list[Block | Event]: ...
     async def send(self, payload: bytes) -> None: ...
+    def discard(self) -> None: ...
 
 
 class _StreamSource:
@@ -125,6 +126,9 @@ class _StreamSource:
     async def send(self, payload: bytes) -> None:
         await self._stream.write(payload)
 
+    def discard(self) -> None:
+        self._stream.discard()
+
 
 class _DatagramSource:
     def __init__(self, stream: DatagramStream, decoder: TextDecoder) -> None:
@@ -138,6 +142,9 @@ class _DatagramSource:
     async def send(self, payload: bytes) -> None:
         """Do nothing: it listens only."""
 
+    def discard(self) -> None:
+        self._stream.discard()
+
 
 class TextSession:
     """A port at which text comes, or will when asked for."""
@@ -149,18 +156,21 @@ class TextSession:
         *,
         label: str,
         information: DeviceInformation,
+        interval: float,
     ) -> None:
         self.information = (information,)
+        self._interval = interval  # of samples, s
         self._source = source
         self._settings = settings
         self._label = label
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Ask for samples and yield blocks of them."""
+        self._source.discard()
         if self._settings.start:
             await self._source.send(self._settings.start.encode())
         loop = asyncio.get_running_loop()
-        last, between = loop.time(), 0.0  # of blocks
+        last, between = loop.time(), self._interval  # of blocks
         while True:
             patience = last + self._settings.patience + 2 * between
             try:
@@ -173,7 +183,7 @@ class TextSession:
                 ) from error
             for item in items:
                 if isinstance(item, Block):
-                    between = max(0.9 * between, loop.time() - last)
+                    between = max(0.9 * between, self._interval, loop.time() - last)
                     last = loop.time()
                 yield item
 
@@ -200,14 +210,22 @@ class TextDriver:
             raise BenchFileError(f"port {sensor.port} is given to {names}; text comes from one")
         label = f"sensor {sensor.name!r} on {sensor.port}"
         format_ = settings.format_for(sensor)
-        decoder = TextDecoder(sensor.name, format_, sampling_rate=sensor.sampling_rate)
+        decoder = TextDecoder(
+            sensor.name, format_, sampling_rate=sensor.sampling_rate, joins=not settings.start
+        )
         information = DeviceInformation(
             sensor=sensor.name,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
         )
         async with _opened(sensor.port, clock, settings, decoder, label=label) as source:
             try:
-                yield TextSession(source, settings, label=label, information=information)
+                yield TextSession(
+                    source,
+                    settings,
+                    label=label,
+                    information=information,
+                    interval=1 / sensor.sampling_rate,
+                )
             finally:
                 if settings.stop:
                     with contextlib.suppress(DeviceError):

@@ -201,6 +201,7 @@ class Streams:
         self._sensors = {name: _Sensor(name, stream_ids) for name, stream_ids in ids.items()}
         self._owner = {stream: name for name, streams in ids.items() for stream in streams}
         self._unknown: Counter[str] = Counter()
+        self._name = _only(ids)
         self._lost = "block missing"
 
     @property
@@ -247,7 +248,7 @@ class Streams:
             self._unknown[block.stream_id] += 1
         elif len(self._unknown) < MAX_PENDING:
             self._unknown[block.stream_id] = 1
-            yield Event("", "refused", f"stream {block.stream_id} is of no sensor here", at)
+            yield Event(self._name, "refused", f"stream {block.stream_id} is of no sensor here", at)
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
 
@@ -265,6 +266,12 @@ def _cut(text: str) -> str:
     return text.encode()[:200].decode(errors="ignore")
 
 
+def _only(names: Iterable[str]) -> str:
+    """Return the one name of events that concern the port; none if several sensors share it."""
+    first, *others = (*names, "")
+    return first if len(others) <= 1 else ""
+
+
 class SerialDecoder:
     """GCF over a serial line with block recovery; see :mod:`daq.protocols.brp`.
 
@@ -278,6 +285,7 @@ class SerialDecoder:
 
     def __init__(self, sensors: Mapping[str, Iterable[str]], *, replies: bool = True) -> None:
         self.streams = Streams(sensors)
+        self._name = _only(sensors)
         self._receiver = Receiver(replies=replies)
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
@@ -288,14 +296,14 @@ class SerialDecoder:
                 case Frame(_, data):
                     found += self._frame(data, at)
                 case Damaged(sequence):
-                    found.append(Event("", "checksum", f"block {sequence} was damaged", at))
+                    found.append(Event(self._name, "checksum", f"block {sequence} was damaged", at))
                     self.streams.lost("damaged block")
                 case Lost(sequence, n_frames):
                     text = f"{n_frames} blocks from number {sequence} did not come again"
-                    found.append(Event("", "resynchronised", text, at))
+                    found.append(Event(self._name, "resynchronised", text, at))
                     self.streams.lost("lost block")
                 case Skipped(n_bytes, start):
-                    found.append(Event("", "status", _told(n_bytes, start), at))
+                    found.append(Event(self._name, "status", _told(n_bytes, start), at))
         return found
 
     def take_replies(self) -> bytes:
@@ -306,7 +314,7 @@ class SerialDecoder:
         try:
             block = decode_block(data)
         except RemoteProtocolError as error:
-            yield Event("", "checksum", _cut(str(error)), at)
+            yield Event(self._name, "checksum", _cut(str(error)), at)
             return
         yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
 
@@ -328,6 +336,7 @@ class ScreamDecoder:
 
     def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
         self.streams = Streams(sensors)
+        self._name = _only(sensors)
         self._finder = PacketFinder()
         self._next: int | None = None
         self._missing: dict[int, int] = {}  # sequence number: how many came since
@@ -344,7 +353,7 @@ class ScreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, at)
             else:
-                found.append(Event("", "resynchronised", f"skipped {item} bytes", at))
+                found.append(Event(self._name, "resynchronised", f"skipped {item} bytes", at))
         return found
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
@@ -353,11 +362,11 @@ class ScreamDecoder:
         if text == ACKNOWLEDGED:
             return []
         if text == NO_SERVER:
-            return [Event("", "stopped", "the Scream server shuts down", at)]
+            return [Event(self._name, "stopped", "the Scream server shuts down", at)]
         try:
             return list(self._packet(decode_packet(data), at))
         except RemoteProtocolError as error:
-            return [Event("", "resynchronised", _cut(str(error)), at)]
+            return [Event(self._name, "resynchronised", _cut(str(error)), at)]
 
     def not_available(self, sequence: int) -> None:
         """Note that the server no longer has this packet."""
@@ -376,7 +385,7 @@ class ScreamDecoder:
     def _advance(self, due: int, ahead: int, at: HostTime) -> Iterator[Event]:
         if ahead:
             self.streams.lost("lost packet")
-            yield Event("", "resynchronised", f"{ahead} packets missing", at)
+            yield Event(self._name, "resynchronised", f"{ahead} packets missing", at)
         aged = {number: since + 1 for number, since in self._missing.items()}
         if ahead <= self.PATIENCE:  # more than that is no disorder on the way
             aged |= {(due + i) % 65536: 0 for i in range(ahead)}

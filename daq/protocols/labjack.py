@@ -189,6 +189,7 @@ class StreamDecoder:
             name: np.array([list(scan_list).index(address) for address in addresses])
             for name, addresses in sensors.items()
         }
+        self._name = next(iter(sensors)) if len(sensors) == 1 else ""  # of events of the port
         self._n_columns = len(scan_list)
         self._timed = tuple(scan_list[:2]) == TIMER_ADDRESSES
         self._rate = scan_rate
@@ -229,7 +230,7 @@ class StreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, rows, at)
             else:
-                found.append(Event("", "resynchronised", f"skipped {item} bytes", at))
+                found.append(Event(self._name, "resynchronised", f"skipped {item} bytes", at))
         return found + self._blocks(rows, at)
 
     def receive_response(self, packet: Packet, at: HostTime) -> list[Block | Event]:
@@ -248,11 +249,11 @@ class StreamDecoder:
         lost = self._lost_packets(packet)
         if lost:
             found += self._blocks(rows, at)
-            found.append(Event("", "resynchronised", f"{lost} packets lost", at))
+            found.append(Event(self._name, "resynchronised", f"{lost} packets lost", at))
             self._skip_samples(lost * self._packet_size)
         self._packet_size = len(packet.samples) or self._packet_size
         if packet.status == AUTO_RECOVER_ACTIVE and not self._recovering:
-            found.append(Event("", "overflow", "the device's buffer overflowed (2940)", at))
+            found.append(Event(self._name, "overflow", "the device's buffer overflowed (2940)", at))
         self._recovering = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
         if packet.status == AUTO_RECOVER_END:
@@ -260,19 +261,19 @@ class StreamDecoder:
             rows.append(before)
             found += self._blocks(rows, at)
             text = f"the device skipped {packet.information} scans (2941)"
-            found.append(Event("", "overflow", text, at))
+            found.append(Event(self._name, "overflow", text, at))
             self._next_row += packet.information
             self._reason = "buffer overflow"
         elif packet.status in FATAL:
             self.fatal = packet.status
             text = f"{FATAL[packet.status]} ({packet.status})"
-            found.append(Event("", "overflow", text, at))
+            found.append(Event(self._name, "overflow", text, at))
             if DUMMY in scans[-1:]:  # incomplete when the stream broke off
                 scans = scans[:-1]
         elif packet.status == BURST_COMPLETE:
             self.complete = True
         elif packet.status not in (0, AUTO_RECOVER_ACTIVE):
-            found.append(Event("", "status", f"stream status {packet.status}", at))
+            found.append(Event(self._name, "status", f"stream status {packet.status}", at))
         rows.append(scans)
         return found
 

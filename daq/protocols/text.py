@@ -176,12 +176,17 @@ class TextDecoder:
         How the device writes.
     sampling_rate : float
         In Hz.
+    joins : bool
+        Whether the device may be sending already, so that the first message may lack its start.
     """
 
-    def __init__(self, sensor: str, format_: TextFormat, *, sampling_rate: float) -> None:
+    def __init__(
+        self, sensor: str, format_: TextFormat, *, sampling_rate: float, joins: bool = False
+    ) -> None:
         self._sensor = sensor
         self._format = format_
         self._rate = sampling_rate
+        self._joins = joins
         self._finder = MessageFinder(format_.terminator.encode())
         self._next = 0
         self._flags = BlockFlag.CLOCK_RESTART
@@ -195,7 +200,10 @@ class TextDecoder:
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take bytes of a line or connection, cut anywhere."""
-        return self._messages(self._finder.receive(data), at)
+        messages = self._finder.receive(data)
+        if self._joins and messages:
+            messages, self._joins = messages[1:], False
+        return self._messages(messages, at)
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take one datagram: whole messages, with or without a terminator at the end."""

@@ -199,7 +199,7 @@ def test_status_becomes_events_and_foreign_streams_are_named_once() -> None:
     assert [(e.sensor, e.kind) for e in events] == [
         ("A", "status"),
         ("A", "status"),
-        ("", "refused"),
+        ("A", "refused"),
     ]
     assert events[0].text == "GPS 3D"
     assert len(events[1].text) == 200

@@ -53,6 +53,13 @@ def test_rows_cut_anywhere(step: int) -> None:
     assert first.counts.dtype == np.float64
 
 
+def test_a_device_that_sends_already_is_joined_at_a_message() -> None:
+    decoder = TextDecoder("A", ROWS, sampling_rate=10.0, joins=True)
+    found = decoder.receive(b"5,6\n1,2,3", at(1)) + decoder.receive(b"\n4,5,6\n", at(2))
+    index, rows, events = split(found)
+    assert (index, rows, events) == ([0, 1], [[1, 2, 3], [4, 5, 6]], [])
+
+
 def test_lily() -> None:
     """The manual's line, padded as it is; seconds that do not come are a gap."""
     line = "LILY,2013/06/24 23:22:{:02d},-236.026,  25.666,194.25, 26.01,11.96,N9655\r\n"
