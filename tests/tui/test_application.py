@@ -77,13 +77,14 @@ async def test_channels_sensors_and_methods_by_keys(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
         await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
-        assert app.choice.methods == ("three-sensor",)
+        both = ("three-sensor", "three-channel")
+        assert app.choice.methods == both
         for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
             await pilot.press(key)
             assert app.choice.channel == channel
         title = app.query_one("#title", Static)
         assert "C X" in str(title.render())
-        for methods in (("three-channel",), ("three-sensor", "three-channel"), ("three-sensor",)):
+        for methods in (("three-sensor",), ("three-channel",), both):
             await pilot.press("e")
             assert app.choice.methods == methods
 
@@ -117,7 +118,7 @@ async def test_pictures(told: Told, name: str, size: tuple[int, int]) -> None:
         await shown(pilot, app, Fresh(empty_snapshot(), SETTINGS))
         assert_looks_as_before(app, f"{name}-waiting")
         await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
-        await pilot.press("e", "e", "down")
+        await pilot.press("down")
         await pilot.pause()
         assert_looks_as_before(app, f"{name}-running")
         await shown(pilot, app, Fresh(made_snapshot(n_effective=2000, closed=True), SETTINGS))
@@ -140,3 +141,16 @@ async def test_negative_estimates_are_marked_not_hidden(told: Told) -> None:
         text = screen_text(app)
     assert "40 of 199 values at or below zero" in text
     assert "▾" in text.replace("(▾ marks", "")
+
+
+async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(told: Told) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await pilot.press("question_mark")
+        await shown(pilot, app, Fresh(made_snapshot(n_effective=500), SETTINGS))
+        await pilot.resize_terminal(100, 40)
+        await pilot.pause()
+        await pilot.press("escape")
+        await pilot.pause()
+        assert "530 segments" in screen_text(app)

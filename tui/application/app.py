@@ -174,7 +174,6 @@ class HuddleApp(App[None]):
     def on_resize(self, event: Resize) -> None:
         """Fit the screen's size."""
         self.set_class(event.size.height >= TALL, "-tall")
-        self.screen.set_class(event.size.height >= TALL, "-tall")
         self.call_after_refresh(self._show)
 
     def _show(self) -> None:
@@ -182,7 +181,7 @@ class HuddleApp(App[None]):
             return
         self.query_one("#status", Static).update(self._status())
         snapshot, settings = self.snapshot, self._settings
-        self.screen.set_class(snapshot is None, "-idle")
+        self.set_class(snapshot is None, "-idle")
         if snapshot is None or settings is None:
             self.query_one("#table", Static).update(self._controls.description())
             self.query_one("#progress", Static).update(
