@@ -28,6 +28,7 @@ from daq.refinement import DelayMeter
 from daq.units import canonical, conversion
 from estimator.errors import InsufficientDataError
 from estimator.methods import METHODS, self_noise
+from estimator.rejection import Reason, SelectedSpectra
 from estimator.spectra import CrossSpectra, WelchSettings, scale
 from estimator.windows import effective_averages, get_window
 
@@ -85,6 +86,8 @@ class Settings:
         Of the common grid in Hz; the lowest of the sensors' where not given.
     refine : bool
         Whether clocks are refined by the motion the sensors share.
+    reject : bool
+        Whether segments with a transient in any channel are left out (`estimator.rejection`).
     options : dict
         Further options of the methods.
     """
@@ -102,6 +105,7 @@ class Settings:
     target_cov: float | None = None
     sampling_rate: float | None = None
     refine: bool = True
+    reject: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -179,8 +183,9 @@ class Snapshot:
     closed : bool
         Whether nothing more will come.
     diagnostics : dict
-        ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
-        ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
+        ``transients``: number of segments left out as disturbed. ``synchronisation``: ``residual``
+        between the clocks in seconds by sensor, and the fraction ``noise_bias``, shape
+        (n_freqs, n_channels), that it is expected to add to the noise PSD.
     """
 
     frequency: FloatArray
@@ -228,16 +233,29 @@ class _Pass:
             detrend=settings.detrend,
         )
         self.n_channels = len(self.aligned.channels)
-        self.refine = settings.refine
+        self.refine, self.reject = settings.refine, settings.reject
         self.restart()
 
     def restart(self) -> None:
         """Begin again, with the clocks as they are now."""
-        self.spectra = CrossSpectra(self.welch, self.n_channels)
+        self._undisturbed: SelectedSpectra | None = None
+        if self.reject:
+            self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
+        self._all = CrossSpectra(self.welch, self.n_channels)
         self.n_seen = 0
         self.taken_at: list[FloatArray] = []
         self.aligned.forget()
         self._meter: DelayMeter | None = None
+
+    @property
+    def spectra(self) -> CrossSpectra:
+        """Spectra of the segments that count."""
+        return self._all if self._undisturbed is None else self._undisturbed.spectra()
+
+    @property
+    def transients(self) -> int:
+        """Segments left out because something disturbed them."""
+        return 0 if self._undisturbed is None else self._undisturbed.counts[Reason.TRANSIENT]
 
     @property
     def n_complete(self) -> int:
@@ -270,7 +288,10 @@ class _Pass:
             starts = np.arange(count) * hop
             missing = np.concatenate([[0], np.cumsum(~valid)])
             starts = starts[missing[starts + length] == missing[starts]]
-            self.spectra.add(samples, starts)
+            if self._undisturbed is None:
+                self._all.add(samples, starts)
+            else:
+                self._undisturbed.add(samples, starts)
             self.taken_at.append(self._positions(np.arange(first, first + count)))
             self._measure(samples, starts, first * hop)
             self.n_seen += count
@@ -504,9 +525,10 @@ class Estimation:
         aligned = self._passes[-1].aligned
         residual = np.array([state.residual for state in aligned.clocks])
         diagnostics: dict[str, Any] = {
+            "transients": sum(each.transients for each in self._passes),
             "synchronisation": {
                 "residual": dict(zip((s.sensor for s in aligned.clocks), residual, strict=True))
-            }
+            },
         }
         if results and len(residual) == len(aligned.dims):
             noise = next(iter(results.values())).noise_psd
@@ -520,9 +542,9 @@ class Estimation:
     def _n_effective(self) -> float:
         window = get_window(self.settings.window, self._passes[0].welch.segment_length)
         return sum(
-            effective_averages(window, each.welch.hop, each.spectra.n_segments)
+            effective_averages(window, each.welch.hop, count)
             for each in self._passes
-            if each.spectra.n_segments
+            if (count := each.spectra.n_segments)
         )
 
     def _methods(

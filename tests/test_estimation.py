@@ -132,6 +132,20 @@ def test_a_gap_drops_the_segments_it_touches_and_nothing_else(tmp_path: Path) ->
     np.testing.assert_allclose(snapshot.csm, spectra.csm(), rtol=1e-9, atol=1.0)
 
 
+def test_a_disturbed_segment_is_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
+    sensors = huddle()
+    disturbed = sensors["b"].counts.copy()
+    disturbed[4010:4020] += 40 * np.abs(disturbed).max()  # someone knocks
+    sensors["b"].counts = disturbed
+    path = write(tmp_path / "r.h5", sensors)
+    everything = estimate([path], SETTINGS)
+    quiet = estimate([path], replace(SETTINGS, reject=True))
+    # Lattice segments at 3950 and 4000.
+    assert everything.n_segments - quiet.n_segments == 2
+    assert quiet.diagnostics["transients"] == 2
+    assert quiet.data_psd[5:10, 2].max() < 0.2 * everything.data_psd[5:10, 2].min()
+
+
 def test_several_recordings_accumulate(tmp_path: Path) -> None:
     one, two = huddle(seed=1), huddle(4000, seed=9)
     first, second = write(tmp_path / "1.h5", one), write(tmp_path / "2.h5", two)
