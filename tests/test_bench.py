@@ -183,7 +183,7 @@ psd = [[1, 2], [3, 4]]
         ),
         (
             sensor_text("d", extra="settings = {mood = 1}"),
-            ".settings.mood = 1: unknown key; expected one of baud_rate, mode (did you mean 'mode'?)",
+            "mood = 1: unknown key; expected one of baud_rate, mode (did you mean 'mode'?)",
         ),
         (sensor_text("d", extra="sampling_rate = 100"), "expected at least the bench's 200 Hz"),
         (
