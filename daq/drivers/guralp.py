@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
 SEND_INTERVAL = 10.0
 """Between two requests to go on sending, s."""
-MARGIN = 0.5
-"""What a block may be late by, waiting for its place on the line, s."""
+MARGIN = 3.0
+"""Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""
 RECOVERY_TIMEOUT = 2.0
 COMPONENTS = "ZNEX1234"
 

@@ -43,7 +43,7 @@ _NS = 1_000_000_000
 _HOUR_NS = 3600 * _NS
 MAX_PENDING = 64
 """Blocks a stream may be ahead of the others."""
-FULL_SCALE_COUNTS = 1 << 23
+FULL_SCALE_COUNTS = (1 << 23) - 1
 """Of a 24-bit digitizer."""
 
 
@@ -169,7 +169,7 @@ class _Sensor:
                 self._latest = (self._latest[0] - start, self._latest[1])
             start = self._taken_to = 0
         flags, self._flags = self._flags | BlockFlag.DEVICE_UTC, BlockFlag.NONE
-        if counts.max() >= FULL_SCALE_COUNTS - 1 or counts.min() <= -FULL_SCALE_COUNTS:
+        if counts.max() >= FULL_SCALE_COUNTS or counts.min() <= -FULL_SCALE_COUNTS:
             flags |= BlockFlag.CLIPPED
         missing = start > self._taken_to
         self._taken_to = start + len(counts)
@@ -293,8 +293,8 @@ class SerialDecoder:
         found: list[Block | Event] = []
         for item in self._receiver.receive(data):
             match item:
-                case Frame(_, data):
-                    found += self._frame(data, at)
+                case Frame(_, block):
+                    found += self._frame(block, at)
                 case Damaged(sequence):
                     found.append(Event(self._name, "checksum", f"block {sequence} was damaged", at))
                     self.streams.lost("damaged block")

@@ -207,10 +207,11 @@ def test_status_becomes_events_and_foreign_streams_are_named_once() -> None:
     assert decoder.streams.silent == STREAMS
 
 
-def test_clipping_is_flagged() -> None:
+@pytest.mark.parametrize("extreme", [8_388_607, -8_388_607])
+def test_clipping_is_flagged(extreme: int) -> None:
     line = b""
     for i in range(3):
-        counts = np.full(100, 8_388_607 if i == 1 else 5, np.int32)
+        counts = np.full(100, extreme if i == 1 else 5, np.int32)
         raw = gcf.encode_block(SampleBlock(SYSTEM, STREAMS[i], START_NS, Fraction(100), counts))
         line += brp.encode_frame(i, raw)
     _, blocks, _ = joined(SerialDecoder(SENSORS).receive(line, AT))
