@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.counting import SampleCounter
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack_registers import CORE_HZ, CORE_TIMER, FEEDBACK, STREAM_DATA_CAPTURE_16
 
@@ -206,7 +207,7 @@ class StreamDecoder:
     def _begin(self) -> None:
         self._carry = np.empty(0, np.uint16)  # of a scan that goes on in the next packet
         self._offset = 0  # samples to drop until a scan begins
-        self._transaction: int | None = None
+        self._transactions: SampleCounter | None = None
         self._packet_size = 0
         self._recovering = False
         self.fatal: int | None = None
@@ -246,7 +247,10 @@ class StreamDecoder:
         found: list[Block | Event] = []
         if self.fatal is not None or self.complete:
             return found
-        lost = self._lost_packets(packet)
+        lost = self._lost_packets(packet, at)
+        if lost is None:
+            found.append(Event(self._name, "resynchronised", "a packet came twice", at))
+            return found
         if lost:
             found += self._blocks(rows, at)
             found.append(Event(self._name, "resynchronised", f"{lost} packets lost", at))
@@ -277,11 +281,18 @@ class StreamDecoder:
         rows.append(scans)
         return found
 
-    def _lost_packets(self, packet: Packet) -> int:
-        previous, self._transaction = self._transaction, packet.transaction
-        if previous is None or packet.transaction is None:
+    def _lost_packets(self, packet: Packet, at: HostTime) -> int | None:
+        """Return how many packets are missing before this one; None if it came before."""
+        if packet.transaction is None:
             return 0
-        return (packet.transaction - previous - 1) % 65536
+        if self._transactions is None:
+            packet_rate = self._rate * self._n_columns / max(1, len(packet.samples))
+            self._transactions = SampleCounter(65536, packet_rate)
+        runs, n_repeated = self._transactions.place(np.array([packet.transaction]), at)
+        if n_repeated:
+            return None
+        # a number that host time does not allow is none that was counted to
+        return 0 if runs[0].restarted else runs[0].missing
 
     def _skip_samples(self, n_samples: int) -> None:
         position = len(self._carry) + n_samples

@@ -332,3 +332,21 @@ def test_memory_stays_bounded() -> None:
     for _ in range(100):
         receiver.receive(b"\x4c\x10" * 5000)
     assert len(receiver._buffer) < 2048  # noqa: SLF001 -- the claim
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_packet_number_that_host_time_does_not_allow(timed: bool) -> None:
+    """One packet comes twice, and one with a wrong number: neither is 65,000 packets lost."""
+    width = 6 if timed else 4
+    sent = packets(scans(0, 400, timed=timed), 10 * width)
+    wrong = bytearray(sent[20])
+    wrong[0] ^= 0x80  # its transaction number
+    one = decoder(timed=timed)
+    found: list[Block | Event] = []
+    for k, packet in enumerate([*sent[:10], sent[9], *sent[10:20], bytes(wrong), *sent[21:]]):
+        found += one.receive(packet, at(k * 10 / RATE))
+    blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert blocks[-1].end_sample == 400
+    events = [item.text for item in found if isinstance(item, Event)]
+    assert events == ["a packet came twice"]
