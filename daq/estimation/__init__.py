@@ -1,0 +1,18 @@
+"""Follows recordings and estimates: the only part of this package that knows the estimator.
+
+`settings` says what is wanted, `segments` takes the segments of one recording, `following`
+keeps estimates up with recordings as they grow, and `snapshot` is what front ends see.
+"""
+
+from daq.estimation.following import Estimation, estimate
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import ChannelLabel, SensorState, Snapshot
+
+__all__ = [
+    "ChannelLabel",
+    "Estimation",
+    "SensorState",
+    "Settings",
+    "Snapshot",
+    "estimate",
+]

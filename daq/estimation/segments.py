@@ -1,0 +1,192 @@
+"""The segments of one recording, taken in order."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from daq.alignment import AlignedRecording
+from daq.refinement import DelayMeter
+from estimator.rejection import Reason, SelectedSpectra
+from estimator.spectra import CrossSpectra, WelchSettings
+from estimator.windows import get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from datetime import datetime
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.settings import Settings
+    from daq.recording.reader import Recording
+
+    FloatArray = NDArray[np.float64]
+
+_Piece = TypeVar("_Piece")
+_Read = TypeVar("_Read")
+
+_VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
+_MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
+
+
+class Pass:
+    """Segments of one recording, taken in order."""
+
+    def __init__(self, recording: Recording, settings: Settings) -> None:
+        self.recording = recording
+        self.aligned = AlignedRecording(
+            recording,
+            sampling_rate=settings.sampling_rate,
+            start_utc_ns=_utc_ns(settings.start),
+            end_utc_ns=_utc_ns(settings.end),
+        )
+        rate = self.aligned.sampling_rate
+        self.welch = WelchSettings(
+            sampling_rate=rate,
+            segment_length=round(settings.segment * rate),
+            overlap=settings.overlap,
+            window=settings.window,
+            detrend=settings.detrend,
+        )
+        self.n_channels = len(self.aligned.channels)
+        self.refine, self.reject = settings.refine, settings.reject
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again, with the clocks as they are now."""
+        self._undisturbed: SelectedSpectra | None = None
+        if self.reject:
+            self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
+        self._all = CrossSpectra(self.welch, self.n_channels)
+        self.n_seen = 0
+        self.taken_at: list[FloatArray] = []
+        self.aligned.forget()
+        self._meter: DelayMeter | None = None
+
+    @property
+    def spectra(self) -> CrossSpectra:
+        """Spectra of the segments that count."""
+        return self._all if self._undisturbed is None else self._undisturbed.spectra()
+
+    @property
+    def transients(self) -> int:
+        """Segments left out because something disturbed them."""
+        return 0 if self._undisturbed is None else self._undisturbed.counts[Reason.TRANSIENT]
+
+    @property
+    def n_complete(self) -> int:
+        """Segments of the lattice that are available now."""
+        beyond = self.aligned.n_available - self.welch.segment_length
+        return max(0, beyond // self.welch.hop + 1)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of the grid that have been looked at."""
+        if self.n_seen == 0:
+            return 0.0
+        length = (self.n_seen - 1) * self.welch.hop + self.welch.segment_length
+        return length / self.welch.sampling_rate
+
+    def advance(self, progress: Callable[[int], None] | None = None) -> None:
+        """Take every segment that is complete."""
+        hop, length = self.welch.hop, self.welch.segment_length
+        at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
+        total = self.n_complete
+        pieces = [
+            (first, min(at_once, total - first)) for first in range(self.n_seen, total, at_once)
+        ]
+
+        def read(piece: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
+            first, count = piece
+            return self.aligned.read(first * hop, (first + count - 1) * hop + length)
+
+        for (first, count), (samples, valid) in zip(pieces, _ahead(read, pieces), strict=True):
+            starts = np.arange(count) * hop
+            missing = np.concatenate([[0], np.cumsum(~valid)])
+            starts = starts[missing[starts + length] == missing[starts]]
+            if self._undisturbed is None:
+                self._all.add(samples, starts)
+            else:
+                self._undisturbed.add(samples, starts)
+            self.taken_at.append(self._positions(np.arange(first, first + count)))
+            self._measure(samples, starts, first * hop)
+            self.n_seen += count
+            if progress is not None:
+                progress(count)
+
+    def set_clocks(self) -> None:
+        """Set the clocks by what the segments taken say."""
+        if self._meter is not None:
+            self.aligned.set_clocks()
+
+    def is_outdated(self, tolerance: float) -> bool:
+        """Whether clocks, as known now, differ from those that segments were taken by.
+
+        By more than `tolerance` in seconds rms, that is; or whether delays could be measured now
+        and could not yet when segments came one by one.
+        """
+        if not self.taken_at or self.aligned.is_exact:
+            return False
+        if self._meter is not None and not self._meter.has_frame:
+            return self.n_seen >= self._meter.fewest
+        before = np.concatenate(self.taken_at)
+        moved = self._positions(np.arange(len(before))) - before
+        moved -= moved.mean(axis=1, keepdims=True)  # all sensors alike: no delay between them
+        constant = moved.mean(axis=0)
+        varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
+        return varying > tolerance or bool(
+            np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
+        )
+
+    def drift(self) -> FloatArray:
+        """Return middles of segments in seconds, and every sensor's delay there."""
+        n_sensors = len(self.aligned.dims)
+        taken = np.concatenate(self.taken_at) if self.taken_at else np.empty((0, n_sensors))
+        middle = np.arange(len(taken)) * self.welch.hop + self.welch.segment_length / 2
+        return np.column_stack([middle / self.welch.sampling_rate, taken])
+
+    def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
+        """Measure what delays are left, for the clocks' next setting."""
+        measurable = self.aligned.measurable if self.refine else ()
+        if not measurable:
+            return
+        if self._meter is None:
+            edges = np.cumsum([0, *self.aligned.dims])
+            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in measurable)
+            window = get_window(self.welch.window, self.welch.segment_length)
+            self._meter = DelayMeter(self.welch.sampling_rate, window, columns)
+        delays, std = self._meter.measure(samples, starts)
+        at = first + starts + self.welch.segment_length / 2
+        self.aligned.learn(
+            np.asarray(at, dtype=np.float64),
+            delays,
+            std=std,
+            frame_delays=self._meter.frame_delays(),
+        )
+
+    def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
+        middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
+        return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+
+
+def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
+    """Read pieces in order, the next one while the one before is worked on."""
+    if len(pieces) < 2:
+        yield from map(read, pieces)
+        return
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(read, pieces[0])
+        for following in pieces[1:]:
+            piece = coming.result()
+            coming = pool.submit(read, following)
+            yield piece
+        yield coming.result()
+
+
+def _utc_ns(instant: datetime | None) -> int | None:
+    if instant is None:
+        return None
+    return math.floor(instant.timestamp()) * 10**9 + instant.microsecond * 1000

@@ -1,0 +1,77 @@
+"""What is estimated, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from daq.bench_model import Bench
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is estimated, and how.
+
+    Attributes
+    ----------
+    segment : float
+        Length of a segment in seconds.
+    overlap, window, detrend
+        As `estimator.spectra.WelchSettings` takes them.
+    methods : tuple of str
+        Names in `estimator.methods.METHODS`; ``("all",)`` for every method that applies.
+    correct : bool
+        Whether the small-sample bias is removed.
+    unit : str or None
+        Of the result; that of the first channel where not given.
+    start, end : datetime or None
+        Only what lies between; with time zone.
+    band : (float, float) or None
+        Frequencies in Hz in which `target_cov` is wanted; 0.05 to 0.45 of the rate if not given.
+    target_cov : float or None
+        Wanted coefficient of variation.
+    sampling_rate : float or None
+        Of the common grid in Hz; the lowest of the sensors' where not given.
+    refine : bool
+        Whether clocks are refined by the motion the sensors share.
+    reject : bool
+        Whether segments with a transient in any channel are left out (`estimator.rejection`).
+    options : dict
+        Further options of the methods.
+    """
+
+    segment: float = 10.0
+    overlap: float = 0.5
+    window: str = "hann"
+    detrend: Literal["none", "constant", "linear"] = "constant"
+    methods: tuple[str, ...] = ("three-sensor",)
+    correct: bool = True
+    unit: str | None = None
+    start: datetime | None = None
+    end: datetime | None = None
+    band: tuple[float, float] | None = None
+    target_cov: float | None = None
+    sampling_rate: float | None = None
+    refine: bool = True
+    reject: bool = False
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, bench: Bench | None) -> Settings:
+        """Return what a bench file says, or what holds where there is none."""
+        if bench is None:
+            return cls()
+        wanted = bench.estimate
+        return cls(
+            segment=wanted.segment,
+            overlap=wanted.overlap,
+            window=wanted.window,
+            detrend=wanted.detrend,
+            methods=(wanted.method,),
+            correct=wanted.correct,
+            band=wanted.band,
+            target_cov=wanted.target_cov,
+        )
