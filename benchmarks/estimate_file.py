@@ -77,8 +77,8 @@ def run() -> list[Row]:
             Row("memory of an estimate, 3 h", _memory(shared), "MB", at_most=250.0),
             Row("memory of an estimate, three clocks, 3 h", _memory(free), "MB", at_most=250.0),
             Row(
-                "memory of an estimate, 12 h",
-                _memory(_record(Path(folder) / "long.h5", _samples(12), ppm=(0.0, 0.0, 0.0))),
+                "memory of an estimate, 9 h",
+                _memory(_record(Path(folder) / "long.h5", _samples(9), ppm=(0.0, 0.0, 0.0))),
                 "MB",
                 at_most=250.0,
             ),

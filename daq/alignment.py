@@ -14,6 +14,7 @@ the reading is cut. Memory is that of the piece asked for.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from dataclasses import dataclass, field
@@ -116,22 +117,25 @@ class _Source:
             self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
         self.n_blocks += len(blocks)
 
-    def read(self, first: int, last: int) -> tuple[FloatArray, BoolArray]:
-        """Return samples `first` to `last` (not included), and which of them are there."""
-        samples = np.zeros((last - first, len(self.columns)))
-        present = np.zeros(last - first, dtype=bool)
-        for run in self.runs:
+    def fill(self, samples: FloatArray, first: int) -> BoolArray:
+        """Write samples from `first` on in physical units; return which of them are there."""
+        last = first + len(samples)
+        present = np.zeros(len(samples), dtype=bool)
+        begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
+        for run in itertools.islice(self.runs, max(begin, 0), None):
+            if run.first_sample >= last:
+                break
             low = max(first, run.first_sample)
             high = min(last, run.first_sample + run.n_samples)
             if low >= high:
                 continue
             row = run.first_row + low - run.first_sample
             counts = self.record.counts(row, row + high - low)
-            np.divide(
-                counts[:, self.columns], self.sensitivity, out=samples[low - first : high - first]
-            )
+            if len(self.columns) < counts.shape[1]:
+                counts = counts[:, self.columns]
+            np.divide(counts, self.sensitivity, out=samples[low - first : high - first])
             present[low - first : high - first] = True
-        return samples, present
+        return present
 
 
 class AlignedRecording:
@@ -349,41 +353,35 @@ class AlignedRecording:
         # Whole spans: then the same numbers come out however the reading is cut.
         first = start // SPAN * SPAN
         last = -(-stop // SPAN) * SPAN
-        samples = np.empty((stop - start, len(self.channels)))
+        samples = np.zeros((stop - start, len(self.channels)))
         valid = np.ones(stop - start, dtype=bool)
         column = 0
         for source in self._sources:
-            width = len(source.columns)
+            part = samples[:, column : column + len(source.columns)]
             if self._passes(source):
-                part, present = self._pass_through(source, start, stop)
+                valid &= self._pass_through(source, start, part)
             else:
-                part, present = self._read_source(source, first, last)
-                part = part[start - first : stop - first]
-                present = present[start - first : stop - first]
-            samples[:, column : column + width] = part
-            valid &= present
-            column += width
+                whole, present = self._interpolated(source, first, last)
+                part[:] = whole[start - first : stop - first]
+                valid &= present[start - first : stop - first]
+            column += len(source.columns)
         return samples, valid
 
-    def _pass_through(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
-        """Return samples that fall on the grid, as they are."""
+    def _pass_through(self, source: _Source, start: int, samples: FloatArray) -> BoolArray:
+        """Write samples that fall on the grid, from `start` on; return which are valid."""
         second = np.array([(self._start or 0.0) + start / self.sampling_rate])
-        samples = np.zeros((stop - start, len(source.columns)))
-        valid = np.zeros(stop - start, dtype=bool)
+        valid = np.zeros(len(samples), dtype=bool)
         for epoch in _known(source).epochs:
             first = round(float(epoch.position(second)[0]))
             low = max(first, epoch.first_sample)
-            high = min(first + stop - start, epoch.end_sample)
+            high = min(first + len(samples), epoch.end_sample)
             if low < high:
-                part, present = source.read(low, high)
-                if high - low == stop - start:
-                    return part, present
-                samples[low - first : high - first][present] = part[present]
-                valid[low - first : high - first] |= present
-        return samples, valid
+                rows = slice(low - first, high - first)
+                valid[rows] = source.fill(samples[rows], low)
+        return valid
 
-    def _read_source(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
-        """Return samples interpolated on the grid."""
+    def _interpolated(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        """Return samples interpolated on the grid, and which of them are valid."""
         seconds = (self._start or 0.0) + np.arange(start, stop) / self.sampling_rate
         samples = np.zeros((stop - start, len(source.columns)))
         valid = np.zeros(stop - start, dtype=bool)
@@ -395,7 +393,8 @@ class AlignedRecording:
             margin = reach(ratio)
             low = math.floor(positions[0]) - margin
             high = math.ceil(positions[-1]) + margin + 1
-            inputs, present = source.read(low, high)
+            inputs = np.zeros((high - low, len(source.columns)))
+            present = source.fill(inputs, low)
             inside = np.arange(low, high)
             present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
             inputs[~present] = 0.0
