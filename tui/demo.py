@@ -103,7 +103,7 @@ def _show(path: Path, settings: Settings) -> Path | None:
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> None:
     notices().print(
         "Three simulated accelerometers on their serial protocol, "
-        f"{format_duration(duration)} at {speed:g} × life."
+        f"{format_duration(duration)} at {speed:g} × life, so {format_duration(duration / speed)}."
     )
     recorder = RecorderProcess(path, out, duration=duration)
     try:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from daq.estimation import Snapshot
 
 INTERRUPTED = 130
-INTERVAL = 0.2
-SHARE = 0.1
+INTERVAL = 0.5
+SHARE = 0.03
 """Of the time, at most, that estimating live may take."""
 
 
