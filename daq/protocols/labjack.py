@@ -345,6 +345,8 @@ class StreamDecoder:
         if not self._timed:
             return None
         first, last = (int(scans[i, 0]) | int(scans[i, 1]) << 16 for i in (0, -1))
+        if abs((last - first) % _WRAP - (n_scans - 1) * self._ticks) > n_scans * self._ticks / 2:
+            return None  # samples were lost on the way: what stands there is no timer
         counter = first
         if self._timer is not None:
             # What is known to be missing tells the number of wraps, the timer then the rest.

@@ -350,3 +350,17 @@ def test_a_packet_number_that_host_time_does_not_allow(timed: bool) -> None:
     assert blocks[-1].end_sample == 400
     events = [item.text for item in found if isinstance(item, Event)]
     assert events == ["a packet came twice"]
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_packet_that_lost_bytes_does_not_move_those_that_follow(timed: bool) -> None:
+    width = 6 if timed else 4
+    sent = packets(scans(0, 200, timed=timed), 10 * width)
+    cut = sent[5][:50] + sent[5][52:]
+    one = decoder(timed=timed)
+    found: list[Block | Event] = []
+    for k, packet in enumerate([*sent[:5], cut, *sent[6:]]):
+        found += one.receive(packet, at(k * 10 / RATE))
+    blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]
+    starts = [block.first_sample for block in blocks]
+    assert starts == [0, 10, 20, 30, 40, 50, *range(70, 200, 10)]  # the next one pays for it
