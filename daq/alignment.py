@@ -14,25 +14,15 @@ the reading is cut. Memory is that of the piece asked for.
 
 from __future__ import annotations
 
-import bisect
-import itertools
 import math
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.clock_model import (
-    ArrivalTimes,
-    Clock,
-    ClockState,
-    MeasuredDelays,
-    from_instants,
-    nominal,
-)
+from daq.clock_model import Clock, ClockState, from_instants, nominal
 from daq.errors import CannotAlignError
-from daq.protocols.block import BlockFlag
 from daq.resampling import SPAN, reach, resample
+from daq.sensor_source import Learnt, SensorSource, main_columns
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,97 +35,6 @@ if TYPE_CHECKING:
 
 _GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
 _SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
-
-
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """Contiguous samples, in the file as well as in time."""
-
-    first_sample: int
-    first_row: int
-    n_samples: int
-
-    @property
-    def last_row(self) -> int:
-        return self.first_row + self.n_samples
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Learnt:
-    """Delays measured where a sensor's sample `index` met the reference's `at_reference`."""
-
-    index: FloatArray
-    at_reference: FloatArray
-    delay: FloatArray
-    std: FloatArray
-
-
-@dataclass(slots=True)
-class _Source:
-    """One sensor of the recording: where its samples are, and when they were taken."""
-
-    record: SensorRecord
-    columns: list[int]
-    sensitivity: FloatArray
-    arrivals: ArrivalTimes
-    runs: list[_Run] = field(default_factory=list)
-    n_blocks: int = 0
-    device_utc: bool = False
-    polled: bool = False
-    clock: Clock | None = None
-    learnt: list[_Learnt] = field(default_factory=list)
-    frame_delay: float = 0.0
-
-    @property
-    def end_sample(self) -> int:
-        run = self.runs[-1]
-        return run.first_sample + run.n_samples
-
-    def refresh(self) -> None:
-        """Take the blocks that have been committed since."""
-        blocks = self.record.blocks[self.n_blocks :]
-        ends = blocks["first_row"] + blocks["n_samples"]
-        blocks = blocks[: np.searchsorted(ends, self.record.n_samples, side="right")]
-        if len(blocks) == 0:
-            return
-        if self.n_blocks == 0:
-            self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
-            self.polled = self.record.polled
-        self.arrivals.add(blocks)
-        first = blocks["first_sample"].astype(np.int64)
-        length = blocks["n_samples"].astype(np.int64)
-        expected = np.append(self.end_sample if self.runs else -1, (first + length)[:-1])
-        starts = np.flatnonzero(first != expected)
-        if len(starts) == 0 or starts[0] > 0:  # the run before goes on
-            until = int(starts[0]) if len(starts) else len(blocks)
-            run = self.runs[-1]
-            self.runs[-1] = _Run(
-                run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
-            )
-        for start, end in itertools.pairwise([*starts.tolist(), len(blocks)]):
-            n_samples = int(length[start:end].sum())
-            self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
-        self.n_blocks += len(blocks)
-
-    def fill(self, samples: FloatArray, first: int) -> BoolArray:
-        """Write samples from `first` on in physical units; return which of them are there."""
-        last = first + len(samples)
-        present = np.zeros(len(samples), dtype=bool)
-        begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
-        for run in itertools.islice(self.runs, max(begin, 0), None):
-            if run.first_sample >= last:
-                break
-            low = max(first, run.first_sample)
-            high = min(last, run.first_sample + run.n_samples)
-            if low >= high:
-                continue
-            row = run.first_row + low - run.first_sample
-            counts = self.record.counts(row, row + high - low)
-            if len(self.columns) < counts.shape[1]:
-                counts = counts[:, self.columns]
-            np.divide(counts, self.sensitivity, out=samples[low - first : high - first])
-            present[low - first : high - first] = True
-        return present
 
 
 class AlignedRecording:
@@ -166,18 +65,20 @@ class AlignedRecording:
     ) -> None:
         self._recording = recording
         self._wanted = (start_utc_ns, end_utc_ns)
-        records = [record for record in recording.sensors if _main(record)]
+        records = [record for record in recording.sensors if main_columns(record)]
         if not records:
             raise CannotAlignError(
                 f"{recording.path}: no sensor with a channel that is not auxiliary"
             )
         self.sampling_rate = _grid_rate(records, sampling_rate)
         self.channels: tuple[tuple[str, Channel], ...] = tuple(
-            (record.name, record.channels[column]) for record in records for column in _main(record)
+            (record.name, record.channels[column])
+            for record in records
+            for column in main_columns(record)
         )
-        self.dims = tuple(len(_main(record)) for record in records)
+        self.dims = tuple(len(main_columns(record)) for record in records)
         self._records = records
-        self._sources: list[_Source] = []
+        self._sources: list[SensorSource] = []
         self._origin = (0, 0)
         self._start: float | None = None
         self._set_at = (0, 0)
@@ -201,7 +102,7 @@ class AlignedRecording:
             return 0
         ends = []
         for source in self._sources:
-            clock = _known(source)
+            clock = source.known_clock
             margin = 0 if self._passes(source) else reach(self._ratio(source))
             rate = source.record.sampling_rate
             ends.append(clock.end - margin / rate)
@@ -228,7 +129,7 @@ class AlignedRecording:
         """
         seconds = (self._start or 0.0) + at / self.sampling_rate
         columns = [
-            seconds - _known(source).position(seconds) / source.record.sampling_rate
+            seconds - source.known_clock.position(seconds) / source.record.sampling_rate
             for source in self._sources
         ]
         return np.stack(columns, axis=1)
@@ -242,13 +143,13 @@ class AlignedRecording:
         if self.is_exact:
             return ()
         reference = self._reference
-        seen = {_clock_name(self._sources[reference])}
+        seen = {self._sources[reference].clock_name}
         free = []
         for number, source in enumerate(self._sources):
             stated = source.device_utc or source.polled
-            if not stated and _clock_name(source) not in seen:
+            if not stated and source.clock_name not in seen:
                 free.append(number)
-                seen.add(_clock_name(source))
+                seen.add(source.clock_name)
         return (reference, *free) if free else ()
 
     def learn(
@@ -267,12 +168,12 @@ class AlignedRecording:
             What is to be added to all delays since `forget`, in seconds.
         """
         seconds = (self._start or 0.0) + at / self.sampling_rate
-        at_reference = _known(self._sources[self._reference]).position(seconds)
+        at_reference = self._sources[self._reference].known_clock.position(seconds)
         for column, number in enumerate(self.measurable[1:]):
             source = self._sources[number]
-            index = _known(source).position(seconds)
+            index = source.known_clock.position(seconds)
             source.frame_delay = float(frame_delays[column])
-            source.learnt.append(_Learnt(index, at_reference, delays[:, column], std[:, column]))
+            source.learnt.append(Learnt(index, at_reference, delays[:, column], std[:, column]))
 
     def forget(self) -> None:
         """Drop what was learnt; the clocks stay as they are until they are set again."""
@@ -282,14 +183,14 @@ class AlignedRecording:
     def set_clocks(self) -> None:
         """Set every clock by all that is known now."""
         sources = self._sources
-        together = len({_clock_name(source) for source in sources}) == 1 and not any(
+        together = len({source.clock_name for source in sources}) == 1 and not any(
             source.device_utc or source.polled for source in sources
         )
         if together and len({source.record.sampling_rate for source in sources}) == 1:
             for source in sources:
                 source.clock = nominal(
                     source.record.name,
-                    _clock_name(source),
+                    source.clock_name,
                     end_sample=source.end_sample,
                     sampling_rate=source.record.sampling_rate,
                 )
@@ -298,13 +199,13 @@ class AlignedRecording:
         solved: dict[str, Clock] = {}
         for source in [reference, *sources]:
             name = source.record.name
-            known = solved.get(_clock_name(source))
+            known = solved.get(source.clock_name)
             if source.polled:
                 source.clock = self._polled(source)
             elif known is None or source.device_utc:
-                measured = None if source is reference else _measured(source, _known(reference))
+                measured = None if source is reference else source.measured(reference.known_clock)
                 source.clock = source.arrivals.solve(name, measured)
-                solved[_clock_name(source)] = source.clock
+                solved[source.clock_name] = source.clock
             elif known.state.sensor != name:
                 source.clock = known.shared_by(name).extended(source.end_sample)
 
@@ -316,7 +217,7 @@ class AlignedRecording:
                 return
             at = self._recording.created_at
             self._origin = (at.monotonic_ns, at.utc_ns)
-            self._sources = [_source(record, *self._origin) for record in self._records]
+            self._sources = [SensorSource.of(record, *self._origin) for record in self._records]
         for source in self._sources:
             source.refresh()
         n_samples = sum(source.end_sample for source in self._sources)
@@ -326,7 +227,7 @@ class AlignedRecording:
             self.set_clocks()
         else:
             for source in self._sources:
-                source.clock = _known(source).extended(source.end_sample)
+                source.clock = source.known_clock.extended(source.end_sample)
         if self._start is None:
             self._set_start()
 
@@ -367,11 +268,11 @@ class AlignedRecording:
             column += len(source.columns)
         return samples, valid
 
-    def _pass_through(self, source: _Source, start: int, samples: FloatArray) -> BoolArray:
+    def _pass_through(self, source: SensorSource, start: int, samples: FloatArray) -> BoolArray:
         """Write samples that fall on the grid, from `start` on; return which are valid."""
         second = np.array([(self._start or 0.0) + start / self.sampling_rate])
         valid = np.zeros(len(samples), dtype=bool)
-        for epoch in _known(source).epochs:
+        for epoch in source.known_clock.epochs:
             first = round(float(epoch.position(second)[0]))
             low = max(first, epoch.first_sample)
             high = min(first + len(samples), epoch.end_sample)
@@ -380,13 +281,15 @@ class AlignedRecording:
                 valid[rows] = source.fill(samples[rows], low)
         return valid
 
-    def _interpolated(self, source: _Source, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+    def _interpolated(
+        self, source: SensorSource, start: int, stop: int
+    ) -> tuple[FloatArray, BoolArray]:
         """Return samples interpolated on the grid, and which of them are valid."""
         seconds = (self._start or 0.0) + np.arange(start, stop) / self.sampling_rate
         samples = np.zeros((stop - start, len(source.columns)))
         valid = np.zeros(stop - start, dtype=bool)
         ratio = self._ratio(source)
-        for epoch in _known(source).epochs:
+        for epoch in source.known_clock.epochs:
             if epoch.end < seconds[0] or epoch.start > seconds[-1]:
                 continue
             positions = epoch.position(seconds)
@@ -412,7 +315,7 @@ class AlignedRecording:
                 return number
         return 0
 
-    def _polled(self, source: _Source) -> Clock:
+    def _polled(self, source: SensorSource) -> Clock:
         instants = source.record.instants_ns(0, source.runs[-1].last_row)
         return from_instants(
             source.record.name,
@@ -423,12 +326,12 @@ class AlignedRecording:
 
     def _set_start(self) -> None:
         start_utc_ns, end_utc_ns = self._wanted
-        self._start = max(_known(source).start for source in self._sources)
+        self._start = max(source.known_clock.start for source in self._sources)
         if not all(self._passes(source) for source in self._sources):
             self._start += max(
                 reach(self._ratio(source)) / source.record.sampling_rate for source in self._sources
             )
-        first = _known(self._sources[0])
+        first = self._sources[0].known_clock
         if start_utc_ns is not None:
             wanted = (start_utc_ns - self._origin[1]) * 1e-9
             if wanted > self._start:  # the first sensor's next sample
@@ -438,11 +341,11 @@ class AlignedRecording:
         if end_utc_ns is not None:
             self._end = (end_utc_ns - self._origin[1]) * 1e-9
 
-    def _passes(self, source: _Source) -> bool:
+    def _passes(self, source: SensorSource) -> bool:
         """Whether the sensor's samples fall on the grid."""
         if source.record.sampling_rate != self.sampling_rate or self._start is None:
             return source.record.sampling_rate == self.sampling_rate and self._start is None
-        clock = _known(source)
+        clock = source.known_clock
         for epoch in clock.epochs:
             rate = (epoch.index[-1] - epoch.index[0]) / (epoch.seconds[-1] - epoch.seconds[0])
             if len(epoch.index) > 2 or abs(rate / self.sampling_rate - 1) > 1e-12:
@@ -452,44 +355,8 @@ class AlignedRecording:
                 return False
         return True
 
-    def _ratio(self, source: _Source) -> float:
+    def _ratio(self, source: SensorSource) -> float:
         return max(1.0, source.record.sampling_rate / self.sampling_rate)
-
-
-def _known(source: _Source) -> Clock:
-    if source.clock is None:
-        raise CannotAlignError(f"sensor {source.record.name!r}: no block recorded yet")
-    return source.clock
-
-
-def _clock_name(source: _Source) -> str:
-    return source.record.clock or source.record.name
-
-
-def _measured(source: _Source, reference: Clock) -> MeasuredDelays | None:
-    """When a sensor's samples were taken, from the delays learnt against the reference."""
-    if not source.learnt:
-        return None
-    index = np.concatenate([each.index for each in source.learnt])
-    at_reference = np.concatenate([each.at_reference for each in source.learnt])
-    delay = np.concatenate([each.delay for each in source.learnt])
-    seconds = reference.at(at_reference) - delay - source.frame_delay
-    std = np.concatenate([each.std for each in source.learnt])
-    return MeasuredDelays(index, seconds, std)
-
-
-def _main(record: SensorRecord) -> list[int]:
-    return [column for column, channel in enumerate(record.channels) if not channel.auxiliary]
-
-
-def _source(record: SensorRecord, monotonic_ns: int, utc_ns: int) -> _Source:
-    columns = _main(record)
-    return _Source(
-        record,
-        columns,
-        np.array([record.channels[column].sensitivity for column in columns]),
-        ArrivalTimes(record.sampling_rate, monotonic_ns, utc_ns),
-    )
 
 
 def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:

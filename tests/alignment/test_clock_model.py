@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
+from daq.arrival_times import ArrivalTimes, MeasuredDelays, supporting_line
 from daq.clock_filter import Observations, smooth
-from daq.clock_model import ArrivalTimes, Clock, MeasuredDelays, supporting_line
 from daq.protocols.block import BlockFlag
 from daq.recording.layout import BLOCK_DTYPE
+
+if TYPE_CHECKING:
+    from daq.clock_model import Clock
 
 RATE = 200.0
 BLOCK = 20

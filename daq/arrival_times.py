@@ -1,0 +1,316 @@
+"""From block arrival times to the instant of every sample.
+
+Theory of operation
+-------------------
+The last sample of a block cannot have been taken after the block had been received, and latency
+only adds. So the instants of the samples, plus a constant (the shortest latency), are the *lower
+envelope* of the arrival times: late blocks, however late and however many, do not move it. Times
+are on the host's monotonic clock, in seconds from the recording's creation; a host whose UTC is
+stepped in the middle of a run changes nothing.
+
+Arrival times are thinned to the earliest in each second, so that memory and work do not grow with
+the block rate. A line under all of them (the edge of their lower convex hull below their mean)
+takes out what is common; the earliest in each stretch of `_NODE` seconds then is one observation
+for the filter of :mod:`daq.clock_filter`, which follows a rate that wanders. Delays measured from
+the samples (:mod:`daq.refinement`) join there.
+
+A stretch between restarts of the device's clock is an :class:`daq.clock_model.Epoch`; within one,
+the sample index counts without error. A block that says ``CLOCK_RESTART`` or
+``MISSING_ESTIMATED`` begins a new one, and so does a block far earlier than possible: then the
+host's clock has been asleep.
+
+Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
+statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
+its nominal rate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.clock_filter import Observations, smooth
+from daq.clock_model import Clock, ClockState, Epoch
+from daq.protocols.block import BlockFlag
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+
+_NANO = 1e-9
+_NODE = 10.0  # seconds of arrival times that make one observation
+_MOST_NODES = 3000
+_FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
+_WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
+_ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
+_RATE_OFF = 0.02  # share by which a rate may be off
+_STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
+_LEVEL = 10  # groups over which a slope can be told from jitter
+_UTC_JUMP = 0.01  # samples
+_BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+_UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
+_HULL_POINTS = 512
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredDelays:
+    """When samples were taken, as measured from the motion, up to one constant.
+
+    Attributes
+    ----------
+    index : float64, shape (n,)
+        (Fractional) sample indices, increasing.
+    seconds : float64, shape (n,)
+        When they were taken.
+    std : float64, shape (n,)
+        Standard deviation of `seconds`.
+    """
+
+    index: FloatArray
+    seconds: FloatArray
+    std: FloatArray
+
+
+@dataclass(slots=True)
+class ArrivalTimes:
+    """Arrival times of a sensor's blocks, thinned; grows with the recording.
+
+    Parameters
+    ----------
+    sampling_rate : float
+        Nominal, in Hz.
+    origin_monotonic_ns, origin_utc_ns : int
+        The recording's origin on both host clocks.
+    """
+
+    sampling_rate: float
+    origin_monotonic_ns: int
+    origin_utc_ns: int
+    _epoch_starts: list[int] = field(default_factory=list)
+    _index: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _late: FloatArray = field(default_factory=lambda: np.empty(0))
+    _epoch: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _end_sample: int = 0
+    _device_utc: bool = False
+    _lowest: float = np.inf
+
+    def add(self, blocks: NDArray[Any]) -> None:
+        """Take further rows of a recording's ``blocks``.
+
+        Parameters
+        ----------
+        blocks : structured array, shape (n_blocks,)
+            With the fields first_sample, n_samples, monotonic_ns, device_counter, flags.
+        """
+        blocks = blocks[blocks["n_samples"] > 0]
+        if len(blocks) == 0:
+            return
+        flags = blocks["flags"]
+        first = blocks["first_sample"].astype(np.int64)
+        length = blocks["n_samples"].astype(np.int64)
+        begins = not self._epoch_starts
+        if begins:
+            self._device_utc = bool(flags[0] & BlockFlag.DEVICE_UTC)
+        if self._device_utc:
+            index = first
+            elapsed = (blocks["device_counter"].astype(np.int64) - self.origin_utc_ns) * _NANO
+        else:
+            index = first + length - 1
+            elapsed = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
+        late = elapsed - index / self.sampling_rate
+        if self._device_utc:
+            step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
+            breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
+        else:
+            # Far below all before, even if the rate is off: the host's clock stood still.
+            level = late + _RATE_OFF * index / self.sampling_rate
+            lowest = np.minimum.accumulate(np.append(self._lowest, level))
+            self._lowest = float(lowest[-1])
+            breaks = ((flags & int(_BREAKS)) != 0) | (level < lowest[:-1] - _ASLEEP)
+        breaks[0] |= begins
+        epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
+        self._epoch_starts += [int(start) for start in first[breaks]]
+        self._end_sample = int(first[-1] + length[-1])
+        # A second that is not over yet is thinned again with what comes.
+        index = np.concatenate([self._index[-1:], index])
+        late = np.concatenate([self._late[-1:], late])
+        epoch = np.concatenate([self._epoch[-1:], epoch])
+        kept = _earliest(index, late, epoch, self.sampling_rate)
+        self._index = np.concatenate([self._index[:-1], index[kept]])
+        self._late = np.concatenate([self._late[:-1], late[kept]])
+        self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
+
+    def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:
+        """Return the clock, from everything taken so far.
+
+        Parameters
+        ----------
+        sensor : str
+            Its name.
+        measured : MeasuredDelays, optional
+            What the samples say.
+        """
+        if self._device_utc:
+            return self._stated(sensor)
+        slope, anchors = self._lines()
+        return self._filtered(sensor, slope, anchors, measured)
+
+    def _bounds(self) -> list[tuple[int, int]]:
+        """First sample of each epoch, and the one after its last."""
+        return list(itertools.pairwise([*self._epoch_starts, self._end_sample]))
+
+    def _stated(self, sensor: str) -> Clock:
+        """Follow the device's own statements; at the nominal rate, if they agree with it."""
+        epochs = []
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = self._epoch == number
+            index, late = self._index[mine].astype(float), self._late[mine]
+            if np.ptp(late) < _UTC_TOLERANCE:
+                index = np.array([first, max(end, first + 1)], dtype=float)
+                late = np.full(2, late[0])
+            epochs.append(Epoch(first, end, index, index / self.sampling_rate + late))
+        ppm, wander = 0.0, 0.0
+        if any(len(epoch.index) > 2 for epoch in epochs):
+            longest = max(epochs, key=lambda epoch: epoch.end_sample - epoch.first_sample)
+            rates = np.diff(longest.index) / np.diff(longest.seconds) / self.sampling_rate
+            ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
+        state = ClockState(
+            sensor, "device UTC", epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
+        )
+        return Clock(tuple(epochs), state)
+
+    def _lines(self) -> tuple[float, list[float]]:
+        """One slope (lateness per sample) for all epochs, and the lateness at index 0 of each."""
+        slopes, weights = [0.0], [0.0]
+        for number in range(len(self._epoch_starts)):
+            mine = self._epoch == number
+            if np.count_nonzero(mine) > 1:
+                index, late = self._index[mine].astype(float), self._late[mine]
+                slopes.append(supporting_line(index, late)[1])
+                weights.append(float(index[-1] - index[0]) ** 2)
+        total = sum(weights)
+        slope = float(np.dot(slopes, weights) / total) if total else 0.0
+        late = self._late - slope * self._index
+        return slope, [
+            float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
+        ]
+
+    def _filtered(
+        self,
+        sensor: str,
+        slope: float,
+        anchors: list[float],
+        measured: MeasuredDelays | None,
+    ) -> Clock:
+        left = self._late - slope * self._index - np.array(anchors)[self._epoch]
+        duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
+        node = max(_NODE, duration / _MOST_NODES)
+        kept = _earliest(self._index, left, self._epoch, self.sampling_rate * node)
+        index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
+        variance = np.zeros(len(index))
+        if measured is not None:
+            known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
+            at = measured.index[known]
+            which = np.searchsorted(self._epoch_starts, at, side="right") - 1
+            lateness = measured.seconds[known] - at / self.sampling_rate
+            lateness -= slope * at + np.array(anchors)[which]
+            index, late = np.concatenate([index, at]), np.concatenate([late, lateness])
+            epoch = np.concatenate([epoch, which])
+            variance = np.concatenate([variance, measured.std[known] ** 2 + _FLOOR**2])
+            order = np.lexsort((index, epoch))
+            index, late, epoch = index[order], late[order], epoch[order]
+            variance = variance[order]
+        observations = Observations(
+            seconds=index / self.sampling_rate,
+            lateness=late,
+            variance=variance,
+            from_samples=variance > 0,
+            restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
+        )
+        smoothed = smooth(observations)
+        residual = float(np.sqrt(np.mean(smoothed.std**2)))
+        refined = bool(observations.from_samples.any())
+        if refined and residual > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
+            return self._filtered(sensor, slope, anchors, None)
+        curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
+        epochs = []
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = np.flatnonzero(epoch == number)
+            nodes, late = index[mine], curve[mine]
+            # Straight on at both ends, at the rate the filter has there.
+            low, high = min(float(first), nodes[0]) - 1.0, max(float(end), nodes[-1]) + 1.0
+            nodes = np.concatenate([[low], nodes, [high]])
+            ends = smoothed.rate[mine[[0, -1]]] / self.sampling_rate
+            late = np.concatenate(
+                [
+                    [late[0] - ends[0] * (nodes[1] - low)],
+                    late,
+                    [late[-1] + ends[1] * (high - nodes[-2])],
+                ]
+            )
+            seconds = nodes / self.sampling_rate + late + slope * nodes + anchors[number]
+            increasing = np.concatenate([[True], np.diff(nodes) > 0])
+            epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
+        drift = slope * self.sampling_rate + float(smoothed.rate.mean())
+        state = ClockState(
+            sensor=sensor,
+            source="arrival times",
+            offset=epochs[0].start,
+            ppm=-drift / (1 + drift) * 1e6,
+            ppm_std=float(np.sqrt(2)) * residual / duration * 1e6,
+            wander_ppm=float(smoothed.rate.std()) * 1e6,
+            residual=residual,
+            n_epochs=len(epochs),
+            refined=refined,
+        )
+        return Clock(tuple(epochs), state)
+
+
+def _earliest(index: IntArray, late: FloatArray, epoch: IntArray, length: float) -> IntArray:
+    """Return, in order, the row of least lateness in every `length` samples of each epoch."""
+    group = (index / length).astype(np.int64)
+    # A sensor whose rate is off by per cent would otherwise keep each group's last, or first.
+    if len(index) > 2 and np.ptp(index) > _LEVEL * length:
+        slope = float(np.polynomial.polynomial.polyfit(index - index[0], late, 1)[1])
+        if abs(slope * length) > _STEEP:
+            late = late - slope * index
+    order = np.lexsort((late, group, epoch))
+    kept = np.ones(len(order), dtype=bool)
+    kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)
+    return order[kept]
+
+
+def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return intercept and slope of the highest line under all points at their mean.
+
+    Parameters
+    ----------
+    x, y : float64, shape (n_points,)
+        `x` increasing.
+    """
+    x0, y0 = float(x[0]), float(y[0])
+    x, y = x - x0, y - y0
+    if len(x) > _HULL_POINTS:  # the lowest of each group, against a line through them all
+        slope = np.polynomial.polynomial.polyfit(x, y, 1)[1]
+        groups = np.array_split(np.arange(len(x)), _HULL_POINTS)
+        chosen = np.array([group[np.argmin(y[group] - slope * x[group])] for group in groups])
+    else:
+        chosen = np.arange(len(x))
+    hull: list[int] = []
+    for point in chosen.tolist():
+        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    right = min(max(int(np.searchsorted(x[hull], x.mean())), 1), len(hull) - 1)
+    a, b = hull[right - 1], hull[right]
+    slope = float((y[b] - y[a]) / (x[b] - x[a]))
+    return y0 + float(y[a]) - slope * (x0 + float(x[a])), slope
+
+
+def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
+    return bool((x[b] - x[a]) * (y[c] - y[a]) <= (y[b] - y[a]) * (x[c] - x[a]))

@@ -1,0 +1,154 @@
+"""One sensor of a recording as alignment sees it: where its samples are, when they were taken."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.arrival_times import ArrivalTimes, MeasuredDelays
+from daq.errors import CannotAlignError
+from daq.protocols.block import BlockFlag
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.clock_model import Clock
+    from daq.recording.reader import SensorRecord
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Contiguous samples, in the file as well as in time."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+
+    @property
+    def last_row(self) -> int:
+        return self.first_row + self.n_samples
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learnt:
+    """Delays measured where a sensor's sample `index` met the reference's `at_reference`."""
+
+    index: FloatArray
+    at_reference: FloatArray
+    delay: FloatArray
+    std: FloatArray
+
+
+@dataclass(slots=True)
+class SensorSource:
+    """One sensor of the recording: where its samples are, and when they were taken."""
+
+    record: SensorRecord
+    columns: list[int]
+    sensitivity: FloatArray
+    arrivals: ArrivalTimes
+    runs: list[_Run] = field(default_factory=list)
+    n_blocks: int = 0
+    device_utc: bool = False
+    polled: bool = False
+    clock: Clock | None = None
+    learnt: list[Learnt] = field(default_factory=list)
+    frame_delay: float = 0.0
+
+    @property
+    def end_sample(self) -> int:
+        """Index of the sample after the last one."""
+        run = self.runs[-1]
+        return run.first_sample + run.n_samples
+
+    def refresh(self) -> None:
+        """Take the blocks that have been committed since."""
+        blocks = self.record.blocks[self.n_blocks :]
+        ends = blocks["first_row"] + blocks["n_samples"]
+        blocks = blocks[: np.searchsorted(ends, self.record.n_samples, side="right")]
+        if len(blocks) == 0:
+            return
+        if self.n_blocks == 0:
+            self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
+            self.polled = self.record.polled
+        self.arrivals.add(blocks)
+        first = blocks["first_sample"].astype(np.int64)
+        length = blocks["n_samples"].astype(np.int64)
+        expected = np.append(self.end_sample if self.runs else -1, (first + length)[:-1])
+        starts = np.flatnonzero(first != expected)
+        if len(starts) == 0 or starts[0] > 0:  # the run before goes on
+            until = int(starts[0]) if len(starts) else len(blocks)
+            run = self.runs[-1]
+            self.runs[-1] = _Run(
+                run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
+            )
+        for start, end in itertools.pairwise([*starts.tolist(), len(blocks)]):
+            n_samples = int(length[start:end].sum())
+            self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
+        self.n_blocks += len(blocks)
+
+    def fill(self, samples: FloatArray, first: int) -> BoolArray:
+        """Write samples from `first` on in physical units; return which of them are there."""
+        last = first + len(samples)
+        present = np.zeros(len(samples), dtype=bool)
+        begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
+        for run in itertools.islice(self.runs, max(begin, 0), None):
+            if run.first_sample >= last:
+                break
+            low = max(first, run.first_sample)
+            high = min(last, run.first_sample + run.n_samples)
+            if low >= high:
+                continue
+            row = run.first_row + low - run.first_sample
+            counts = self.record.counts(row, row + high - low)
+            if len(self.columns) < counts.shape[1]:
+                counts = counts[:, self.columns]
+            np.divide(counts, self.sensitivity, out=samples[low - first : high - first])
+            present[low - first : high - first] = True
+        return present
+
+    @classmethod
+    def of(cls, record: SensorRecord, monotonic_ns: int, utc_ns: int) -> SensorSource:
+        """Return the source of a sensor, nothing taken yet, times from this origin."""
+        columns = main_columns(record)
+        return cls(
+            record,
+            columns,
+            np.array([record.channels[column].sensitivity for column in columns]),
+            ArrivalTimes(record.sampling_rate, monotonic_ns, utc_ns),
+        )
+
+    @property
+    def clock_name(self) -> str:
+        """Name of the clock that samples it: its own where the recording does not say."""
+        return self.record.clock or self.record.name
+
+    @property
+    def known_clock(self) -> Clock:
+        """The clock, once a block has come."""
+        if self.clock is None:
+            raise CannotAlignError(f"sensor {self.record.name!r}: no block recorded yet")
+        return self.clock
+
+    def measured(self, reference: Clock) -> MeasuredDelays | None:
+        """Return when samples were taken, from the delays learnt against the reference."""
+        if not self.learnt:
+            return None
+        index = np.concatenate([each.index for each in self.learnt])
+        at_reference = np.concatenate([each.at_reference for each in self.learnt])
+        delay = np.concatenate([each.delay for each in self.learnt])
+        seconds = reference.at(at_reference) - delay - self.frame_delay
+        std = np.concatenate([each.std for each in self.learnt])
+        return MeasuredDelays(index, seconds, std)
+
+
+def main_columns(record: SensorRecord) -> list[int]:
+    """Return the columns of the channels that take part in the huddle test."""
+    return [column for column, channel in enumerate(record.channels) if not channel.auxiliary]
