@@ -101,6 +101,26 @@ class MultiResolution:
             if stage is not self._stages[-1]:
                 samples, complete = stage.halve(samples, complete)
 
+    @classmethod
+    def like(cls, other: MultiResolution) -> MultiResolution:
+        """Return an empty one of the same settings, channels and stages."""
+        top = other._stages[0]
+        n_stages = len(other._stages)
+        return cls(top.settings, top.spectra.n_channels, n_stages=n_stages)
+
+    def merge(self, other: MultiResolution) -> None:
+        """Add the segments of another recording.
+
+        Raises
+        ------
+        EstimatorError
+            If settings, stages or channels differ.
+        """
+        if len(other._stages) != len(self._stages):
+            raise EstimatorError(f"{len(other._stages)} stages, expected {len(self._stages)}")
+        for own, added in zip(self._stages, other._stages, strict=True):
+            own.spectra.merge(added.spectra)
+
     def bands(self, least_effective: float = 1.0) -> tuple[Band, ...]:
         """Return what the stages contribute, from the lowest frequencies up.
 

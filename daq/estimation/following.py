@@ -2,10 +2,11 @@
 
 Theory of operation
 -------------------
-Segments lie on a fixed lattice of the common grid; one that touches a gap is left out, for every
-sensor, and nothing else is. Each new segment is transformed once, with what is known about the
-clocks by then. When what is known has become materially better for segments already taken (looked
-at whenever their number has grown by a quarter), they are taken again.
+Segments lie on a fixed lattice of the common grid. One that touches a gap or a clipped block is
+left out, for every sensor, and so is one that something disturbed where that is asked for. Each
+new segment is transformed once, with what is known about the clocks by then. When what is known
+has become materially better for segments already taken (looked at whenever their number has grown
+by a quarter), they are taken again.
 
 ``finish`` is one pass over the whole recording with the final clocks: a function of the file
 alone. So what is shown when a run ends is what ``huddle estimate`` says about its file.
@@ -14,33 +15,37 @@ alone. So what is shown when a run ends is what ``huddle estimate`` says about i
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.errors import CannotAlignError
+from daq.estimation.diagnosis import diagnosis, synchronisation
+from daq.estimation.results import (
+    Dimensions,
+    Estimates,
+    averages,
+    in_units,
+    known_gains,
+    noise_estimates,
+    time_left,
+)
 from daq.estimation.segments import Pass
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, SensorState, Snapshot
+from daq.estimation.snapshot import ChannelLabel, Octave, SensorState, Snapshot
 from daq.recording.reader import Recording
-from daq.units import canonical, conversion
+from daq.units import canonical
 from estimator.errors import InsufficientDataError
-from estimator.methods import METHODS, self_noise
-from estimator.spectra import CrossSpectra, scale
-from estimator.windows import effective_averages, get_window
+from estimator.rejection import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from daq.recording.reader import SensorRecord
-    from estimator.self_noise import SelfNoise
-
-    FloatArray = NDArray[np.float64]
-    ComplexArray = NDArray[np.complex128]
+    from estimator.multiresolution import Band
 
 Progress = Callable[[int, int], None]
 
@@ -82,11 +87,13 @@ class Estimation:
             self._unit = canonical(
                 self.settings.unit or self._passes[0].aligned.channels[0][1].unit
             )
-            self._response = self._responses()
+            self._gains = known_gains(self.settings, self._passes[0].aligned.channels)
         except BaseException:
             self.close()
             raise
         self._next_review = _FIRST_REVIEW
+        self._dimensions: Dimensions | None = None
+        self._chosen_at = 0
 
     def close(self) -> None:
         """Close the recordings."""
@@ -102,7 +109,7 @@ class Estimation:
     @property
     def n_segments(self) -> int:
         """Segments taken so far."""
-        return sum(each.spectra.n_segments for each in self._passes)
+        return sum(each.n_segments for each in self._passes)
 
     @property
     def n_seen(self) -> int:
@@ -166,134 +173,96 @@ class Estimation:
                 total += each.n_seen
                 each.restart()
                 each.advance(count)
-        snapshot = self.snapshot()
+        snapshot = self._snapshot(final=True)
         if not snapshot.results:
             raise InsufficientDataError(self._why_nothing(snapshot))
         return snapshot
 
     def snapshot(self) -> Snapshot:
         """Return the estimate as it stands, from the segments taken so far."""
-        first = self._passes[0]
-        spectra = CrossSpectra(first.welch, first.n_channels)
-        for each in self._passes:
-            spectra.merge(each.spectra)
-        n_segments = spectra.n_segments
-        results: dict[str, SelfNoise] = {}
-        refused: dict[str, str] = {}
-        if n_segments == 0:
-            shape = (len(first.welch.frequencies), first.n_channels, first.n_channels)
-            csm = np.full(shape, np.nan, dtype=np.complex128)
-            n_effective = 0.0
+        return self._snapshot(final=False)
+
+    def _snapshot(self, *, final: bool) -> Snapshot:
+        first, last = self._passes[0], self._passes[-1]
+        dims, channels = first.aligned.dims, first.aligned.channels
+        bands = tuple(in_units(band, channels, self._unit) for band in averages(self._passes))
+        if bands:
+            frequency = np.concatenate([band.frequencies for band in bands])
+            csm = np.concatenate([band.csm for band in bands])
         else:
-            csm = spectra.csm()
-            if self._response is not None:
-                csm = scale(csm, self._response)
-            n_effective = self._n_effective()
-            results, refused = self._methods(csm, n_effective)
+            frequency = first.welch.frequencies
+            shape = (len(frequency), first.n_channels, first.n_channels)
+            csm = np.full(shape, np.nan, dtype=np.complex128)
+        n_segments, n_effective = self.n_segments, bands[-1].n_effective if bands else 0.0
+        estimates = self._estimates(bands, final=final)
+        diagnostics: dict[str, Any] = {
+            "synchronisation": synchronisation(
+                last.aligned.clocks, dims, frequency, csm, estimates.results
+            )
+        }
+        if estimates.dimensions is not None and estimates.dimensions.chosen:
+            diagnostics["dimension"] = estimates.dimensions.chosen
+        if final:
+            diagnostics |= diagnosis(bands, dims, channels)
         return Snapshot(
-            frequency=first.welch.frequencies,
+            frequency=frequency,
             csm=csm,
-            results=results,
-            refused=refused,
+            results=estimates.results,
+            refused=estimates.refused,
             channels=tuple(
-                ChannelLabel(sensor, channel.name, self._unit)
-                for sensor, channel in first.aligned.channels
+                ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
             ),
-            dims=first.aligned.dims,
+            dims=dims,
             unit=self._unit,
             n_segments=n_segments,
             n_dropped=self.n_seen - n_segments,
             n_effective=n_effective,
             elapsed=sum(each.elapsed for each in self._passes),
-            time_left=self._time_left(results, n_effective),
+            time_left=time_left(
+                self.settings,
+                frequency,
+                estimates.results,
+                nyquist=first.welch.sampling_rate / 2,
+                taken=n_segments * first.welch.hop / first.welch.sampling_rate,
+            ),
             start_utc_ns=first.aligned.start_utc_ns,
             sensors=tuple(_sensor_state(record) for record in self._recordings[-1].sensors),
-            clocks=self._passes[-1].aligned.clocks,
-            drift=self._passes[-1].drift(),
+            clocks=last.aligned.clocks,
+            drift=last.drift(),
             closed=all(recording.closed for recording in self._recordings),
-            diagnostics=self._diagnostics(csm, results),
+            left_out=self._left_out(),
+            octaves=tuple(_octave(band) for band in bands) if self.settings.octaves else (),
+            diagnostics=diagnostics,
         )
 
-    def _diagnostics(self, csm: ComplexArray, results: dict[str, SelfNoise]) -> dict[str, Any]:
-        """Say what is left between the clocks, and what it does to the noise estimate.
-
-        A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the
-        common motion, and so into its noise.
-        """
-        aligned = self._passes[-1].aligned
-        residual = np.array([state.residual for state in aligned.clocks])
-        diagnostics: dict[str, Any] = {
-            "transients": sum(each.transients for each in self._passes),
-            "synchronisation": {
-                "residual": dict(zip((s.sensor for s in aligned.clocks), residual, strict=True))
-            },
-        }
-        if results and len(residual) == len(aligned.dims):
-            noise = next(iter(results.values())).noise_psd
-            coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
-            delay = np.repeat(residual, aligned.dims)
-            turn = 2 * np.pi * self._passes[0].welch.frequencies[:, None] * delay
-            with np.errstate(invalid="ignore", divide="ignore"):
-                diagnostics["synchronisation"]["noise_bias"] = turn**2 * coherent / np.abs(noise)
-        return diagnostics
-
-    def _n_effective(self) -> float:
-        window = get_window(self.settings.window, self._passes[0].welch.segment_length)
-        return sum(
-            effective_averages(window, each.welch.hop, count)
-            for each in self._passes
-            if (count := each.spectra.n_segments)
+    def _estimates(self, bands: tuple[Band, ...], *, final: bool) -> Estimates:
+        """Estimate; while following, the dimension is chosen anew when segments have grown."""
+        if not bands:
+            return Estimates({}, {}, None)
+        dims = self._passes[0].aligned.dims
+        keep = not final and self.n_segments < _REVIEW * self._chosen_at
+        estimates = noise_estimates(
+            bands,
+            self.settings,
+            dims=dims,
+            gains=self._gains,
+            dimensions=self._dimensions if keep and self._fits(bands) else None,
         )
+        if estimates.dimensions is not self._dimensions:
+            self._dimensions, self._chosen_at = estimates.dimensions, self.n_segments
+        return estimates
 
-    def _methods(
-        self, csm: ComplexArray, n_effective: float
-    ) -> tuple[dict[str, SelfNoise], dict[str, str]]:
-        wanted = tuple(METHODS) if "all" in self.settings.methods else self.settings.methods
-        results: dict[str, SelfNoise] = {}
-        refused: dict[str, str] = {}
-        for method in wanted:
-            try:
-                with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
-                    results[method] = self_noise(
-                        method,
-                        csm,
-                        dims=self._passes[0].aligned.dims,
-                        n_effective=n_effective,
-                        correct=self.settings.correct,
-                        **self.settings.options,
-                    )
-            except InsufficientDataError as error:
-                refused[method] = str(error)
-        return results, refused
+    def _fits(self, bands: tuple[Band, ...]) -> bool:
+        """Whether the dimensions chosen before are for the same frequencies."""
+        before = () if self._dimensions is None else self._dimensions.n_factors
+        return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
 
-    def _time_left(self, results: dict[str, SelfNoise], n_effective: float) -> float | None:
-        target = self.settings.target_cov
-        if target is None or not results:
-            return None
-        welch = self._passes[0].welch
-        band = self.settings.band or (0.0, 0.45 * welch.sampling_rate)
-        inside = (welch.frequencies >= band[0]) & (welch.frequencies <= band[1])
-        inside[0] = False
-        cov = next(iter(results.values())).cov[inside]
-        if not np.isfinite(cov).any():
-            return None
-        reached = float(np.nanmax(np.nanmedian(cov, axis=0)))
-        # c.o.v. ~ 1 / √n, and averages come at a steady pace.
-        missing = n_effective * max(0.0, (reached / target) ** 2 - 1)
-        pace = self.n_segments * welch.hop / welch.sampling_rate / n_effective
-        return missing * pace
-
-    def _responses(self) -> ComplexArray | None:
-        """Return what spectra are divided by: the response, and the way to the unit."""
-        aligned, welch = self._passes[0].aligned, self._passes[0].welch
-        frequency = welch.frequencies
-        response = np.ones((len(frequency), len(aligned.channels)), dtype=np.complex128)
-        for column, (_, channel) in enumerate(aligned.channels):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                response[:, column] = 1 / conversion(channel.unit, self._unit, frequency)
-            if channel.response is not None:
-                response[:, column] *= channel.response.at(frequency)
-        return None if np.all(response == 1) else response
+    def _left_out(self) -> dict[str, int]:
+        counts: Counter[Reason] = Counter()
+        for each in self._passes:
+            counts.update(each.left_out)
+        counts[Reason.TRANSIENT] = self.n_seen - self.n_segments - counts.total()
+        return {reason.value: counts[reason] for reason in Reason}
 
     def _why_nothing(self, snapshot: Snapshot) -> str:
         names = ", ".join(str(recording.path) for recording in self._recordings)
@@ -302,8 +271,8 @@ class Estimation:
             available = sum(each.aligned.n_available for each in self._passes)
             return (
                 f"{names}: not one whole segment: {available / welch.sampling_rate:.3g} s with all"
-                f" sensors, {snapshot.n_dropped} segments left out for gaps, and a segment takes"
-                f" {self.settings.segment:g} s; record longer or choose a shorter segment"
+                f" sensors, {snapshot.n_dropped} segments left out (gaps, clipping), and a segment"
+                f" takes {self.settings.segment:g} s; record longer or choose a shorter segment"
             )
         return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
 
@@ -359,6 +328,16 @@ def _labels(each: Pass) -> list[tuple[str, str, str]]:
 def _described(each: Pass) -> str:
     names = ", ".join(f"{sensor} {channel} in {unit}" for sensor, channel, unit in _labels(each))
     return f"{names} at {each.welch.sampling_rate:g} Hz"
+
+
+def _octave(band: Band) -> Octave:
+    return Octave(
+        low=float(band.frequencies[0]),
+        high=float(band.frequencies[-1]),
+        segment=band.settings.segment_length / band.settings.sampling_rate,
+        n_segments=band.n_segments,
+        n_effective=band.n_effective,
+    )
 
 
 def _sensor_state(record: SensorRecord) -> SensorState:

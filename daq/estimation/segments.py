@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from daq.alignment import AlignedRecording
+from daq.protocols.block import BlockFlag
 from daq.refinement import DelayMeter
+from estimator.multiresolution import MultiResolution
 from estimator.rejection import Reason, SelectedSpectra
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.windows import get_window
@@ -29,6 +32,8 @@ _Piece = TypeVar("_Piece")
 _Read = TypeVar("_Read")
 
 _VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
+OCTAVES = 12
+"""Stages of the multi-resolution mode: those without segments cost nothing."""
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 
 
@@ -43,6 +48,8 @@ class Pass:
             start_utc_ns=_utc_ns(settings.start),
             end_utc_ns=_utc_ns(settings.end),
         )
+        names = {sensor for sensor, _ in self.aligned.channels}
+        self._sensors = [record for record in recording.sensors if record.name in names]
         rate = self.aligned.sampling_rate
         self.welch = WelchSettings(
             sampling_rate=rate,
@@ -52,29 +59,40 @@ class Pass:
             detrend=settings.detrend,
         )
         self.n_channels = len(self.aligned.channels)
-        self.refine, self.reject = settings.refine, settings.reject
+        self._settings = settings
         self.restart()
 
     def restart(self) -> None:
         """Begin again, with the clocks as they are now."""
+        wanted = self._settings
+        self.octaves: MultiResolution | None = None
         self._undisturbed: SelectedSpectra | None = None
-        if self.reject:
+        if wanted.octaves:
+            self.octaves = MultiResolution(self.welch, self.n_channels, n_stages=OCTAVES)
+        elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
         self._all = CrossSpectra(self.welch, self.n_channels)
-        self.n_seen = 0
+        self._selected: CrossSpectra | None = None
+        self.n_seen = self._n_taken = 0
+        self._fed = 0  # grid samples that the octaves have had
+        self.left_out: Counter[Reason] = Counter()
         self.taken_at: list[FloatArray] = []
         self.aligned.forget()
         self._meter: DelayMeter | None = None
 
     @property
     def spectra(self) -> CrossSpectra:
-        """Spectra of the segments that count."""
-        return self._all if self._undisturbed is None else self._undisturbed.spectra()
+        """Spectra of the segments that count; none with octaves."""
+        if self._undisturbed is None:
+            return self._all
+        if self._selected is None:
+            self._selected = self._undisturbed.spectra()
+        return self._selected
 
     @property
-    def transients(self) -> int:
-        """Segments left out because something disturbed them."""
-        return 0 if self._undisturbed is None else self._undisturbed.counts[Reason.TRANSIENT]
+    def n_segments(self) -> int:
+        """Segments that count."""
+        return self._n_taken if self._undisturbed is None else self.spectra.n_segments
 
     @property
     def n_complete(self) -> int:
@@ -105,17 +123,58 @@ class Pass:
 
         for (first, count), (samples, valid) in zip(pieces, _ahead(read, pieces), strict=True):
             starts = np.arange(count) * hop
-            missing = np.concatenate([[0], np.cumsum(~valid)])
-            starts = starts[missing[starts + length] == missing[starts]]
-            if self._undisturbed is None:
+            usable = valid & self._finite(samples)
+            clipped = self._clipped(first * hop, len(samples))
+            starts = np.arange(count) * hop
+            whole = _whole(usable, starts, length)
+            clean = whole if clipped is None else _whole(usable & ~clipped, starts, length)
+            self.left_out[Reason.GAP] += count - int(whole.sum())
+            self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
+            starts = starts[clean]
+            if self.octaves is not None:
+                complete = usable if clipped is None else usable & ~clipped
+                new = self._fed - first * hop
+                self.octaves.add(samples[new:], complete[new:])
+                self._fed = first * hop + len(samples)
+            elif self._undisturbed is None:
                 self._all.add(samples, starts)
             else:
                 self._undisturbed.add(samples, starts)
+                self._selected = None
+            self._n_taken += len(starts)
             self.taken_at.append(self._positions(np.arange(first, first + count)))
             self._measure(samples, starts, first * hop)
             self.n_seen += count
             if progress is not None:
                 progress(count)
+
+    def _finite(self, samples: FloatArray) -> NDArray[np.bool_]:
+        """Return which samples are finite numbers, in every channel."""
+        with np.errstate(invalid="ignore"):
+            if np.isfinite(samples.sum()):
+                return np.ones(len(samples), dtype=np.bool_)
+        return np.asarray(np.isfinite(samples).all(axis=1))
+
+    def _clipped(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
+        """Return which grid samples lie in blocks that are clipped; None if none do."""
+        if self._settings.reject is False:
+            return None
+        found = None
+        for number, record in enumerate(self._sensors):
+            blocks = record.blocks
+            blocks = blocks[(blocks["flags"] & int(BlockFlag.CLIPPED)) != 0]
+            if len(blocks) == 0:
+                continue
+            found = np.zeros(n_samples, dtype=np.bool_) if found is None else found
+            at = np.arange(start, start + n_samples, dtype=np.float64)
+            origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
+            seconds = origin * 1e-9 + at / self.welch.sampling_rate
+            position = (seconds - self.aligned.delays(at)[:, number]) * record.sampling_rate
+            first = blocks["first_sample"].astype(np.float64)
+            before = np.searchsorted(first, position, side="right") - 1
+            last = (first + blocks["n_samples"])[before]
+            found |= (before >= 0) & (position < last)
+        return found
 
     def set_clocks(self) -> None:
         """Set the clocks by what the segments taken say."""
@@ -150,7 +209,7 @@ class Pass:
 
     def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
         """Measure what delays are left, for the clocks' next setting."""
-        measurable = self.aligned.measurable if self.refine else ()
+        measurable = self.aligned.measurable if self._settings.refine else ()
         if not measurable:
             return
         if self._meter is None:
@@ -170,6 +229,12 @@ class Pass:
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
         middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
         return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+
+
+def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) -> NDArray[np.bool_]:
+    """Return which segments have usable samples only."""
+    missing = np.concatenate([[0], np.cumsum(~usable)])
+    return np.asarray(missing[starts + length] == missing[starts])
 
 
 def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from datetime import datetime
 
     from daq.bench_model import Bench
@@ -37,10 +38,20 @@ class Settings:
         Of the common grid in Hz; the lowest of the sensors' where not given.
     refine : bool
         Whether clocks are refined by the motion the sensors share.
-    reject : bool
-        Whether segments with a transient in any channel are left out (`estimator.rejection`).
-    options : dict
-        Further options of the methods.
+    reject : bool or None
+        Which segments are left out, besides those with gaps: True for those that are clipped or
+        have a transient in any channel (`estimator.rejection`), None for those that are clipped,
+        False for none.
+    octaves : bool
+        Whether each octave has segments of its own length (`estimator.multiresolution`):
+        `segment` in the highest one, twice as long in each one below. Without `reject`.
+    dimension : int, "auto" or None
+        Factors of the common motion that maximum likelihood allows: that many, as many as the
+        model test of each band demands (`estimator.dimension`), or as many as the largest sensor
+        has channels.
+    gains : mapping of str to float
+        What a sensor ("A") or a channel ("A.X") makes of the motion, relative to the others: known
+        beforehand, for the two-channel method. 1 where not given.
     """
 
     segment: float = 10.0
@@ -56,8 +67,10 @@ class Settings:
     target_cov: float | None = None
     sampling_rate: float | None = None
     refine: bool = True
-    reject: bool = False
-    options: dict[str, Any] = field(default_factory=dict)
+    reject: bool | None = None
+    octaves: bool = False
+    dimension: int | Literal["auto"] | None = None
+    gains: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, bench: Bench | None) -> Settings:

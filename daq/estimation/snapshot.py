@@ -39,6 +39,18 @@ class SensorState:
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
 
+@dataclass(frozen=True, slots=True)
+class Octave:
+    """What frequencies up to `high` (Hz) rest on, where each octave has its own segments."""
+
+    low: float
+    high: float
+    segment: float
+    """Seconds."""
+    n_segments: int
+    n_effective: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
     """The estimate at one moment, with everything a front end shows.
@@ -58,9 +70,9 @@ class Snapshot:
     dims : tuple of int
         Number of channels of each sensor.
     n_segments, n_dropped : int
-        Segments taken, and left out for gaps.
+        Segments taken, and left out; with octaves those of the highest.
     n_effective : float
-        Independent averages the segments are worth.
+        Independent averages the segments are worth; with octaves those of the highest.
     elapsed : float
         Seconds from the start to the end of what was looked at.
     time_left : float or None
@@ -73,10 +85,15 @@ class Snapshot:
         sensor's own count of time then lags, in seconds: what the clocks do. Of the last recording.
     closed : bool
         Whether nothing more will come.
+    left_out : dict
+        How many segments were left out, by reason: "gap", "clipped", "transient".
+    octaves : tuple of Octave
+        Rising; empty where all frequencies rest on the same segments.
     diagnostics : dict
-        ``transients``: number of segments left out as disturbed. ``synchronisation``: ``residual``
-        between the clocks in seconds by sensor, and the fraction ``noise_bias``, shape
-        (n_freqs, n_channels), that it is expected to add to the noise PSD.
+        ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
+        ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
+        ``dimension``: tuple of `estimator.dimension.BandDimension`, where it was chosen.
+        Of a finished estimate also what `daq.estimation.diagnosis.diagnosis` returns.
     """
 
     frequency: FloatArray
@@ -96,6 +113,8 @@ class Snapshot:
     clocks: tuple[ClockState, ...]
     drift: FloatArray
     closed: bool
+    left_out: dict[str, int] = field(default_factory=dict)
+    octaves: tuple[Octave, ...] = ()
     diagnostics: dict[str, Any] = field(default_factory=dict)
 
     @property

@@ -1,0 +1,128 @@
+"""What the averages show of the test itself, put together for front ends."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.estimation.results import neighbours
+from estimator.diagnostics import Diagnostics, diagnose
+from estimator.errors import InsufficientDataError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench_model import Channel
+    from daq.clock_model import ClockState
+    from estimator.multiresolution import Band
+    from estimator.self_noise import SelfNoise
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+_UP = {"z", "up", "down", "vertical", "+z", "-z"}
+
+
+def synchronisation(
+    clocks: Sequence[ClockState],
+    dims: tuple[int, ...],
+    frequency: FloatArray,
+    csm: ComplexArray,
+    results: dict[str, SelfNoise],
+) -> dict[str, Any]:
+    """Say what is left between the clocks, and what it does to the noise estimate.
+
+    A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the
+    common motion, and so into its noise.
+    """
+    residual = np.array([state.residual for state in clocks])
+    found: dict[str, Any] = {
+        "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
+    }
+    if results and len(residual) == len(dims):
+        noise = next(iter(results.values())).noise_psd
+        coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
+        turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found["noise_bias"] = turn**2 * coherent / np.abs(noise)
+    return found
+
+
+def vertical_channel(channels: Sequence[Channel]) -> int | None:
+    """Return which of three channels is vertical by its direction or its name.
+
+    Names such as BHZ, or BH0 with BH1 and BH2; None where neither tells.
+    """
+    if len(channels) != 3:
+        return None
+    for number, channel in enumerate(channels):
+        if channel.direction is not None and channel.direction.strip().lower() in _UP:
+            return number
+    last = "".join(channel.name[-1:] for channel in channels).upper()
+    if last.count("Z") == 1:
+        return last.index("Z")
+    return last.index("0") if sorted(last) == ["0", "1", "2"] else None
+
+
+def diagnosis(
+    bands: Sequence[Band], dims: tuple[int, ...], channels: Sequence[tuple[str, Channel]]
+) -> dict[str, Any]:
+    """Diagnose the test.
+
+    Returns
+    -------
+    dict
+        ``bands``, ``responses`` and ``advice`` as `estimator.diagnostics.Diagnostics` has them;
+        ``pairs`` (names of sensors) and ``per_frequency``, a dict of its arrays. Where each octave
+        has its own segments, sensors are compared by the octave in which they are most coherent.
+        Empty where there is too little to diagnose.
+    """
+    sensors = list(dict.fromkeys(sensor for sensor, _ in channels))
+    verticals = {
+        vertical_channel([channel for name, channel in channels if name == sensor])
+        for sensor in sensors
+    }
+    vertical = verticals.pop() if len(verticals) == 1 else None
+    found: list[Diagnostics] = []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for band in bands:
+            try:
+                diagnostics = diagnose(
+                    band.csm,
+                    band.frequencies,
+                    dims=dims,
+                    n_effective=band.n_effective,
+                    neighbours=neighbours(band),
+                    names=tuple(sensors),
+                    vertical=vertical,
+                )
+            except InsufficientDataError:  # two sensors, or too few averages
+                return {}
+            found.append(diagnostics)
+    if not found:
+        return {}
+    clearest = max(found, key=lambda each: sum(r.coherence for r in each.responses))
+    return {
+        "bands": tuple(band for each in found for band in each.bands),
+        "responses": clearest.responses,
+        "advice": tuple(
+            advice
+            for each in found
+            for advice in each.advice
+            if each is clearest or not advice.sensors
+        ),
+        "pairs": tuple((sensors[j], sensors[k]) for j, k in found[0].pairs),
+        "per_frequency": {
+            **{
+                name: np.concatenate([getattr(each, name) for each in found])
+                for name in ("coherence", "condition", "dimension", "snr")
+            },
+            **{
+                name: np.concatenate([getattr(each.model, name) for each in found])
+                for name in ("statistic", "degrees", "p_value")
+            },
+        },
+    }
