@@ -35,6 +35,15 @@ def duration(value: str | float) -> float:
         raise typer.BadParameter(f"{value!r}: {error}") from None
 
 
+def factors(value: str) -> int | str:
+    """Read how many factors the common motion has: a number, or ``auto``."""
+    if value == "auto":
+        return value
+    if value.isdecimal() and int(value) > 0:
+        return int(value)
+    raise typer.BadParameter(f"--dimension {value!r}: expected a number such as 3, or auto")
+
+
 def frequencies(value: str | None) -> tuple[float, float] | None:
     """Read a band of frequencies such as ``1:20``, in Hz."""
     if value is None:
@@ -92,6 +101,20 @@ NoCorrectionOption: TypeAlias = Annotated[
 ]
 NoRefinementOption: TypeAlias = Annotated[
     bool, typer.Option("--no-refinement", help="Set clocks by arrival times alone.")
+]
+RejectOption: TypeAlias = Annotated[
+    bool | None,
+    typer.Option(
+        "--reject/--no-rejection",
+        help="Leave out segments with transients too, or none but those with gaps.",
+    ),
+]
+OctavesOption: TypeAlias = Annotated[
+    bool, typer.Option("--octaves", help="Segments twice as long in each octave below the highest.")
+]
+DimensionOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--dimension", metavar="N|auto", help="Factors that maximum likelihood allows."),
 ]
 UnitOption: TypeAlias = Annotated[
     str | None,

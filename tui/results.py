@@ -94,7 +94,10 @@ def remarks(snapshot: Snapshot) -> list[str]:
     taken = f"{snapshot.n_segments} segments ({snapshot.n_effective:.0f} effective averages)"
     lines = [f"{taken} from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"]
     if snapshot.n_dropped:
-        lines.append(f"{snapshot.n_dropped} segments left out: a sensor has a gap there")
+        reasons = ", ".join(f"{count} {reason}" for reason, count in snapshot.left_out.items())
+        lines.append(
+            f"{snapshot.n_dropped} segments left out" + (f": {reasons}" if reasons else "")
+        )
     lines += [
         f"{sensor.name}: {sensor.n_gaps} gaps, {sensor.n_missing} samples missing"
         for sensor in snapshot.sensors
