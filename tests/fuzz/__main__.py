@@ -18,7 +18,7 @@ def main(name: str, seconds: str, folder: str) -> None:
     corpus.mkdir(parents=True, exist_ok=True)
     for k, seed in enumerate(seeds):
         (corpus / f"seed-{k}").write_bytes(seed)
-    options = [f"-max_total_time={seconds}", "-max_len=4096", "-timeout=10", "-rss_limit_mb=600"]
+    options = [f"-max_total_time={seconds}", "-max_len=4096", "-timeout=10", "-rss_limit_mb=8000"]
     options += ["-print_final_stats=1", f"-artifact_prefix={folder}/{name}-"]
     atheris.Setup([sys.argv[0], str(corpus), *options], target)
     atheris.Fuzz()
