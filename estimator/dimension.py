@@ -221,7 +221,7 @@ def choose_dimension(
 
 def _most_testable(n_channels: int) -> int:
     """Most factors that leave the test a degree of freedom."""
-    most = max_factors(n_channels)
+    most = int(max_factors(n_channels))
     return most if (n_channels - most) ** 2 > n_channels else most - 1
 
 

@@ -104,9 +104,19 @@ class _Point:
         self.eigenvectors[index] = other.eigenvectors
 
 
-def max_factors(n_channels: int) -> int:
+def max_factors(n_channels: int | IntArray) -> IntArray:
     """Largest number of factors the model can identify, ``(p - q)**2 >= p``."""
-    return int(np.floor(n_channels - np.sqrt(n_channels) + 1e-12))
+    return np.floor(n_channels - np.sqrt(n_channels) + 1e-12).astype(np.int64)
+
+
+def check_factors(n_factors: int, n_channels: int) -> None:
+    """Raise unless so many factors can be told from the noise of so many channels."""
+    most = max_factors(n_channels)
+    if not 0 <= n_factors <= most:
+        raise InsufficientDataError(
+            f"{n_factors} factors of motion cannot be told from the noise of {n_channels} "
+            f"channels: at most {most} can"
+        )
 
 
 def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
@@ -162,11 +172,7 @@ def maximise(
             f"cross-spectral matrix of shape {csm.shape}: expected (n_freqs, p, p)"
         )
     p = csm.shape[-1]
-    if not 0 <= n_factors <= max_factors(p):
-        raise InsufficientDataError(
-            f"{n_factors} factors of motion cannot be told from the noise of {p} channels: "
-            f"at most {max_factors(p)} can"
-        )
+    check_factors(n_factors, p)
     usable, precision, rounding = _precision(csm)
     n_freqs = len(csm)
     found = Maximum(

@@ -9,7 +9,7 @@ import numpy as np
 from estimator import fisher
 from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError
-from estimator.factor_analysis import Maximum, max_factors, maximise
+from estimator.factor_analysis import Maximum, check_factors, max_factors, maximise
 from estimator.prior import NOISE_SPREAD, expected_noise, maximise_expecting
 from estimator.self_noise import Flag, SelfNoise
 
@@ -85,13 +85,9 @@ def maximum_likelihood(
     factors = np.broadcast_to(
         np.asarray(max(dims) if n_factors is None else n_factors, np.int64), (n_freqs,)
     )
-    if factors.max() > max_factors(p):
-        raise InsufficientDataError(
-            f"{factors.max()} factors of motion cannot be told from the noise of {p} channels: "
-            f"at most {max_factors(p)} can"
-        )
+    check_factors(int(factors.max()), p)
     matrix, absent = _without_dead_and_copies(given)
-    few = (p - absent.sum(axis=1) - factors) ** 2 < p - absent.sum(axis=1)
+    few = factors > max_factors(p - absent.sum(axis=1))
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
@@ -116,10 +112,11 @@ def maximum_likelihood(
         noise_psd[here] = psi * gain
         low[here], high[here] = fisher.interval(noise_psd[here], error * gain)
         flags[here] |= np.where(maximum.boundary, Flag.BOUNDARY, 0)
-        flags[here] |= np.where(maximum.singular, Flag.SINGULAR, 0)[:, None]
+        undetermined = ~np.isfinite(error) & ~maximum.boundary & (given.flags[here] == 0)
+        flags[here] |= np.where(undetermined, Flag.SINGULAR, 0)
         lost = ~maximum.converged & ~maximum.singular
         flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
-    unknown = (given.flags & (Flag.NOT_FINITE | Flag.DEAD_CHANNEL | Flag.DUPLICATE)) != 0
+    unknown = (given.flags | (flags & Flag.SINGULAR)) != 0
     for result in (noise_psd, cov, low, high):
         result[unknown] = np.nan
     return SelfNoise(

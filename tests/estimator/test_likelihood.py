@@ -282,6 +282,28 @@ def test_dead_and_copied_channels_cost_the_others_nothing() -> None:
     assert found.flags[0].tolist() == [Flag.NO_COUNTERPART] * 2 + [Flag.DEAD_CHANNEL]
 
 
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_a_channel_left_alone_has_no_noise_to_tell(d: int) -> None:
+    rng = np.random.default_rng(25)
+    csm = wishart(equal_noise(21, dims=(d,) * 3, snr=1e2), 200, rng, n_draws=2)
+    csm[:1, 1:] = csm[:1, :, 1:] = 0
+    found = maximum_likelihood(csm, dims=(d,) * 3, n_effective=200)
+    assert found.flags[0, 0] == Flag.NO_COUNTERPART
+    assert np.isnan(found.noise_psd[0]).all()
+    assert not found.flags[1].any()
+
+
+def test_noise_that_the_matrix_leaves_open_is_flagged() -> None:
+    """Without any motion the factors may lie anywhere."""
+    rng = np.random.default_rng(26)
+    csm = wishart(equal_noise(21, dims=(2, 2, 2), snr=1e2), 200, rng, n_draws=2)
+    csm[0] = np.eye(6)
+    found = maximum_likelihood(csm, dims=(2, 2, 2), n_effective=200)
+    assert np.all(found.flags[0] == Flag.SINGULAR)
+    assert np.isnan([found.noise_psd[0], found.cov[0], found.low[0], found.high[0]]).all()
+    assert not found.flags[1].any()
+
+
 def test_refuses_what_cannot_be_known() -> None:
     csm = np.eye(9)[None].astype(np.complex128)
     with pytest.raises(InsufficientDataError, match="at most 6"):
