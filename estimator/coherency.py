@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 HERMITIAN_TOLERANCE = 1e-8  # of the geometric mean of both channels' PSDs
 DEAD = 1e-28  # of a channel's largest PSD: what rounding leaves of a constant
 DUPLICATE = 1e-13  # one less the coherence of a channel and its copy
-SINGULAR = 1e12  # condition number from which an inverse is rounding only
+SINGULAR = 1e12  # elements of an inverse coherency from which on they are rounding only
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,8 @@ class Coherency:
     Attributes
     ----------
     matrix : complex128, shape (n_freqs, n_channels, n_channels)
-        Ones on its diagonal; a unit matrix where the cross-spectral matrix is not finite.
+        Ones on its diagonal; zero for a dead channel, a unit matrix where the cross-spectral
+        matrix is not finite.
     psd : float64, shape (n_freqs, n_channels)
         PSD of every channel in unit**2/Hz; 1 where it is zero or not finite.
     flags : int64, shape (n_freqs, n_channels)
@@ -108,12 +109,13 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     if len(negative):
         f, p = negative[0]
         raise InvalidMatrixError(f"PSD of channel {p} at frequency {f} is {psd[f, p]:g}: negative")
-    dead = psd <= DEAD * psd.max(axis=0)
-    psd = np.where(dead, 1.0, psd)
-    amplitude = np.sqrt(psd)
+    dead = psd <= np.maximum(DEAD * psd.max(axis=0), np.finfo(np.float64).tiny)
+    dead &= finite[:, None]
+    psd = np.where(dead | ~finite[:, None], 1.0, psd)
+    scale = np.where(dead, 0.0, 1 / np.sqrt(psd))
     matrix = np.where(finite[:, None, None], csm, np.eye(n_channels))
-    matrix /= amplitude[:, :, None]
-    matrix /= amplitude[:, None, :]
+    matrix *= scale[:, :, None]
+    matrix *= scale[:, None, :]
     deviation = np.abs(matrix - matrix.conj().swapaxes(1, 2)).max(axis=(1, 2))
     if (deviation > HERMITIAN_TOLERANCE).any():
         raise InvalidMatrixError(
@@ -146,7 +148,7 @@ def from_parts(
     """
     unknown = flags != 0
     noise, deviation, low, high = (np.where(unknown, np.nan, given.psd * part) for part in parts)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # noise of zero, even known exactly
         cov = deviation / np.abs(noise)
     negative = np.where(noise <= 0, int(Flag.NEGATIVE), 0)
     return SelfNoise(method, noise, cov, low, high, flags | negative)
@@ -158,6 +160,7 @@ def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
     Parameters
     ----------
     matrices : complex128, shape (n, d, d)
+        Coherencies, so that their rounding is that of one.
 
     Returns
     -------
@@ -174,6 +177,5 @@ def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
         identity = np.eye(matrices.shape[1], dtype=np.complex128)
         invertible = np.where(regular[:, None, None], matrices, identity)
         inverses = np.asarray(np.linalg.inv(invertible), dtype=np.complex128)
-    condition = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
-    regular &= condition < SINGULAR
+    regular &= np.abs(inverses).max(axis=(1, 2)) < SINGULAR
     return np.where(regular[:, None, None], inverses, 0j), regular

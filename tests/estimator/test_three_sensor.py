@@ -250,9 +250,12 @@ def spoilt(fault: str) -> ComplexArray:
         sample[3, 4, :] = sample[3, :, 4] = 0
     elif fault == "zero":
         sample[3] = 0
-    elif fault == "singular":
-        sample[3, 3:6, 6:9] = 0
-        sample[3, 6:9, 3:6] = 0
+    elif fault == "faint":  # as good as dead: what becomes of it must not overflow
+        sample[3] *= 1e-300
+    elif fault.startswith("singular"):
+        block = {"singular": 0.0, "singular but for rounding": 1e-17, "singular, tiny": 1e-200}
+        sample[3, 3:6, 6:9] = block[fault] * np.eye(3)
+        sample[3, 6:9, 3:6] = block[fault] * np.eye(3)
     else:
         copy, original = {"copied": (7, 2), "copied within": (5, 4)}[fault]
         transfer = np.eye(9)
@@ -272,7 +275,10 @@ def spoilt(fault: str) -> ComplexArray:
         ("zero", Flag.DEAD_CHANNEL),
         ("copied", Flag.DUPLICATE),
         ("copied within", Flag.DUPLICATE),
+        ("faint", Flag.DEAD_CHANNEL),
         ("singular", Flag.SINGULAR),
+        ("singular but for rounding", Flag.SINGULAR),
+        ("singular, tiny", Flag.SINGULAR),
     ],
 )
 def test_one_bad_frequency_is_flagged_and_the_others_stand(
@@ -297,6 +303,14 @@ def test_a_dead_sensor_among_five_spoils_only_its_own_triads() -> None:
     dead = np.arange(15) // 3 == 1
     np.testing.assert_array_equal(found.flags[0] == Flag.DEAD_CHANNEL, dead)
     np.testing.assert_allclose(found.noise_psd[0, ~dead], noise_psd[~dead], rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sensors_without_noise_give_no_warning(method: str) -> None:
+    directions = np.array([[1, 0], [0, 1], [1, 1], [1, -1], [2, 1], [1, -2]])
+    csm = (directions @ directions.T)[None].astype(np.complex128)
+    found = self_noise(method, csm, dims=(2, 2, 2), n_effective=60)
+    assert np.all((found.flags[0] != 0) | (found.noise_psd[0] > 0.1))
 
 
 @pytest.mark.parametrize("method", METHODS)
