@@ -22,6 +22,8 @@ from estimator.errors import EstimatorError
 if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray
 
+SINGULAR = 1e-12  # of the largest singular value: what rounding leaves of zero
+
 
 def motion_csm(
     response: ComplexArray | FloatArray, motion: ComplexArray | FloatArray
@@ -148,7 +150,7 @@ def three_sensor_bias(
     Notes
     -----
     Evaluated as Eq. (29) over the noise; in terms of ``c``, ``H_i S_ZiZk S_ZjZk^-1 S_ZjZi H_i^*``
-    is ``c_ik inv(c_jk) c_ji``.
+    is ``c_ik inv(c_jk) c_ji``; the generalised inverse where the motion lacks a dimension.
     """
     d = _equal_dims(dims)
     n = len(dims)
@@ -157,9 +159,8 @@ def three_sensor_bias(
     for i in range(n):
         pairs = list(itertools.combinations([j for j in range(n) if j != i], 2))
         for j, k in pairs:
-            explained = blocks[..., i, k, :, :] @ np.linalg.solve(
-                blocks[..., j, k, :, :], blocks[..., j, i, :, :]
-            )
+            inverse = np.linalg.pinv(blocks[..., j, k, :, :], rcond=SINGULAR)
+            explained = blocks[..., i, k, :, :] @ inverse @ blocks[..., j, i, :, :]
             left = blocks[..., i, i, :, :] - explained
             bias[..., i, :] += np.einsum("...rr->...r", left).real / len(pairs)
     return np.asarray(bias.reshape(*motion.shape[:-2], n * d) / noise_psd)

@@ -102,6 +102,12 @@ def test_the_estimators_do_what_the_theory_says(
     )
 
 
+def test_motion_that_lacks_a_dimension_biases_nobody_who_feels_it_alike() -> None:
+    H = np.stack([rotation(np.random.default_rng(2), 2) for _ in range(3)])
+    c = motion_csm(H, np.diag([1e4, 0.0]))
+    np.testing.assert_allclose(three_sensor_bias(c, np.ones(6), dims=(2, 2, 2)), 0, atol=1e-8)
+
+
 def test_what_the_theory_does_not_cover_is_refused() -> None:
     c = motion_csm(unit([0, 5, 10]), PLANE)
     with pytest.raises(EstimatorError, match="equal sensors"):
