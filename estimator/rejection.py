@@ -152,6 +152,7 @@ class SelectedSpectra:
         Parameters
         ----------
         samples : float64, shape (n_samples, n_channels)
+            NaN counts as a gap.
         starts : int64, shape (n_segments,)
             In the order of time.
         complete : bool, shape (n_samples,), optional
@@ -169,7 +170,8 @@ class SelectedSpectra:
             rows = starts[first : first + SEGMENTS_PER_BLOCK]
             for row, power in zip(rows, self._powers(samples, rows), strict=True):
                 stretch = slice(row, row + self.settings.segment_length)
-                whole = complete is None or bool(complete[stretch].all())
+                whole = bool(np.isfinite(power).all())
+                whole &= complete is None or bool(complete[stretch].all())
                 if self._passes(samples[stretch], power, whole=whole):
                     passed.append(row)
         self._accepted.add(samples, np.array(passed, dtype=np.int64))

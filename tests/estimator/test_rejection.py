@@ -87,6 +87,15 @@ def test_gaps_and_clipping_are_told_apart() -> None:
     np.testing.assert_allclose(spectra.spectra().csm(), expected(samples, kept), rtol=1e-9)
 
 
+@pytest.mark.parametrize("row", [550, 5050])
+def test_nan_is_a_gap_whatever_is_said_of_it(row: int) -> None:
+    samples, starts = quiet(60)
+    samples[row, 2] = np.nan
+    spectra = selected(samples, starts)
+    assert spectra.counts == {Reason.GAP: 2}
+    assert np.isfinite(spectra.spectra().csm()).all()
+
+
 def test_a_decision_knows_nothing_of_what_comes_later_nor_of_how_samples_arrive() -> None:
     samples, starts = quiet(200)
     for row in np.random.default_rng(1).integers(0, len(samples) - 60, 12):
