@@ -71,7 +71,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     maximum : Maximum
         Of the likelihood, from `estimator.factor_analysis.maximise`.
     n_effective : float
-        Averages, at least as many as channels.
+        Averages, more than channels.
 
     Returns
     -------
