@@ -11,12 +11,12 @@ A third-party package adds a driver by an entry point in the group ``huddle.driv
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
-from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+    from collections.abc import AsyncIterator, Sequence
     import numpy as np
     from pydantic import BaseModel
 
