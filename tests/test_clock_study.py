@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from tui.clock_study import Latency, study
+from daq.estimation import estimate
+from tui.clock_study import Latency, free_running, residuals, study, synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,6 +25,22 @@ def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Late
     assert rows["refined"].cov == pytest.approx(rows["oracle"].cov, rel=0.05)
     if latency.kind == "batching":
         assert np.abs(rows["arrival times"].against_oracle).max() > 0.1
+
+
+def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> None:
+    scenario = free_running(snr=1e4, duration=400.0, seed=5)
+    path = synthesise(tmp_path / "r.h5", scenario, duration=400.0)
+    snapshot = estimate([path])
+    stated = snapshot.diagnostics["synchronisation"]
+    left = residuals(snapshot, scenario)
+    told = [stated["residual"][name] for name in scenario.names]
+    assert told[0] == 0.0  # the reference
+    assert np.all(left < 2 * np.array(told[1:]))
+    assert np.all(left > 0.2 * np.array(told[1:]))
+    at = int(np.searchsorted(snapshot.frequency, 80.0))
+    # Coherent power over noise is the SNR, for a channel that sees the weaker direction.
+    expected = (2 * np.pi * 80 * told[2]) ** 2 * 1e4
+    assert stated["noise_bias"][at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
 
 
 def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:

@@ -39,6 +39,9 @@ def synchronisation(
     common motion, and so into its noise.
     """
     residual = np.array([state.residual for state in clocks])
+    refined = np.array([state.refined for state in clocks], dtype=bool)
+    if refined.any():  # what counts is the delay against the reference, however late all are
+        residual = np.where(refined, residual, 0.0)
     found: dict[str, Any] = {
         "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
     }
