@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from contextlib import AbstractAsyncContextManager
     from collections.abc import AsyncIterator, Sequence
+    from contextlib import AbstractAsyncContextManager
+
     import numpy as np
     from pydantic import BaseModel
 
