@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 METHODS = ("three-channel", "three-sensor")
 ALL_AT_ONCE = 2.773
-"""Standard deviations within which nine independent errors lie together 95 times in 100."""
+"""Standard deviations within which nine errors lie together 95 times in 100 (Bonferroni)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +60,11 @@ def run_demo(
     """Serve the demo's bench, record it, estimate, and compare; or open the application on it."""
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     bench = parse(text, "demo")
+    if duration is not None:
+        bench = bench.model_copy(
+            update={"recording": bench.recording.model_copy(update={"duration": duration})}
+        )
     speed = bench.speed if speed is None else speed
-    duration = bench.recording.duration if duration is None else duration
     terminal = all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr))
     on_screen = terminal and not table and json is None
     with tempfile.TemporaryDirectory(prefix="huddle-demo-") as folder:
@@ -73,7 +76,7 @@ def run_demo(
                 out = _show(path, settings)
             else:
                 out = path.with_suffix(".h5")
-                _record(path, out, settings, duration or 60.0, speed)
+                _record(path, out, settings, bench.recording.duration or 60.0, speed)
         if out is None or not out.exists():
             return
         snapshot = estimate([out], settings)
