@@ -7,6 +7,7 @@ The specification is one JSON object::
      "scenario": {...},            see sim_devices.scenario
      "faults": [...],              what goes wrong, see sim_devices.faults
      "fault_log": "FILE",          where each fault is noted when it strikes, a JSON object a line
+     "sent_log": "FILE",           and each unit that goes onto a line somebody has open, in hex
      "devices": [
        {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
         "driver": "epson",         whose protocol it speaks: a key of FAMILIES
@@ -77,10 +78,13 @@ class Served:
         clock: WorldClock,
         faults: LineFaults,
         tell: Callable[[float, Fault], None],
+        tell_sent: Callable[[float, bytes], None] | None = None,
     ) -> None:
         self.line = line
         self._faults = faults
         self._tell = tell
+        self._tell_sent = tell_sent
+        self._is_open = False
         self._endpoint: Endpoint = line.endpoint
         self._clock = clock
         self._loop = asyncio.get_running_loop()
@@ -91,6 +95,7 @@ class Served:
 
     def connected(self) -> None:
         """Somebody opened the line."""
+        self._is_open = True
         self._send(self._endpoint.connected(self._clock.now()))
         self._schedule()
 
@@ -101,6 +106,7 @@ class Served:
 
     def disconnected(self) -> None:
         """Nobody has the line open any more."""
+        self._is_open = False
         self._endpoint.disconnected(self._clock.now())
         self._schedule()
 
@@ -112,8 +118,13 @@ class Served:
 
     def _send(self, units: Sequence[bytes]) -> None:
         if units:
-            units = self._faults.send(units, self._clock.now())
-            self.wire.send(units)
+            self._put(self._faults.send(units, self._clock.now()))
+
+    def _put(self, units: Sequence[bytes]) -> None:
+        self.wire.send(units)
+        if self._tell_sent is not None and self._is_open:
+            for unit in units:
+                self._tell_sent(self._clock.now(), unit)
 
     def _strike(self) -> None:
         """Let go wrong what is due to, and repair what was to be repaired."""
@@ -122,7 +133,7 @@ class Served:
             self._down = False
             self.wire.restore()
         faults, units = self._faults.act(now)
-        self.wire.send(units)
+        self._put(units)
         for fault in faults:
             if fault.kind == "disconnect" and not self._down:
                 self._down = True
@@ -175,14 +186,15 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
     with contextlib.suppress(PermissionError):  # /dev/null: nobody will close it
         loop.add_reader(sys.stdin.fileno(), _end_of_input, ended)
     name = ",".join(device.sensors)
-    log = spec.get("fault_log")
+    tell_fault, tell_sent = _Log(spec.get("fault_log"), device), _Log(spec.get("sent_log"), device)
 
     def tell(at: float, fault: Fault) -> None:
-        if log:
-            told = {"at": at, "sensors": device.sensors, **fault.model_dump(exclude={"sensors"})}
-            with Path(log).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(told) + "\n")
+        tell_fault.write(at=at, **fault.model_dump(exclude={"sensors", "at"}))
 
+    def sent(at: float, unit: bytes) -> None:
+        tell_sent.write(at=at, unit=unit.hex())
+
+    tell_sent.write(at=clock.now(), utc_ns=device.utc_ns)
     served = [
         Served(
             line,
@@ -193,6 +205,7 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
                 begin=clock.now(),
             ),
             tell,
+            sent if line.carries_samples and tell_sent.is_wanted else None,
         )
         for k, line in enumerate(lines)
     ]
@@ -207,6 +220,26 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
         loop.remove_reader(sys.stdin.fileno())
         for one in opened:
             await one.close()
+
+
+class _Log:
+    """Lines of JSON that the processes of a bench append to one file; nothing without a file."""
+
+    def __init__(self, path: str | None, device: DeviceSpec) -> None:
+        self._path = path
+        self._sensors = list(device.sensors)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether there is a file."""
+        return bool(self._path)
+
+    def write(self, **told: object) -> None:
+        """Append one line, whole."""
+        if self._path:
+            line = json.dumps({"sensors": self._sensors, **told}) + "\n"
+            with Path(self._path).open("ab", buffering=0) as file:
+                file.write(line.encode())
 
 
 def _end_of_input(ended: asyncio.Event) -> None:

@@ -57,8 +57,11 @@ def scenario_of(bench: Bench) -> Scenario:
     return scenario
 
 
-def specification(bench: Bench, *, speed: float) -> dict[str, Any]:
-    """Return what ``sim_devices.serve`` needs to serve every port of a bench."""
+def specification(bench: Bench, *, speed: float, log: Path | None = None) -> dict[str, Any]:
+    """Return what ``sim_devices.serve`` needs to serve every port of a bench.
+
+    Each fault that strikes and all that is sent is noted in ``log``.
+    """
     scenario = scenario_of(bench).to_dict()
     for sensor in bench.sensors:
         scenario["sensors"][sensor.name]["sampling_rate"] = sensor.sampling_rate
@@ -67,6 +70,8 @@ def specification(bench: Bench, *, speed: float) -> dict[str, Any]:
         "speed": speed,
         "scenario": scenario,
         "faults": bench.simulation.get("faults", []),
+        "fault_log": str(log) if log else None,
+        "sent_log": str(log) if log else None,
         "devices": [_device(sensors) for sensors in bench.ports().values()],
     }
 
@@ -105,9 +110,9 @@ def _kind(port: str) -> str:
 
 
 @contextmanager
-def simulated(bench: Bench, *, speed: float) -> Iterator[Bench]:
+def simulated(bench: Bench, *, speed: float, log: Path | None = None) -> Iterator[Bench]:
     """Serve a bench's devices while the context lasts; yields a bench that connects to them."""
-    with start(specification(bench, speed=speed)) as running:
+    with start(specification(bench, speed=speed, log=log)) as running:
         yield connected(bench, running, speed=speed)
 
 
@@ -145,14 +150,20 @@ def with_faults(bench: Bench, path: Path) -> Bench:
 
 
 def serve_devices(
-    path: Path, *, speed: float | None, faults: Path | None, out: Path | None, json: str | None
+    path: Path,
+    *,
+    speed: float | None,
+    faults: Path | None,
+    log: Path | None,
+    out: Path | None,
+    json: str | None,
 ) -> None:
     """Serve a bench's devices until interrupted, and tell how to reach them."""
     bench = load(path)
     if faults is not None:
         bench = with_faults(bench, faults)
     speed = bench.speed if speed is None else speed
-    with simulated(bench, speed=speed) as reachable:
+    with simulated(bench, speed=speed, log=log) as reachable:
         text = dump(reachable)
         if out is not None:
             out.write_text(text, encoding="utf-8")

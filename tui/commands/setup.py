@@ -62,6 +62,14 @@ def devices(
         Path | None,
         typer.Option("--faults", metavar="FILE", help="What goes wrong, as [[faults]] in TOML."),
     ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log",
+            metavar="FILE",
+            help="Note each fault that strikes, and all that is sent: a line of JSON each.",
+        ),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -75,7 +83,7 @@ def devices(
     """
     from tui.devices import serve_devices
 
-    serve_devices(bench, speed=speed, faults=faults, out=out, json=json)
+    serve_devices(bench, speed=speed, faults=faults, log=log, out=out, json=json)
 
 
 @examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
