@@ -71,6 +71,7 @@ def band_means(
     edges: NDArray[np.int64],
     correlation: FloatArray,
     *,
+    weights: FloatArray | None = None,
     quantile: float = NORMAL_95,
 ) -> BandMeans:
     """Average a noise spectrum over bands of bins.
@@ -83,6 +84,8 @@ def band_means(
         Band b holds bins ``edges[b]`` to ``edges[b + 1]``; increasing.
     correlation : float64, shape (N_LAGS,)
         From :func:`bin_correlation`.
+    weights : float64, shape (n_freqs,), optional
+        Of the bins in the average: their widths, where these differ.
     quantile : float
         Standard deviations to either end of the interval: 95 % unless given.
 
@@ -95,7 +98,9 @@ def band_means(
     starts = edges[:-1] - first
     psd, sigma = noise_psd[first:last], (np.abs(noise_psd) * cov)[first:last]
     known = np.isfinite(psd) & np.isfinite(sigma)
-    psd, sigma = np.where(known, psd, 0.0), np.where(known, sigma, 0.0)
+    share = np.ones(psd.size) if weights is None else weights[first:last]
+    share = np.where(known, share, 0.0)
+    psd, sigma = np.where(known, psd, 0.0) * share, np.where(known, sigma, 0.0) * share
     band = np.searchsorted(starts, np.arange(psd.size), side="right")
     variance = np.add.reduceat(sigma**2, starts)
     for lag in range(1, min(correlation.size, psd.size)):
@@ -104,9 +109,9 @@ def band_means(
         padded = np.concatenate((pairs, np.zeros(lag)))
         variance += 2 * correlation[lag] * np.add.reduceat(padded, starts)
     with np.errstate(invalid="ignore", divide="ignore"):
-        count = np.add.reduceat(known.astype(np.float64), starts)
-        mean = np.add.reduceat(psd, starts) / count
-        spread = np.sqrt(variance) / count
+        whole = np.add.reduceat(share, starts)
+        mean = np.add.reduceat(psd, starts) / whole
+        spread = np.sqrt(variance) / whole
         certain = mean > CERTAIN * spread
         factor = np.exp(np.where(certain, quantile * spread / mean, 0.0))
         low = np.where(certain, mean / factor, mean - quantile * spread)

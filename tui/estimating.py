@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from daq.bench import parse_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
+from tui.diagnosis import details, summary
 from tui.limits import exceeded
 from tui.output import for_people, notices, write_json, write_text
 from tui.results import curves_csv, document, remarks, result_table, result_title
@@ -31,14 +32,15 @@ def estimate_recordings(
     *,
     start: str | None,
     end: str | None,
+    diagnostics: bool = False,
     json: str | None,
     csv: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of Settings
 ) -> None:
     """Estimate, with settings from the first recording where none are given, and show the result.
 
-    ``wanted`` holds method, segment, overlap, window, detrend, correct, unit and band, each None
-    where not given.
+    ``wanted`` holds method and fields of Settings, each None where not given. ``diagnostics``
+    shows all of them and not only what applies.
     """
     with Recording.open(files[0]) as recording:
         bench = recording.bench
@@ -62,16 +64,38 @@ def estimate_recordings(
             settings,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    if not show_result(snapshot, settings, json=json, csv=csv, bench=bench):
+    met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
+    if not met:
         raise typer.Exit(LIMIT_NOT_MET)
 
 
 def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of Settings
-    """Return settings with everything replaced that is not None."""
+    """Return settings with everything replaced that is not None.
+
+    A dimension or gains without a method ask for the method that takes them.
+
+    Raises
+    ------
+    typer.BadParameter
+        If what was asked for does not go together.
+    """
     changes = {key: value for key, value in wanted.items() if value is not None}
     if method is not None:
         changes["methods"] = (str(method),)
-    return replace(settings, **changes)
+    settings = replace(settings, **changes)
+    for option, needed in (("dimension", "maximum-likelihood"), ("gains", "two-channel")):
+        if option not in changes or {needed, "all"} & set(settings.methods):
+            continue
+        if method is not None:
+            name = "--gain" if option == "gains" else f"--{option}"
+            raise typer.BadParameter(f"{name} is for the {needed} method, not for {method}")
+        settings = replace(settings, methods=(needed,))
+    if settings.octaves and settings.reject:
+        raise typer.BadParameter(
+            "--octaves and --reject do not go together: one transient lies in segments of many "
+            "lengths; choose one of them"
+        )
+    return settings
 
 
 def show_result(
@@ -81,6 +105,7 @@ def show_result(
     json: str | None,
     csv: str | None,
     bench: Bench | None,
+    diagnostics: bool = False,
 ) -> bool:
     """Print the table for people, and write what programs asked for.
 
@@ -94,6 +119,8 @@ def show_result(
     screen.print(result_table(snapshot, settings))
     for line in remarks(snapshot):
         screen.print(line)
+    for part in details(snapshot) if diagnostics else summary(snapshot):
+        screen.print(part)
     write_json(json, document(snapshot))
     if csv is not None:
         write_text(csv, curves_csv(snapshot))

@@ -64,7 +64,13 @@ def exceeded(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> lis
                 continue
             if limit.channels and label.channel not in limit.channels:
                 continue
-            means = band_means(noise.noise_psd[:, column], noise.cov[:, column], edges, correlation)
+            means = band_means(
+                noise.noise_psd[:, column],
+                noise.cov[:, column],
+                edges,
+                correlation,
+                weights=np.gradient(snapshot.frequency),
+            )
             above = np.nan_to_num(means.low / mask, nan=0.0)
             worst = int(np.argmax(above))
             if above[worst] > 1:

@@ -35,11 +35,11 @@ def duration(value: str | float) -> float:
         raise typer.BadParameter(f"{value!r}: {error}") from None
 
 
-def factors(value: str) -> int | str:
+def factors(value: str | None) -> int | str | None:
     """Read how many factors the common motion has: a number, or ``auto``."""
-    if value == "auto":
+    if value is None or value == "auto":
         return value
-    if value.isdecimal() and int(value) > 0:
+    if value.isdecimal():
         return int(value)
     raise typer.BadParameter(f"--dimension {value!r}: expected a number such as 3, or auto")
 
@@ -55,6 +55,22 @@ def frequencies(value: str | None) -> tuple[float, float] | None:
     if not 0 < low < high:
         raise typer.BadParameter(f"--band {value!r}: expected two frequencies in Hz such as 1:20")
     return low, high
+
+
+def gains(values: list[str] | None) -> dict[str, float] | None:
+    """Read gains such as ``B=1.02`` or ``B.X=1.02``."""
+    if not values:
+        return None
+    found = {}
+    for value in values:
+        name, _, number = value.rpartition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            name = ""
+        if not name:
+            raise typer.BadParameter(f"--gain {value!r}: expected a sensor and number as in B=1.02")
+    return found
 
 
 BenchArgument: TypeAlias = Annotated[
@@ -102,20 +118,6 @@ NoCorrectionOption: TypeAlias = Annotated[
 NoRefinementOption: TypeAlias = Annotated[
     bool, typer.Option("--no-refinement", help="Set clocks by arrival times alone.")
 ]
-RejectOption: TypeAlias = Annotated[
-    bool | None,
-    typer.Option(
-        "--reject/--no-rejection",
-        help="Leave out segments with transients too, or none but those with gaps.",
-    ),
-]
-OctavesOption: TypeAlias = Annotated[
-    bool, typer.Option("--octaves", help="Segments twice as long in each octave below the highest.")
-]
-DimensionOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--dimension", metavar="N|auto", help="Factors that maximum likelihood allows."),
-]
 UnitOption: TypeAlias = Annotated[
     str | None,
     typer.Option("--unit", metavar="UNIT", help="As in m/s², m/s, µg: spectra are in UNIT²/Hz."),
@@ -123,6 +125,41 @@ UnitOption: TypeAlias = Annotated[
 BandOption: TypeAlias = Annotated[
     str | None,
     typer.Option("--band", metavar="LOW:HIGH", help="Band of the table, in Hz, as in 1:20."),
+]
+RejectOption: TypeAlias = Annotated[
+    bool | None,
+    typer.Option(
+        "--reject/--no-reject",
+        help="Leave out segments with transients; without either those that are clipped. "
+        "Gaps always are.",
+        show_default=False,
+    ),
+]
+OctavesOption: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--octaves",
+        help="Each octave with its own segments: --segment in the highest, doubling downwards.",
+    ),
+]
+DimensionOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--dimension",
+        metavar="auto|N",
+        help="Dimensions of the common motion (maximum likelihood); auto: as the data demand.",
+    ),
+]
+GainOption: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--gain",
+        metavar="SENSOR=G",
+        help="Known relative response for the two-channel method; alike where not given.",
+    ),
+]
+DiagnosticsOption: TypeAlias = Annotated[
+    bool, typer.Option("--diagnostics", help="Show all that is known of the test, band by band.")
 ]
 SpeedOption: TypeAlias = Annotated[
     float | None, typer.Option("--speed", min=0.01, help="How many times as fast as life.")

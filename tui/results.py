@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
+from estimator.self_noise import Flag
 from estimator.windows import get_window
 from tui.bands import band_edges, band_means, bin_correlation
 from tui.text import clock_time, level, level_with_error, utc
@@ -39,9 +40,11 @@ def channel_means(
 ) -> tuple[BandMeans, ...]:
     """Return the mean noise of every channel in a band, each with its 95 % interval."""
     edges = band_edges(frequency, band)
-    correlation = correlation_of(settings)
+    correlation, width = correlation_of(settings), np.gradient(frequency)
     return tuple(
-        band_means(noise.noise_psd[:, column], noise.cov[:, column], edges, correlation)
+        band_means(
+            noise.noise_psd[:, column], noise.cov[:, column], edges, correlation, weights=width
+        )
         for column in range(noise.noise_psd.shape[1])
     )
 
@@ -79,7 +82,8 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
         table.add_column(method, justify="right")
         columns.append(channel_means(noise, snapshot.frequency, settings, band))
     inside = slice(*band_edges(snapshot.frequency, band))
-    data = snapshot.data_psd[inside].mean(axis=0)
+    width = np.gradient(snapshot.frequency)[inside]
+    data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
     for number, label in enumerate(snapshot.channels):
         row = [label.sensor, label.channel, level(float(data[number]))]
         for means in columns:
@@ -93,11 +97,15 @@ def remarks(snapshot: Snapshot) -> list[str]:
     """Return what must be said beside the numbers, in plain words."""
     taken = f"{snapshot.n_segments} segments ({snapshot.n_effective:.0f} effective averages)"
     lines = [f"{taken} from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"]
-    if snapshot.n_dropped:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in snapshot.left_out.items())
+    if snapshot.octaves:
+        lowest, highest = snapshot.octaves[0], snapshot.octaves[-1]
+        lines[0] += f" above {highest.low:.3g} Hz"
         lines.append(
-            f"{snapshot.n_dropped} segments left out" + (f": {reasons}" if reasons else "")
+            f"octaves below have longer segments, up to {lowest.segment:.4g} s"
+            f" ({lowest.n_effective:.0f} effective averages) below {lowest.high:.3g} Hz"
         )
+    if snapshot.n_dropped:
+        lines.append(f"{snapshot.n_dropped} segments left out{left_out(snapshot)}")
     lines += [
         f"{sensor.name}: {sensor.n_gaps} gaps, {sensor.n_missing} samples missing"
         for sensor in snapshot.sensors
@@ -109,7 +117,13 @@ def remarks(snapshot: Snapshot) -> list[str]:
         worst = max(clock.residual for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
+    if "two-channel" in snapshot.results:
+        lines.append(
+            "two-channel: takes like channels to point the same way, and their gains as given "
+            "(--gain) or alike"
+        )
     for method, noise in snapshot.results.items():
+        lines += flagged(snapshot, method)
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
@@ -117,6 +131,41 @@ def remarks(snapshot: Snapshot) -> list[str]:
                 "zero, and are kept so"
             )
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
+    return lines
+
+
+def left_out(snapshot: Snapshot) -> str:
+    """Return why segments were left out, to follow their number."""
+    words = {
+        "gap": "where a sensor has a gap",
+        "clipped": "where a sensor is at the end of its range",
+        "transient": "that something disturbed",
+    }
+    reasons = [f"{count} {words[reason]}" for reason, count in snapshot.left_out.items() if count]
+    return ": " + ", ".join(reasons) if reasons else ""
+
+
+def flagged(snapshot: Snapshot, method: str) -> list[str]:
+    """Return which channels have frequencies at which nothing can be said, and why."""
+    words = {
+        Flag.DEAD_CHANNEL: "no signal",
+        Flag.DUPLICATE: "a copy of another channel",
+        Flag.NOT_FINITE: "not finite",
+        Flag.SINGULAR: "the matrix is singular",
+        Flag.NO_COUNTERPART: "the other sensors have too few channels to compare with",
+        Flag.NOT_CONVERGED: "the iteration did not reach the maximum",
+    }
+    flags = snapshot.results[method].flags[1:-1]
+    lines = []
+    for flag, why in words.items():
+        counts = ((flags & flag) != 0).sum(axis=0)
+        if counts.any():
+            names = ", ".join(
+                f"{label.sensor}.{label.channel}"
+                for label, count in zip(snapshot.channels, counts, strict=True)
+                if count
+            )
+            lines.append(f"{method}: {names}: {why}, at {counts.max()} of {len(flags)} frequencies")
     return lines
 
 
@@ -139,6 +188,7 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
                 "noise_psd_low": noise.low[:, column].tolist(),
                 "noise_psd_high": noise.high[:, column].tolist(),
                 "cov": noise.cov[:, column].tolist(),
+                "flags": noise.flags[:, column].tolist(),
             }
             for column, label in enumerate(snapshot.channels)
         ],
@@ -156,6 +206,9 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
     return {
         "elapsed": snapshot.elapsed,
         "dropped_segments": snapshot.n_dropped,
+        "left_out": snapshot.left_out,
+        "octaves": [asdict(octave) for octave in snapshot.octaves],
+        "flags": {flag.name: flag.value for flag in Flag},
         "start_utc_ns": snapshot.start_utc_ns,
         "closed": snapshot.closed,
         "refused": snapshot.refused,

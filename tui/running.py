@@ -43,6 +43,7 @@ def run_test(
     out: Path | None,
     json: str | None,
     csv: str | None,
+    diagnostics: bool = False,
     **wanted: Any,  # noqa: ANN401 - fields of Settings
 ) -> None:
     """Run one huddle test and show its result.
@@ -69,7 +70,9 @@ def run_test(
             recorder, settings, duration=duration, until_cov=until_cov
         )
         finish_recording(out, snapshot)
-        met = show_result(snapshot, settings, json=json, csv=csv, bench=bench)
+        met = show_result(
+            snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
+        )
         recorder.check()
         if interrupted:
             raise typer.Exit(INTERRUPTED)

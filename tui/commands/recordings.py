@@ -12,10 +12,12 @@ from tui.options import (
     BandOption,
     CsvOption,
     DetrendOption,
+    DiagnosticsOption,
     DimensionOption,
     DurationOption,
     FileArgument,
     FilesArgument,
+    GainOption,
     JsonOption,
     MethodOption,
     NoCorrectionOption,
@@ -28,6 +30,7 @@ from tui.options import (
     WindowOption,
     factors,
     frequencies,
+    gains,
 )
 
 
@@ -35,6 +38,7 @@ from tui.options import (
     "huddle estimate night.h5",
     "huddle estimate night.h5 --method all --band 1:20",
     "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
+    "huddle estimate night.h5 --octaves --dimension auto --diagnostics",
 )
 def estimate(
     files: FilesArgument,
@@ -49,6 +53,7 @@ def estimate(
     reject: RejectOption = None,
     octaves: OctavesOption = False,
     dimension: DimensionOption = None,
+    gain: GainOption = None,
     start: Annotated[
         str | None,
         typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
@@ -58,6 +63,7 @@ def estimate(
     ] = None,
     unit: UnitOption = None,
     band: BandOption = None,
+    diagnostics: DiagnosticsOption = False,
     json: JsonOption = None,
     csv: CsvOption = None,
 ) -> None:
@@ -78,11 +84,13 @@ def estimate(
         refine=False if no_refinement else None,
         reject=reject,
         octaves=octaves or None,
-        dimension=None if dimension is None else factors(dimension),
+        dimension=factors(dimension),
+        gains=gains(gain),
         start=start,
         end=end,
         unit=unit,
         band=frequencies(band),
+        diagnostics=diagnostics,
         json=json,
         csv=csv,
     )

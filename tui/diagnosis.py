@@ -1,0 +1,159 @@
+"""What the averages show of the test itself, in words: what applies, or all of it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rich.console import RenderableType
+
+    from daq.estimation import Snapshot
+    from estimator.advice import Advice
+
+FAILS = "statistic over expectation"
+
+
+def summary(snapshot: Snapshot) -> list[str]:
+    """Return what applies to this test, a line for each kind of thing; worst first."""
+    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    kinds: dict[str, list[Advice]] = {}
+    for advice in snapshot.diagnostics.get("advice", ()):
+        kinds.setdefault(next(iter(advice.numbers)), []).append(advice)
+    lines = []
+    for kind, found in kinds.items():
+        if kind == "share of frequencies":  # said with the channels' flags
+            continue
+        in_short = _SHORT.get(kind)
+        lines += [advice.text for advice in found] if in_short is None else [in_short(found, names)]
+    if "bands" in snapshot.diagnostics and FAILS not in kinds:
+        lines.append("model test: one common motion explains what the sensors share, in all bands")
+    if "dimension" in snapshot.diagnostics:
+        lines += _dimensions(snapshot)
+    return lines
+
+
+def details(snapshot: Snapshot) -> list[RenderableType]:
+    """Return the diagnosis of every band and pair of sensors, and all advice."""
+    found = snapshot.diagnostics
+    if "bands" not in found:
+        return ["too few sensors or averages to diagnose the test"]
+    parts: list[RenderableType] = [_bands(snapshot), _pairs(snapshot)]
+    parts += [f"{advice.level}: {advice.text}" for advice in found["advice"]]
+    parts += [choice.text for choice in found.get("dimension", ())]
+    return parts
+
+
+def _bands(snapshot: Snapshot) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), title_justify="left")
+    for name in ("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p"):
+        table.add_column(name, justify="right")
+    for band in snapshot.diagnostics["bands"]:
+        known = [float(value) for value in band.snr if math.isfinite(value)]
+        ratio = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
+        table.add_row(
+            f"{band.low:.3g}–{band.high:.3g}",
+            f"{band.coherence:.4f}",
+            f"{band.condition:.3g}",
+            f"{band.dimension:.0f}",
+            f"{min(known):.2g}…{max(known):.2g}" if known else "?",
+            f"{ratio:.3f}",
+            f"{band.test.p_value:.2g}",
+        )
+    return table
+
+
+def _pairs(snapshot: Snapshot) -> Table:
+    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("sensors", "turned", "horizontal", "±", "gains", "delay", "not orthogonal"):
+        table.add_column(name, justify="left" if name == "sensors" else "right")
+    for pair in snapshot.diagnostics["responses"]:
+        table.add_row(
+            f"{names[pair.first]} → {names[pair.second]}",
+            f"{pair.rotation_deg:.3f}°",
+            f"{pair.horizontal_deg:.3f}°" if math.isfinite(pair.horizontal_deg) else "?",
+            f"{pair.angle_error_deg:.3f}°" if math.isfinite(pair.angle_error_deg) else "?",
+            " ".join(f"{gain:.4f}" for gain in pair.gains),
+            f"{pair.delay * 1e6:.1f} µs".replace("-", "−"),
+            f"{pair.nonorthogonality_deg:.2f}°",
+        )
+    return table
+
+
+def _dimensions(snapshot: Snapshot) -> list[str]:
+    """Return the choice and its price for the bands where it is not the usual one, in short."""
+    choices = snapshot.diagnostics["dimension"]
+    unusual = [choice for choice in choices if choice.accepted and choice.n_factors != choice.usual]
+    failing = [choice for choice in choices if not choice.accepted]
+    lines = [choice.text for choice in unusual]
+    if failing:
+        where = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
+        lines.append(f"no dimension that these sensors allow explains {where} Hz")
+    if len(unusual) + len(failing) < len(choices):
+        lines.append(f"elsewhere the motion has all {choices[0].usual} dimensions")
+    return lines
+
+
+def _fails(found: Sequence[Advice], _names: list[str]) -> str:
+    worst = sorted(found, key=lambda advice: advice.numbers["worst"], reverse=True)
+    where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in worst)
+    hint = found[0].text.split("wrong there. ", 1)[-1]
+    return (
+        "model test fails at (statistic over its expectation) "
+        f"{where}: the sensors do not share one motion, their noise is estimated wrong there. "
+        f"{hint}"
+    )
+
+
+def _turned(found: Sequence[Advice], names: list[str]) -> str:
+    horizontal = all(math.isfinite(advice.numbers["horizontal_deg"]) for advice in found)
+    which = "horizontal_deg" if horizontal else "angle_deg"
+    pairs = ", ".join(f"{_pair(advice, names)} {advice.numbers[which]:.3f}°" for advice in found)
+    return (
+        f"sensors are turned{' in the horizontal' if horizontal else ''}: {pairs}: no bias in the "
+        "three-sensor or maximum likelihood estimate, but a three-channel estimate leaks motion; "
+        "aligning them can improve precision"
+    )
+
+
+def _gains(found: Sequence[Advice], names: list[str]) -> str:
+    pairs = ", ".join(f"{_pair(advice, names)} {advice.numbers['gain']:.3f}" for advice in found)
+    return f"gains differ: {pairs}: no bias, but a sensitivity is wrong, and the noise with it"
+
+
+def _delayed(found: Sequence[Advice], names: list[str]) -> str:
+    pairs = ", ".join(
+        f"{_pair(advice, names)} {advice.numbers['delay_s'] * 1e3:.3g} ms" for advice in found
+    )
+    return f"sensors lag each other: {pairs}: align the clocks, and use a tapered window"
+
+
+def _singular(found: Sequence[Advice], _names: list[str]) -> str:
+    where = ", ".join(_span(advice) for advice in found)
+    return (
+        f"nearly singular at {where}: one direction moves far less than the others there, and the "
+        "three-sensor estimate scatters more"
+    )
+
+
+_SHORT: dict[str, Callable[[Sequence[Advice], list[str]], str]] = {
+    FAILS: _fails,
+    "angle_deg": _turned,
+    "gain": _gains,
+    "delay_s": _delayed,
+    "condition": _singular,
+}
+
+
+def _pair(advice: Advice, names: list[str]) -> str:
+    return "–".join(names[sensor] for sensor in advice.sensors)
+
+
+def _span(advice: Advice) -> str:
+    low, high = advice.band or (math.nan, math.nan)
+    return f"{low:.3g}–{high:.3g} Hz"
