@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from daq.bench import dump, load, parse
 from daq.control import ask
 from daq.estimation import Settings
 from daq.recording.reader import Recording
+from tests.tui.screen_text import screen_text
 from tui.application.app import HuddleApp
 from tui.application.main import BenchControls
 from tui.devices import simulated
@@ -37,8 +39,10 @@ def bench(tmp_path: Path) -> Iterator[Path]:
 
 
 async def until(pilot: Pilot[None], reached: Callable[[], bool]) -> None:
-    """Let the application run until something is the case; the test's own timeout ends it."""
+    """Let the application run until something is the case, for half a minute at most."""
+    deadline = time.monotonic() + 30
     while not reached():
+        assert time.monotonic() < deadline, screen_text(pilot.app)
         await pilot.pause(0.05)
 
 
