@@ -1,8 +1,10 @@
 """Spectra from those segments that nothing has disturbed.
 
 A segment is left out when samples of it are missing, when it is clipped, or when the power of any
-channel in any octave lies far from what it was in the segments accepted before. The decision on a
-segment looks at earlier ones only, so that it is the same while the recording grows and afterwards.
+channel in any octave lies far from what it was in the segments accepted before, or when a channel
+stands still in part of it: one that was dead for a moment lacks too little power to show by that.
+The decision on a segment looks at earlier ones only, so that it is the same while the recording
+grows and afterwards.
 
 The first segments have none before them: a start-up set is held back and judged by its own median.
 Should the level change for good, so that a whole start-up set in a row is left out, judging starts
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from estimator.arrays import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
+STILL = 32  # samples alike in a row: a channel that was dead (or one that is all below a count)
 FEWEST = 5  # segments that have a median worth the name
 SEGMENTS_PER_BLOCK = 32
 REPORTED = 1000  # segments left out that are remembered one by one
@@ -87,7 +90,8 @@ class Rejected:
     channel : int or None
         The channel that shows it most; None for a gap.
     deviation : float
-        Standard deviations from the median, for a transient; NaN otherwise.
+        Standard deviations from the median, for a transient, infinite where a channel stood still;
+        NaN otherwise.
     """
 
     segment: int
@@ -206,6 +210,10 @@ class SelectedSpectra:
             if clipped.any():
                 self._leave_out(Rejected(number, Reason.CLIPPED, int(np.argmax(clipped)), np.nan))
                 return False
+        still = _stands_still(segment)
+        if still.any():
+            self._leave_out(Rejected(number, Reason.TRANSIENT, int(np.argmax(still)), np.inf))
+            return False
         if self._normal is None:
             self._held.append(_Held(number, segment.copy(), power))
             if len(self._held) == self.rejection.start_up:
@@ -274,6 +282,20 @@ class _Held:
     number: int
     samples: FloatArray
     power: FloatArray
+
+
+def _stands_still(segment: FloatArray) -> BoolArray:
+    """Return which channels are constant, to rounding, over `STILL` samples or more: (n_channels,).
+
+    Not those that are so from end to end: a channel may be dead for good.
+    """
+    if len(segment) <= STILL:
+        return np.zeros(segment.shape[1], dtype=np.bool_)
+    moved = np.abs(np.diff(segment, axis=0)) > 1e-6 * segment.std(axis=0)
+    since = np.cumsum(moved, axis=0)
+    since = np.concatenate([np.zeros_like(since[:1]), since])
+    still = (since[STILL - 1 :] == since[: len(since) - STILL + 1]).any(axis=0)
+    return np.asarray(still & (since[-1] > 0))
 
 
 def _deviation(power: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:

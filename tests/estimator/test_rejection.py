@@ -164,3 +164,19 @@ def test_settings_and_segments_that_mean_nothing_are_refused() -> None:
     with pytest.raises(EstimatorError, match="expected"):
         spectra.add(samples, starts + 1)
     assert spectra.n_segments == 0
+
+
+@pytest.mark.parametrize("level", [0.0, 3.0])
+def test_a_channel_that_was_dead_for_a_moment_costs_the_segments_it_touches(level: float) -> None:
+    """A fifth of a segment hides in the scatter of its power."""
+    samples, starts = quiet(100)
+    clean = samples.copy()
+    samples[5000:5040, 1] = level
+    samples[7000:7020, 2] = level  # too short to be told from chance
+    spectra = selected(samples, starts)
+    touched = [i for i in range(100) if starts[i] <= 5008 and starts[i] + 200 >= 5032]
+    assert [r.segment for r in spectra.rejected] == touched
+    assert all(r.channel == 1 and r.deviation == np.inf for r in spectra.rejected)
+    rest = np.delete(starts, touched)
+    samples[5000:5040, 1] = clean[5000:5040, 1]
+    np.testing.assert_allclose(spectra.spectra().csm(), expected(samples, rest))
