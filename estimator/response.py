@@ -194,23 +194,27 @@ def relative_response(
     low, high = band or (0.0, np.inf)
     usable = (frequency > 0) & (frequency >= low) & (frequency <= high)
     usable &= ~(given.flags != 0).any(axis=1)
-    g = canonical_coherence(given.matrix, dims, first, second)[:, -1]
-    weight = g / np.maximum(1 - g, 1e-9)
-    weight[~usable | (weight < LEAST_COHERENCE / (1 - LEAST_COHERENCE))] = 0.0
-    if not weight.any():
-        raise InsufficientDataError(
-            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
-            f"alive and coherent in all {d} directions by more than {LEAST_COHERENCE}"
-        )
-    inside = np.flatnonzero(weight)
-    f, weight = frequency[inside], weight[inside]
-    csm = csm[inside] / _power(csm[inside], dims, first)[:, None, None]
     own = [np.arange(d) + sum(dims[:sensor]) for sensor in (first, second)]
     rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
     if len(rest) < d:
         raise InsufficientDataError(
             f"sensors {first} and {second}: the others have {len(rest)} channels, {d} are needed"
         )
+    g = canonical_coherence(given.matrix, dims, first, second)[:, -1]
+    among = np.concatenate([own[0], rest])
+    with_rest = given.matrix[:, among[:, None], among]
+    seen = canonical_coherence(with_rest, (d, len(rest)), 0, 1)[:, -1]
+    weight = g / np.maximum(1 - g, 1e-9)
+    weight[~usable | (np.minimum(g, seen) < LEAST_COHERENCE)] = 0.0
+    if not weight.any():
+        raise InsufficientDataError(
+            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
+            f"alive and coherent, with each other and with the others, in all {d} directions by "
+            f"more than {LEAST_COHERENCE}"
+        )
+    inside = np.flatnonzero(weight)
+    f, weight = frequency[inside], weight[inside]
+    csm = csm[inside] / _power(csm[inside], dims, first)[:, None, None]
     S_ik, S_jk = (csm[:, channels[:, None], rest] for channels in own)
     delay = _delay(f, weight, S_ik, S_jk)
     S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]

@@ -30,7 +30,8 @@ def summary(snapshot: Snapshot) -> list[str]:
             continue
         in_short = _SHORT.get(kind)
         lines += [advice.text for advice in found] if in_short is None else [in_short(found, names)]
-    if "bands" in snapshot.diagnostics and FAILS not in kinds:
+    tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
+    if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
         lines.append("model test: one common motion explains what the sensors share, in all bands")
     if "dimension" in snapshot.diagnostics:
         lines += _dimensions(snapshot)
@@ -129,7 +130,7 @@ def _gains(found: Sequence[Advice], names: list[str]) -> str:
 def _delayed(found: Sequence[Advice], names: list[str]) -> str:
     pairs = ", ".join(
         f"{_pair(advice, names)} {advice.numbers['delay_s'] * 1e3:.3g} ms" for advice in found
-    )
+    ).replace(" -", " −")
     return f"sensors lag each other: {pairs}: align the clocks, and use a tapered window"
 
 

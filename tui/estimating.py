@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -21,8 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daq.bench import Bench
+    from daq.bench import Bench, Sensor
     from daq.estimation import Snapshot
+    from daq.recording.reader import SensorRecord
 
 LIMIT_NOT_MET = 1
 
@@ -45,6 +47,7 @@ def estimate_recordings(
     with Recording.open(files[0]) as recording:
         bench = recording.bench
         settings = chosen(Settings.of(bench), **wanted)
+        check_gains(settings, recording.sensors)
         settings = replace(
             settings,
             start=_instant(start, recording.created),
@@ -96,6 +99,25 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
             "lengths; choose one of them"
         )
     return settings
+
+
+def check_gains(settings: Settings, sensors: Sequence[Sensor | SensorRecord]) -> None:
+    """Refuse gains of what is not there.
+
+    Raises
+    ------
+    typer.BadParameter
+        With the names of the sensors.
+    """
+    known = {sensor.name for sensor in sensors}
+    known |= {f"{sensor.name}.{channel.name}" for sensor in sensors for channel in sensor.channels}
+    for name, gain in settings.gains.items():
+        if name not in known or gain == 0 or not math.isfinite(gain):
+            names = ", ".join(sensor.name for sensor in sensors)
+            raise typer.BadParameter(
+                f"--gain {name}={gain:g}: expected one of the sensors {names}, or a channel of "
+                f"them as in {sensors[0].name}.{sensors[0].channels[0].name}, and a number not 0"
+            )
 
 
 def show_result(

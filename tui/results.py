@@ -141,8 +141,10 @@ def left_out(snapshot: Snapshot) -> str:
         "clipped": "where a sensor is at the end of its range",
         "transient": "that something disturbed",
     }
-    reasons = [f"{count} {words[reason]}" for reason, count in snapshot.left_out.items() if count]
-    return ": " + ", ".join(reasons) if reasons else ""
+    counts = {reason: count for reason, count in snapshot.left_out.items() if count}
+    if len(counts) == 1:
+        return " " + words[next(iter(counts))]
+    return ": " + ", ".join(f"{count} {words[reason]}" for reason, count in counts.items())
 
 
 def flagged(snapshot: Snapshot, method: str) -> list[str]:

@@ -16,7 +16,7 @@ from daq.clock import SystemClock
 from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
-from tui.estimating import LIMIT_NOT_MET, chosen, show_result
+from tui.estimating import LIMIT_NOT_MET, check_gains, chosen, show_result
 from tui.output import notices
 from tui.recorder_process import RecorderProcess
 from tui.results import reached_cov, result_arrays
@@ -57,6 +57,7 @@ def run_test(
     """
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
+    check_gains(settings, bench.sensors)
     if until_cov is not None:
         settings = replace(settings, target_cov=until_cov)
     duration = bench.recording.duration if duration is None and until_cov is None else duration

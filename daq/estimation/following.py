@@ -174,7 +174,7 @@ class Estimation:
                 each.restart()
                 each.advance(count)
         snapshot = self._snapshot(final=True)
-        if not snapshot.results:
+        if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
             raise InsufficientDataError(self._why_nothing(snapshot))
         return snapshot
 
@@ -273,6 +273,11 @@ class Estimation:
                 f"{names}: not one whole segment: {available / welch.sampling_rate:.3g} s with all"
                 f" sensors, {snapshot.n_dropped} segments left out (gaps, clipping), and a segment"
                 f" takes {self.settings.segment:g} s; record longer or choose a shorter segment"
+            )
+        if snapshot.results:
+            return (
+                f"{names}: nothing can be said of any channel at any frequency: they have no signal"
+                " or are copies of each other; look at the samples and the bench file"
             )
         return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
 

@@ -34,6 +34,7 @@ _Read = TypeVar("_Read")
 _VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
+_STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 
 
@@ -124,6 +125,7 @@ class Pass:
         for (first, count), (samples, valid) in zip(pieces, _ahead(read, pieces), strict=True):
             starts = np.arange(count) * hop
             usable = valid & self._finite(samples)
+            self._silence(samples)
             clipped = self._clipped(first * hop, len(samples))
             starts = np.arange(count) * hop
             whole = _whole(usable, starts, length)
@@ -147,6 +149,15 @@ class Pass:
             self.n_seen += count
             if progress is not None:
                 progress(count)
+
+    def _silence(self, samples: FloatArray) -> None:
+        """Make channels that stand still exactly zero: the rounding of their mean is no signal."""
+        if self.welch.detrend == "none":
+            return
+        rows = samples[:: max(1, len(samples) // 4)]
+        for column in np.flatnonzero(_stands_still(rows)):
+            if _stands_still(samples[:, column]):
+                samples[:, column] = 0.0
 
     def _finite(self, samples: FloatArray) -> NDArray[np.bool_]:
         """Return which samples are finite numbers, in every channel."""
@@ -235,6 +246,10 @@ def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) ->
     """Return which segments have usable samples only."""
     missing = np.concatenate([[0], np.cumsum(~usable)])
     return np.asarray(missing[starts + length] == missing[starts])
+
+
+def _stands_still(samples: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.ptp(samples, axis=0) <= _STILL * np.abs(samples[0]))
 
 
 def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
