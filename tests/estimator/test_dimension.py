@@ -21,7 +21,7 @@ ITEM_9_SNR = 400.0
 
 def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     """Item 9 of method.md: bias of the mean over each band and all channels."""
-    centres = np.array([1.0, 2, 3.5, 5, 7, 10, 14, 20, 50])
+    centres = np.array([1.0, 3.5, 7, 10, 20, 50])
     frequency = (centres[:, None] * np.linspace(0.95, 1.05, 24)).ravel()
     band = np.repeat(np.arange(len(centres)), 24)
     csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR)
@@ -45,7 +45,7 @@ def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     assert all(choice.n_factors >= 9 for choice in choices[-2:])
     assert np.all(np.diff([choice.n_factors for choice in choices]) >= 0)
     assert "do not feel one motion" in choices[-1].text
-    for choice in choices[3:]:
+    for choice in choices[2:]:
         assert choice.cov > choice.usual_cov  # the price
         assert all(test.p_value < 0.05 for test in choice.tried[:-1])
 

@@ -62,7 +62,7 @@ def test_permuting_the_channels_permutes_the_noise() -> None:
     np.testing.assert_allclose(maximise(permuted, 3).psi, maximise(csm, 3).psi[:, order], rtol=1e-5)
 
 
-def test_the_gradient_and_hessian_are_those_of_the_discrepancy() -> None:
+def test_nothing_nearby_explains_the_matrix_better() -> None:
     rng = np.random.default_rng(7)
     csm = wishart(equal_noise(7, dims=(2, 2, 2), snr=10), 30, rng)
     found = maximise(csm, 2)
@@ -91,7 +91,7 @@ def test_the_gradient_and_hessian_are_those_of_the_discrepancy() -> None:
     ids=["SNR 0.01", "SNR 1e6", "noise 100x and 100x", "one quiet sensor", "11 of 15 factors"],
 )
 def test_arrives_where_fixed_points_crawl(csm: ComplexArray, n_factors: int) -> None:
-    draws = wishart(csm, 1080, np.random.default_rng(8), n_draws=100)
+    draws = wishart(csm, 1080, np.random.default_rng(8), n_draws=50)
     found = maximise(draws, n_factors)
     assert found.converged.all()
     assert np.median(found.iterations) < 80
@@ -101,7 +101,7 @@ def test_arrives_where_fixed_points_crawl(csm: ComplexArray, n_factors: int) -> 
 def test_arrives_wherever_it_starts_from() -> None:
     """Three to five sensors, SNR 0.01 to 1e6, noise 1e4 apart, few averages, any factors."""
     rng = np.random.default_rng(5)
-    for _ in range(60):
+    for _ in range(40):
         n_sensors, d = int(rng.integers(3, 6)), int(rng.integers(1, 4))
         p = n_sensors * d
         n_averages = int(rng.choice([p + 1, 2 * p, 100, 1080, 100_000]))
@@ -177,7 +177,7 @@ def test_precise_as_the_bound_unbiased_and_sure_of_it(geometry: str, n_averages:
     A sample c.o.v. of m draws scatters by 1/sqrt(2 m) (more for the skewed: 1.5 allows it),
     the mean by cov/sqrt(m), coverage by sqrt(.05 .95/m).
     """
-    n_draws = 1000
+    n_draws = 600
     csm, noise_psd, dims = GEOMETRIES[geometry]
     bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=n_averages)[0]
     draws = wishart(csm, n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
@@ -208,7 +208,7 @@ def test_five_triaxial_sensors_reach_four_percent() -> None:
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [10.0, 1e6])
 def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
-    n_draws = 1500
+    n_draws = 1000
     rng = np.random.default_rng(16)
     csm = equal_noise(17, dims=(d,) * 3, snr=snr)
     found = maximum_likelihood(

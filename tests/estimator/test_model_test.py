@@ -104,7 +104,7 @@ def test_incoherence_that_biases_by_half_is_seen_over_an_octave() -> None:
 
     snr = optimize.brentq(excess, 1.0, 1e6)
     csm = plane_waves(np.array([7.0]), positions, snr=float(snr))[0]
-    n_octaves = 120
+    n_octaves = 100
     rng = np.random.default_rng(5)
     # Correlated neighbours carry less: as independent bins, the octave has 50 / spread of them.
     draws = wishart(csm, 1080, rng, n_draws=n_octaves * 35)
