@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError, NoAnswerError, NotConnectedError
-from daq.recording.reader import Recording
+from daq.recording.reader import control_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -132,7 +132,7 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
 
 
 def _control_of(path: Path) -> tuple[int, str]:
-    with Recording.open(path) as recording:
-        if recording.closed or recording.control is None:
-            raise NotConnectedError(f"{path}: no recorder is writing it")
-        return recording.control
+    address = control_address(path)
+    if address is None:
+        raise NotConnectedError(f"{path}: no recorder is writing it")
+    return address

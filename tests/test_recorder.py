@@ -16,7 +16,7 @@ from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDe
 from daq.protocols.block import Event
 from daq.recorder import Status, record, recording_path
 from daq.recording.healing import verify
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, control_address
 from tests.devices import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
 
 if TYPE_CHECKING:
@@ -273,9 +273,9 @@ async def test_commands_from_outside(tmp_path: Path) -> None:
         status = await asyncio.to_thread(ask, run.path, "status")
         assert status["sensors"]["a"]["samples"] == 100
         await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
-        with Recording.open(run.path) as recording:
-            assert recording.control is not None
-            port, token = recording.control
+        address = control_address(run.path)
+        assert address is not None
+        port, token = address
         with pytest.raises(ControlRefusedError, match="wrong token"):
             await asyncio.to_thread(ask, (port, "guess"), "stop")
         with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
@@ -295,9 +295,9 @@ async def test_nonsense_on_the_control_port_harms_nothing(tmp_path: Path) -> Non
     async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
-        with Recording.open(run.path) as recording:
-            assert recording.control is not None
-            port, _ = recording.control
+        address = control_address(run.path)
+        assert address is not None
+        port, _ = address
         for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             with contextlib.suppress(ConnectionError):

@@ -22,7 +22,6 @@ from daq.recording.locking import is_being_written
 from daq.recording.superblock import ClearedFile, Superblock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from types import TracebackType
 
     from numpy.typing import NDArray
@@ -191,10 +190,6 @@ class Recording:
         self.operator: str = attributes["operator"]
         self.location: str = attributes["location"]
         self.bench_text: str = attributes["bench"]
-        self.control: tuple[int, str] | None = None
-        """Port and token of the recorder that writes this file (:mod:`daq.control`)."""
-        if "control_port" in attributes:
-            self.control = int(attributes["control_port"]), attributes["control_token"]
         self._committed: h5py.Dataset = file["committed"]
         self.sensors = tuple(
             SensorRecord(file["sensors"][name]) for name in self._committed.attrs["sensors"]
@@ -346,8 +341,29 @@ def check_format(path: Path, file: h5py.File) -> None:
         )
 
 
-@contextlib.contextmanager
-def open_recording(path: str | Path) -> Iterator[Recording]:
-    """Open a recording for the time of a ``with`` block."""
-    with Recording.open(path) as recording:
-        yield recording
+def control_address(path: str | Path) -> tuple[int, str] | None:
+    """Return port and token of the recorder that writes a recording; None if it was closed.
+
+    Safe beside a reader that follows the file in the same process, as a second ``Recording`` is
+    not: HDF5 would let the two share what it remembers of a file that grows, and the first then
+    fails or sees zeros. So the file is read here as it is at this instant, and only what never
+    moves in it.
+
+    Raises
+    ------
+    NotARecordingError, RecordingError
+        As :meth:`Recording.open` does.
+    """
+    path = Path(path)
+    superblock = Superblock.of(path)
+    source = ClearedFile(path, superblock) if superblock.version == 3 else path
+    try:
+        with h5py.File(source, "r") as file:
+            check_format(path, file)
+            if file["committed"][-1, layout.CLOSED] or "control_port" not in file.attrs:
+                return None
+            return int(file.attrs["control_port"]), file.attrs["control_token"]
+    except (KeyError, OSError, RuntimeError, ValueError) as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise NotARecordingError(f"{path}: a damaged recording: {error}") from error

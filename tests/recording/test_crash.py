@@ -18,7 +18,7 @@ from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.healing import heal, verify, write_results
 from daq.recording.layout import SensorLayout
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, control_address
 from daq.recording.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 
@@ -45,7 +45,7 @@ if limit:
 now = HostTime(0, 0)
 channels = tuple(Channel(name=n, sensitivity=1.0) for n in "xyz")
 sensors = [SensorLayout(n, channels, 100.0, np.dtype("i4")) for n in ("a", "b")]
-writer = RecordingWriter.create(path, sensors=sensors, created=now)
+writer = RecordingWriter.create(path, sensors=sensors, created=now, control=(7, "token"))
 rng = np.random.default_rng(1)
 first = 0
 try:
@@ -135,6 +135,28 @@ def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) 
     assert healed.intact
     for sensor in healed.sensors:
         assert sensor.n_samples >= json.loads(lines[-1])[sensor.name] > 0
+
+
+def test_asking_who_writes_does_not_disturb_a_reader(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        seen = dict.fromkeys("ab", 0)
+        with Recording.open(path) as following:
+            while min(seen.values()) < 3000:
+                assert control_address(path) == (7, "token")
+                writer.stdout.readline()
+                following.refresh()
+                for sensor in following.sensors:
+                    counts = sensor.counts(seen[sensor.name])
+                    assert len(counts) == sensor.n_samples - seen[sensor.name]
+                    assert not len(counts) or counts.any(axis=1).all()
+                    seen[sensor.name] = sensor.n_samples
+        writer.kill()
+    assert control_address(path) == (7, "token")
+    heal(path, now=NOW)
+    assert control_address(path) is None
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])

@@ -73,7 +73,6 @@ def test_round_trip(tmp_path: Path) -> None:
 
     with Recording.open(path) as recording:
         assert recording.closed
-        assert recording.control == (4711, "token")
         assert [sensor.name for sensor in recording.sensors] == ["b", "a"]
         b, a = recording.sensors
         assert b.channels == CHANNELS
