@@ -229,8 +229,6 @@ class _Device:
         """Read what the device says about itself; refuse it if it is not the one expected."""
         await self.wait_clear(epson.GLOB_CMD, epson.NOT_READY, "starting")
         model, serial_number = await self._identity()
-        if self._refusal(model, serial_number):  # replies bear no checksum: look again
-            model, serial_number = await self._identity()
         if refusal := self._refusal(model, serial_number):
             raise WrongDeviceError(f"{self._stream.label}: {refusal}")
         version = await self.read(epson.VERSION)
@@ -248,9 +246,21 @@ class _Device:
         )
 
     async def _identity(self) -> tuple[str, str]:
-        """Return model and serial number."""
-        model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
-        return model, epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
+        """Return model and serial number, read twice alike: replies bear no checksum.
+
+        A wrong one would be taken for the device's own, and the device refused ever after.
+        """
+        before: tuple[str, str] | None = None
+        for _ in range(ATTEMPTS):
+            model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
+            found = model, epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
+            if found == before:
+                return found
+            before = found
+        raise WrongDeviceError(
+            f"{self._stream.label}: model and serial number differ each time they are read,"
+            f" last {' '.join(before or ())!r}; check the cable"
+        )
 
     def _refusal(self, model: str, serial_number: str) -> str:
         """Say why this is not the device the bench file names; nothing if it is."""
@@ -389,8 +399,8 @@ class EpsonDriver:
             await device.identify()
             try:
                 information = await device.information()
-                await device.configure(configuration)
-                actual = await device.sampling_rate()
+                await device.configure(configuration)  # reads back what it sets
+                actual = float(configuration.sampling_rate)
                 information = replace(information, sampling_rate=actual)
                 yield EpsonSession(sensor, stream, configuration, information)
             finally:

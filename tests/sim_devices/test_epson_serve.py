@@ -112,6 +112,44 @@ async def test_another_serial_number_is_refused(running: tuple[RunningDevice, ..
         await blocks(sensor, 1)
 
 
+async def test_a_serial_number_changed_on_the_way_is_not_believed(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    host, _, number = running[2].port.removeprefix("socket://").partition(":")
+    changed = 0
+
+    async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal changed
+        tasks.append(asyncio.current_task())
+        from_device, to_device = await asyncio.open_connection(host, int(number))
+
+        async def back() -> None:
+            nonlocal changed
+            while received := bytearray(await from_device.read(4096)):
+                at = received.find(b"\x78\x30")  # the register that ends in a character 0
+                if at >= 0 and not changed:
+                    received[at + 1] ^= 0x04
+                    changed += 1
+                writer.write(received)
+
+        returning = asyncio.create_task(back())
+        while received := await reader.read(4096):
+            to_device.write(received)
+        to_device.close()
+        await returning
+        writer.close()
+
+    tasks: list[asyncio.Task[None] | None] = []
+    async with await asyncio.start_server(relay, "127.0.0.1", 0) as server:
+        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        (sensor,) = sensors(running[2], TABLES[2], port=port)
+        async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+            (information,) = session.information
+        await asyncio.gather(*filter(None, tasks))
+    assert changed
+    assert information.serial_number == "C0000007"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
