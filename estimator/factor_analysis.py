@@ -129,9 +129,7 @@ def maximise(
     csm: ComplexArray,
     n_factors: int,
     *,
-    start: FloatArray | None = None,
     penalty: FloatArray | None = None,
-    max_iterations: int = MAX_ITERATIONS,
 ) -> Maximum:
     """Maximum likelihood noise PSD of every channel, at all frequencies at once.
 
@@ -141,14 +139,9 @@ def maximise(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``.
     n_factors : int
         Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= p``.
-    start : float64, shape (n_freqs, n_channels), optional
-        Noise PSD to start from; where it is not positive, and by default, the search starts
-        from ``(1 - q / (2 p)) / (S^-1)_ii``.
     penalty : float64, shape (n_channels, n_channels), optional
         Adds ``x' penalty x / 2``, x = ln psi, to the discrepancy: the precision of a Gaussian
         prior of x over the number of averages. Positive semidefinite, rows summing to zero.
-    max_iterations : int
-        After as many a frequency is reported as not converged.
 
     Returns
     -------
@@ -163,9 +156,11 @@ def maximise(
 
     Notes
     -----
-    Gradient ``sum_m (1 - w_m) |u_im|**2`` over the residual eigenvalues; Hessian after Clarke
-    (1970) carried over to complex matrices. Its expectation ``|P_ij|**2``, P the projector on
-    the residual eigenvectors, is the Fisher information of ln psi with A eliminated.
+    The search starts from ``(1 - q / (2 p)) / (S^-1)_ii``; a frequency that has not arrived after
+    `MAX_ITERATIONS` is reported as such. Gradient ``sum_m (1 - w_m) |u_im|**2`` over the residual
+    eigenvalues; Hessian after Clarke (1970) carried over to complex matrices. Its expectation
+    ``|P_ij|**2``, P the projector on the residual eigenvectors, is the Fisher information of
+    ln psi with A eliminated.
     """
     if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
         raise InvalidMatrixError(
@@ -190,19 +185,14 @@ def maximise(
     )
     if usable.any():
         partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
-        x0 = np.log(partial * (1 - n_factors / (2 * p)))
-        if start is not None:
-            given = start[usable]
-            x0 = np.where(given > 0, np.log(np.where(given > 0, given, 1.0)), x0)
         lowest = np.log(partial * BOUNDARY)
         _search(
             precision[usable],
-            np.maximum(x0, lowest),
+            np.log(partial * (1 - n_factors / (2 * p))),
             lowest=lowest,
             rounding=rounding[usable],
             found=found,
             where=np.flatnonzero(usable),
-            max_iterations=max_iterations,
         )
     return found
 
@@ -232,7 +222,6 @@ def _search(
     rounding: FloatArray,
     found: Maximum,
     where: IntArray,
-    max_iterations: int,
 ) -> None:
     """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
     q = found.n_factors
@@ -244,7 +233,7 @@ def _search(
     iterations = np.ones(n, np.int64)
     converged = decrement < DECREMENT
     going = np.flatnonzero(~converged)
-    for _ in range(max_iterations):
+    for _ in range(MAX_ITERATIONS):
         if not len(going):
             break
         size = np.abs(step[going]).max(axis=1)
