@@ -103,7 +103,8 @@ def test_the_estimators_do_what_the_theory_says(
 
 
 def test_motion_that_lacks_a_dimension_biases_nobody_who_feels_it_alike() -> None:
-    H = np.stack([rotation(np.random.default_rng(2), 2) for _ in range(3)])
+    rng = np.random.default_rng(2)
+    H = np.stack([rotation(rng, 2) for _ in range(60)]).reshape(20, 3, 2, 2)
     c = motion_csm(H, np.diag([1e4, 0.0]))
     np.testing.assert_allclose(three_sensor_bias(c, np.ones(6), dims=(2, 2, 2)), 0, atol=1e-8)
 
