@@ -54,7 +54,7 @@ class RejectionSettings:
         Deviations of the logarithmic power of a band above its running median, in standard
         deviations (1.4826 times the median absolute deviation, or the scatter of stationary noise
         where that is more). Twice as many below: logarithms of powers have a long lower tail.
-        Infinite: transients stay in.
+        Infinite: transients, and channels that stand still, stay in.
     start_up : int
         Segments that are judged by each other before there are earlier ones.
     memory : int
@@ -210,10 +210,11 @@ class SelectedSpectra:
             if clipped.any():
                 self._leave_out(Rejected(number, Reason.CLIPPED, int(np.argmax(clipped)), np.nan))
                 return False
-        still = _stands_still(segment)
-        if still.any():
-            self._leave_out(Rejected(number, Reason.TRANSIENT, int(np.argmax(still)), np.inf))
-            return False
+        if np.isfinite(self.rejection.threshold):
+            still = _stands_still(segment)
+            if still.any():
+                self._leave_out(Rejected(number, Reason.TRANSIENT, int(np.argmax(still)), np.inf))
+                return False
         if self._normal is None:
             self._held.append(_Held(number, segment.copy(), power))
             if len(self._held) == self.rejection.start_up:
@@ -285,13 +286,14 @@ class _Held:
 
 
 def _stands_still(segment: FloatArray) -> BoolArray:
-    """Return which channels are constant, to rounding, over `STILL` samples or more: (n_channels,).
+    """Return which channels hardly move over `STILL` samples or more: (n_channels,).
 
     Not those that are so from end to end: a channel may be dead for good.
     """
     if len(segment) <= STILL:
         return np.zeros(segment.shape[1], dtype=np.bool_)
-    moved = np.abs(np.diff(segment, axis=0)) > 1e-6 * segment.std(axis=0)
+    steps = np.abs(np.diff(segment, axis=0))
+    moved = steps > 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
     since = np.cumsum(moved, axis=0)
     since = np.concatenate([np.zeros_like(since[:1]), since])
     still = (since[STILL - 1 :] == since[: len(since) - STILL + 1]).any(axis=0)

@@ -137,6 +137,7 @@ def test_before_the_start_up_is_over_there_is_a_result_already() -> None:
 def test_turned_off_it_takes_everything() -> None:
     samples, starts = quiet(40)
     bump(samples, 2000, 0, 5.0)
+    samples[3000:3060, 1] = 0.0
     spectra = SelectedSpectra(
         SETTINGS, CHANNELS, rejection=RejectionSettings(threshold=float("inf"))
     )
