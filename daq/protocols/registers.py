@@ -330,7 +330,7 @@ class RegisterDecoder:
         at: HostTime,
     ) -> list[Block | Event]:
         before = instants[0] - round(self._period_ns)
-        if self._last_instant is not None and not restarted:
+        if self._last_instant is not None:  # instants are the host's, also where a clock restarts
             before = np.int64(self._last_instant)
         steps = np.diff(instants, prepend=before) / self._period_ns
         missing = np.where(steps > GAP, np.rint(steps) - 1, 0).astype(np.int64)

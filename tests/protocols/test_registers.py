@@ -175,6 +175,17 @@ def test_a_device_time_that_jumps_restarts_the_clock() -> None:
     assert found[1].flags == BlockFlag.CLOCK_RESTART
 
 
+def test_a_device_that_was_off_for_a_while_leaves_a_gap() -> None:
+    """One of several slaves on a bus: the session goes on without it."""
+    one = decoder(rate=4.0, time_address=2, time_format="uint32-s")
+    one.receive([0, 0, 0, 5000], host(0), host(0))
+    _, block = one.receive([0, 0, 0, 1], host(10_000), host(10_000))
+    assert isinstance(block, Block)
+    assert block.first_sample == 40
+    assert block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    assert block.reason == "39 polls without a reading"
+
+
 def test_the_ends_of_the_range_are_clipped() -> None:
     (block,) = decoder(rate=1.0).receive([0x7FFF], host(0), host(0))
     assert isinstance(block, Block)
