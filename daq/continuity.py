@@ -7,8 +7,9 @@ which counts the samples the sensor took, or should have taken, since its first.
 the two differ by a constant, and a jump of the index is a gap of exactly that length (unless the
 protocol itself says it is an estimate). Where a session begins, or a device restarts its sampling
 (``BlockFlag.CLOCK_RESTART``), the length of the gap comes from the device's UTC where both sides of
-the gap have it, and else from the host's clock, and then says that it is an estimate; the block
-after it carries ``CLOCK_RESTART``, because the phase of the sampling is new.
+the gap have it and the host's clock agrees within an hour (a device may send what it kept, or come
+back with a date of its own), and else from the host's clock, and then says that it is an estimate;
+the block after it carries ``CLOCK_RESTART``, because the phase of the sampling is new.
 
 Samples that were recorded already (late or repeated blocks) are never recorded twice.
 """
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 _NS = 1e9
+_HOUR = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +118,10 @@ class Continuity:
 
     def _missing_by_time(self, last: Block, block: Block) -> tuple[int, bool]:
         """Return how many samples lie between two blocks by their times, and if that is a guess."""
+        waited = (block.received.monotonic_ns - last.received.monotonic_ns) / _NS
         both = last.flags & block.flags & BlockFlag.DEVICE_UTC
         if both and last.device_counter is not None and block.device_counter is not None:
-            elapsed = (block.device_counter - last.device_counter) / _NS * self._rate
-            return max(0, round(elapsed) - last.n_samples), False
-        elapsed = (block.received.monotonic_ns - last.received.monotonic_ns) / _NS * self._rate
-        return max(0, round(elapsed) - block.n_samples), True
+            elapsed = (block.device_counter - last.device_counter) / _NS
+            if abs(elapsed - waited) <= _HOUR:  # negative where it sends again what is known
+                return round(elapsed * self._rate) - last.n_samples, False
+        return max(0, round(waited * self._rate) - block.n_samples), True

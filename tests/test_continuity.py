@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -75,6 +76,29 @@ def test_device_time_makes_it_exact() -> None:
     # 3.00 s later by the device; the host saw it late.
     placed = continuity.place(block(0, 10, 4.7, flags=utc, counter=10**18 + 3 * 10**9))
     assert placed.gap == Gap(10, 290, "stalled", estimated=False)
+
+
+def test_what_a_device_sends_again_after_a_break_is_recorded_once() -> None:
+    continuity = Continuity(RATE)
+    utc = BlockFlag.DEVICE_UTC
+    continuity.place(block(0, 200, 2.0, flags=utc, counter=10**18))
+    continuity.new_session("disconnected")
+    again = continuity.place(block(0, 100, 5.0, flags=utc, counter=10**18 + 10**9))
+    assert (again.block, again.gap, again.repeated) == (None, None, 100)
+    follows = continuity.place(block(100, 150, 5.1, flags=utc, counter=10**18 + 2 * 10**9))
+    assert follows.gap is None
+    assert follows.block is not None
+    assert follows.block.first_sample == 200
+
+
+@pytest.mark.parametrize("date", [0, 3 * 10**18])
+def test_a_device_that_returns_with_another_date_is_placed_by_host_time(date: int) -> None:
+    continuity = Continuity(RATE)
+    utc = BlockFlag.DEVICE_UTC
+    continuity.place(block(0, 10, 0.1, flags=utc, counter=10**18))
+    continuity.new_session("disconnected")
+    placed = continuity.place(block(0, 10, 5.3, flags=utc, counter=date))
+    assert placed.gap == Gap(10, 510, "disconnected", estimated=True)
 
 
 def test_a_reset_in_the_middle() -> None:
