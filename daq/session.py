@@ -161,11 +161,12 @@ class Connection:
         """Done when the first session is open, or could not be opened."""
         self.alive = False
         self._delay = FIRST_DELAY
+        self._said = ""
         self._clock = clock
 
     async def run(self, queue: asyncio.Queue[Item], go: asyncio.Event) -> None:
         """Connect once, wait for ``go``, then read until cancelled, reconnecting if need be."""
-        reason, said = "", ""
+        reason = ""
         while True:
             try:
                 async with self.driver.open(self.sensors, self._clock) as session:
@@ -178,7 +179,12 @@ class Connection:
                         text = self._describe(session, name)
                         await queue.put(Event(name, "connected", text, self._clock.now()))
                     self.alive = True
-                    await self._forward(session, queue)
+                    try:
+                        await self._forward(session, queue)
+                    except Exception as error:
+                        # At once: the driver may have a last word to a device that is gone.
+                        reason = await self._say(error, queue)
+                        raise
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
             except (DeviceError, RemoteProtocolError) as error:
                 failure = error
@@ -191,16 +197,21 @@ class Connection:
             if not self.connected.done():
                 self.connected.set_exception(failure)
                 return
-            kind = _kind(failure)
-            reason = kind if self.alive else reason
             # Said once, not at every attempt: a device may be away for weeks.
-            if self.alive or (kind == "refused" and str(failure) != said):
-                said = str(failure)
-                for name in self.names:
-                    await queue.put(Event(name, kind, said, self._clock.now()))
-            self.alive = False
+            if self.alive:
+                reason = await self._say(failure, queue)
+            elif _kind(failure) == "refused" and str(failure) != self._said:
+                await self._say(failure, queue)
             await asyncio.sleep(self._delay)
             self._delay = min(2 * self._delay, LONGEST_DELAY)
+
+    async def _say(self, failure: Exception, queue: asyncio.Queue[Item]) -> str:
+        """Record that the device is lost, and why; return the kind of the event."""
+        self.alive = False
+        kind, self._said = _kind(failure), str(failure)
+        for name in self.names:
+            await queue.put(Event(name, kind, self._said, self._clock.now()))
+        return kind
 
     async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
         """Hand on what the session yields; raise if nothing comes for too long."""

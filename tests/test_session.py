@@ -1,0 +1,65 @@
+"""One port kept connected: what is said, and when."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, cast
+
+from daq.errors import NoAnswerError
+from daq.protocols.block import Event
+from daq.session import Connection
+from tests.devices import ManualClock, PlayedDevice, PlayedDriver, PlayedSession, bench
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from daq.bench import Sensor
+    from daq.clock import HostClock
+    from daq.drivers.base import DriverType
+    from daq.session import Item
+
+
+class SlowToLeave(PlayedDriver):
+    """Leaves a device only when the test lets it."""
+
+    def __init__(self, devices: dict[str, PlayedDevice]) -> None:
+        super().__init__(devices)
+        self.may_leave = asyncio.Event()
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[PlayedSession]:
+        """Open a session; wait at its end."""
+        async with super().open(sensors, clock) as session:
+            try:
+                yield session
+            finally:
+                await self.may_leave.wait()
+
+
+async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
+    """A LabJack is told to stop its stream, and one that is gone takes 2 s not to answer."""
+    device = PlayedDevice()
+    driver = SlowToLeave({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, ManualClock())
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    device.items.put_nowait(NoAnswerError("no samples"))
+    kinds: list[str] = []
+    async with asyncio.timeout(5):
+        while "stalled" not in kinds:
+            item = await queue.get()
+            kinds += [item.kind] if isinstance(item, Event) else []
+        driver.may_leave.set()
+        device.opened.clear()
+        await device.opened.wait()
+        while kinds.count("connected") < 2:
+            item = await queue.get()
+            kinds += [item.kind] if isinstance(item, Event) else []
+    running.cancel()
+    await asyncio.wait([running])
+    assert kinds == ["connected", "stalled", "connected"]
