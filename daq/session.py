@@ -28,6 +28,8 @@ FIRST_PATIENCE = 10.0
 LONGEST_FIRST_BLOCK = 1100
 """Samples a first block may have: one block of GCF holds up to a thousand."""
 LEAST_PATIENCE = 0.5
+LATENESS = 0.25
+"""What a block may come late by, s: one that is lost whole must not look like a stall."""
 FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
 
 
@@ -55,7 +57,7 @@ class _Patience:
     @property
     def seconds(self) -> float:
         """From the last block on."""
-        return max(LEAST_PATIENCE, 2 * self._longest) if self._begun else self._first
+        return max(LEAST_PATIENCE, 2 * self._longest + LATENESS) if self._begun else self._first
 
     def block_came(self, now: float, duration: float) -> None:
         """Learn from a block and the time its samples took; what was long is forgotten slowly."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from daq.errors import NoAnswerError
 from daq.protocols.block import Event
-from daq.session import Connection
+from daq.session import Connection, _Patience
 from tests.devices import ManualClock, PlayedDevice, PlayedDriver, PlayedSession, bench
 
 if TYPE_CHECKING:
@@ -63,3 +63,11 @@ async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
     running.cancel()
     await asyncio.wait([running])
     assert kinds == ["connected", "stalled", "connected"]
+
+
+def test_one_lost_block_is_no_stall() -> None:
+    """The next of a second each comes two seconds after the last, and a little: no sooner."""
+    patience = _Patience(0.0, 10.0)
+    for second in range(1, 6):
+        patience.block_came(float(second), 1.0)
+    assert 2.1 < patience.seconds <= 2.5
