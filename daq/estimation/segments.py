@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter, deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -32,6 +32,7 @@ _Piece = TypeVar("_Piece")
 _Read = TypeVar("_Read")
 
 _VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
+_READERS = 2  # pieces being read while one is worked on
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
@@ -253,17 +254,18 @@ def _stands_still(samples: FloatArray) -> NDArray[np.bool_]:
 
 
 def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
-    """Read pieces in order, the next one while the one before is worked on."""
+    """Read pieces in order, the next ones while the one before is worked on."""
     if len(pieces) < 2:
         yield from map(read, pieces)
         return
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(read, pieces[0])
-        for following in pieces[1:]:
-            piece = coming.result()
-            coming = pool.submit(read, following)
-            yield piece
-        yield coming.result()
+    with ThreadPoolExecutor(_READERS) as pool:
+        coming: deque[Future[_Read]] = deque()
+        for piece in pieces:
+            coming.append(pool.submit(read, piece))
+            if len(coming) > _READERS:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
 
 
 def _utc_ns(instant: datetime | None) -> int | None:

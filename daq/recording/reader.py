@@ -18,6 +18,7 @@ from daq.bench import parse
 from daq.errors import BenchFileError, NotARecordingError, RecordingError
 from daq.protocols.block import Event, HostTime
 from daq.recording import layout
+from daq.recording.chunks import ChunkedRows
 from daq.recording.locking import is_being_written
 from daq.recording.superblock import ClearedFile, Superblock
 
@@ -79,6 +80,8 @@ class SensorRecord:
         self.dtype: np.dtype[Any] = self._samples.dtype
         self.chunk_rows: int = self._samples.chunks[0]
         """Rows a chunk holds: reading multiples of it is fastest."""
+        self._sample_rows = ChunkedRows(self._samples)
+        self._instant_rows = ChunkedRows(self._instants)
         self._blocks = _Rows(group["blocks"])
         self._gaps = _Rows(group["gaps"])
         self._n_blocks = 0
@@ -124,7 +127,7 @@ class SensorRecord:
         RecordingError
             If the file is damaged there.
         """
-        return self._read(self._samples, first_row, last_row)
+        return self._read(self._sample_rows, first_row, last_row)
 
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Return the host monotonic instants of samples, in ns, of a polled sensor.
@@ -138,9 +141,9 @@ class SensorRecord:
         """
         if not self.polled:
             raise RecordingError(f"sensor {self.name!r} has no instants of single samples")
-        return self._read(self._instants, first_row, last_row)
+        return self._read(self._instant_rows, first_row, last_row)
 
-    def _read(self, dataset: h5py.Dataset, first_row: int, last_row: int | None) -> NDArray[Any]:
+    def _read(self, rows: ChunkedRows, first_row: int, last_row: int | None) -> NDArray[Any]:
         last_row = self.n_samples if last_row is None else last_row
         if not 0 <= first_row <= last_row <= self.n_samples:
             raise IndexError(
@@ -148,13 +151,12 @@ class SensorRecord:
                 " committed"
             )
         try:
-            rows: NDArray[Any] = dataset[first_row:last_row]
+            return rows.read(first_row, last_row)
         except (OSError, RuntimeError) as error:
             raise RecordingError(
-                f"{dataset.file.filename}: sensor {self.name!r} is damaged between rows"
+                f"{self._samples.file.filename}: sensor {self.name!r} is damaged between rows"
                 f" {first_row} and {last_row}: {error}"
             ) from error
-        return rows
 
     def take(self, counts: NDArray[np.int64]) -> bool:
         """Take over what was committed (a row of ``/committed``); return whether that is news."""
