@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -270,3 +271,47 @@ def test_all_methods_a_part_of_the_time_and_csv(tst: Path, tmp_path: Path) -> No
     header, first = csv.read_text(encoding="utf-8").splitlines()[:2]
     assert header.startswith("frequency (Hz),XX.TST5.00.BH0 data ((m/s)²/Hz)")
     assert len(header.split(",")) == len(first.split(",")) == 1 + 9 * (1 + 4 * len(methods))
+
+
+def test_the_report_shows_the_angles_and_where_the_model_test_fails(
+    tst: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "result.json"
+    options = ("--segment", "102.4s", "--unit", "m/s²", "--json", str(out))
+    said = " ".join(huddle("estimate", str(tst), *options).split())
+    shown = [float(angle) for angle in re.findall(r"(\d\.\d+)°", said)]
+    assert shown == pytest.approx([2.242, 3.400, 1.158], abs=0.05)
+    assert re.search(r"model test fails at .* Hz \(\d", said)
+    found = json.loads(out.read_text(encoding="utf-8"))["diagnostics"]
+    failing = [band for band in found["bands"] if band["test"]["p_value"] < 0.01]
+    assert any(band["low"] < 0.3 < band["high"] for band in failing)  # the microseism
+    assert [pair["horizontal_deg"] for pair in found["responses"]] == pytest.approx(shown, abs=1e-3)
+    long = huddle("estimate", str(tst), *options, "--diagnostics")
+    assert "XX.TST5.00 → XX.TST5.10" in long
+
+
+def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -> None:
+    for options in (
+        ("--octaves", "--reject"),
+        ("--dimension", "2", "--method", "three-sensor"),
+        ("--dimension", "many"),
+        ("--gain", "Q=2"),
+        ("--gain", "XX.TST5.10"),
+        ("--gain", "XX.TST5.10=0"),
+    ):
+        huddle("estimate", str(tst), *options, code=2)
+
+
+def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
+    document = result_of(
+        tst, "--end", "2h", "--octaves", "--dimension", "auto", "--unit", "m/s²", "--reject",
+        "--no-reject",
+    )  # fmt: skip
+    assert document["method"] == "maximum-likelihood"
+    frequency = document["frequency_hz"]
+    assert frequency == sorted(frequency)
+    assert frequency[1] <= 0.01
+    assert frequency[-1] == 20.0
+    octaves = document["diagnostics"]["octaves"]
+    assert octaves[0]["segment"] > 100 * 0.99
+    assert len(document["diagnostics"]["dimension"]) >= len(octaves)
