@@ -203,11 +203,8 @@ def _replaced(path: Path) -> Iterator[Path]:
     try:
         shutil.copyfile(path, copy)
         yield copy
-        handle = os.open(copy, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        with copy.open("r+b") as written:  # Windows syncs only what may be written
+            os.fsync(written)
         copy.replace(path)
         sync_directory(path.parent)
     except RecordingError:

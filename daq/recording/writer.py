@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 import uuid
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -115,7 +116,8 @@ class RecordingWriter:
         path = Path(path)
         if path.exists():
             raise RecordingError(f"{path}: exists already; expected a new file")
-        temporary = path.with_name(f".{path.name}.new")
+        renames = os.name != "nt"  # Windows renames no file that is open
+        temporary = path.with_name(f".{path.name}.new") if renames else path
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             # Little cache: chunks are written whole and never looked at again.
@@ -126,7 +128,8 @@ class RecordingWriter:
                 file.swmr_mode = True
                 writer = cls(path, file, sensors, WriterLock(temporary))
                 writer._sync()
-                temporary.rename(path)
+                if renames:
+                    temporary.rename(path)
                 sync_directory(path.parent)
             except BaseException:
                 with contextlib.suppress(OSError, RuntimeError):
@@ -327,7 +330,9 @@ def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int)
 
 
 def sync_directory(path: Path) -> None:
-    """Make a new name in a directory survive a power loss."""
+    """Make a new name in a directory survive a power loss (Windows has no way to ask for it)."""
+    if sys.platform == "win32":
+        return
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
