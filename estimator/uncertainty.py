@@ -84,7 +84,8 @@ def score_interval(
         square = 1 - kappa * curvature
         root = np.sqrt(np.maximum((kappa * slope) ** 2 + square * kappa * t2, 0.0))
         reach = root - side * kappa * slope
-        bounded = (reach > 0) & ((side < 0) | (square > 0))
+        # with one average or less the expansion for skewness has lost its meaning
+        bounded = (reach > 0) & ((side < 0) | ((square > 0) & (averages > 1)))
         distance = np.full_like(t2, np.inf)
         np.divide(kappa * t2, reach, out=distance, where=bounded)
         ends.append(noise + side * np.where(certain, 0.0, distance))
