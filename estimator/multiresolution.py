@@ -16,13 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.methods import self_noise
-from estimator.self_noise import SelfNoise
 from estimator.spectra import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from estimator.arrays import BoolArray, ComplexArray, FloatArray
 
 LOW, HIGH = 0.2, 0.4  # of its own rate: the octave that a stage contributes
@@ -164,43 +160,6 @@ class MultiResolution:
                 )
             )
         return tuple(bands)
-
-
-def self_noise_by_band(
-    method: str,
-    bands: tuple[Band, ...],
-    *,
-    dims: tuple[int, ...],
-    correct: bool = True,
-    **options: Any,  # noqa: ANN401 - each method's own
-) -> tuple[FloatArray, SelfNoise]:
-    """Self-noise PSD over all bands, each with its own number of averages.
-
-    Parameters
-    ----------
-    method, dims, correct, **options
-        As `estimator.methods.self_noise` takes them.
-    bands : tuple of Band
-        As `MultiResolution.bands` returns them.
-
-    Returns
-    -------
-    frequencies : float64, shape (n_freqs,)
-        Of all bands, ascending.
-    SelfNoise
-        At these frequencies.
-    """
-    results = [
-        self_noise(
-            method, band.csm, dims=dims, n_effective=band.n_effective, correct=correct, **options
-        )
-        for band in bands
-    ]
-    joined = (
-        np.concatenate([getattr(result, name) for result in results])
-        for name in ("noise_psd", "cov", "low", "high", "flags")
-    )
-    return np.concatenate([band.frequencies for band in bands]), SelfNoise(method, *joined)
 
 
 class _Stage:
