@@ -132,6 +132,14 @@ def test_an_unusable_frequency_is_left_out_of_the_pool() -> None:
     assert np.isnan(pool(test, np.array([False, True, False])).p_value)
 
 
+def test_pooling_allows_for_correlated_neighbours() -> None:
+    """Amplitudes correlated by 0.5 and statistics by its square: the sum of 10 is that of fewer."""
+    test = ModelTest(np.full(10, 13.0), np.full(10, 10.0), np.full(10, 0.2))
+    spread = 1 + 2 * 9 * 0.5**2 / 10
+    band = pool(test, np.ones(10, np.bool_), neighbours=np.array([0.5]))
+    assert band.p_value == pytest.approx(stats.chi2.sf(130 / spread, 100 / spread))
+
+
 def test_refuses_a_model_with_nothing_left_to_test() -> None:
     draws = wishart(bench((3, 3, 3)), 50, np.random.default_rng(7))
     with pytest.raises(InsufficientDataError, match="nothing is left"):
