@@ -5,20 +5,23 @@ No clock and no event loop: the recorder calls it from its writing thread.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import defaultdict
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daq.continuity import Continuity, Gap
 from daq.protocols.block import Block, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from daq.protocols.block import HostTime
     from daq.recording.writer import Committed, RecordingWriter
     from daq.session import Connected, Item
 
 _SAY_INTERVAL_NS = 1_000_000_000
+MOST_ALIKE = 20
+"""Events of one kind of one sensor that are written of each second."""
 LOST_KINDS = frozenset({"disconnected", "refused", "stalled"})
 
 
@@ -45,12 +48,39 @@ class _Sensor:
         self.said_ns = -_SAY_INTERVAL_NS
 
 
+class _Alike:
+    """Events of one kind of one sensor: a line full of noise must not fill the file."""
+
+    def __init__(self) -> None:
+        self._since_ns = -_SAY_INTERVAL_NS
+        self._n = 0
+
+    def take(self, event: Event) -> Iterator[Event]:
+        """Yield what is to be written."""
+        if event.kind == "mark":  # a person's words
+            yield event
+            return
+        now_ns = event.received.monotonic_ns
+        if now_ns - self._since_ns >= _SAY_INTERVAL_NS:
+            yield from self.left_out(event)
+            self._since_ns, self._n = now_ns, 0
+        self._n += 1
+        if self._n <= MOST_ALIKE:
+            yield event
+
+    def left_out(self, event: Event) -> Iterator[Event]:
+        """Yield how many were left out, as an event like this one."""
+        if self._n > MOST_ALIKE:
+            yield replace(event, text=f"{self._n - MOST_ALIKE} more of these before")
+
+
 class Intake:
     """The one who writes a recording's rows."""
 
     def __init__(self, writer: RecordingWriter, sampling_rates: Mapping[str, float]) -> None:
         self._writer = writer
         self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
+        self._alike: defaultdict[tuple[str, str], _Alike] = defaultdict(_Alike)
 
     def take(self, items: Iterable[Item]) -> None:
         """Write what came, in order.
@@ -64,7 +94,8 @@ class Intake:
             if isinstance(item, Block):
                 self._block(item)
             elif isinstance(item, Event):
-                self._writer.event(item)
+                for event in self._alike[item.sensor, item.kind].take(item):
+                    self._writer.event(event)
                 if item.kind in LOST_KINDS and item.sensor in self._sensors:
                     self._sensors[item.sensor].state = "lost"
             else:
@@ -81,6 +112,9 @@ class Intake:
                 gap = sensor.continuity.lost_until(now, "lost at the end")
                 if gap is not None:
                     self._gap(name, sensor, gap)
+        for (name, kind), alike in self._alike.items():
+            for event in alike.left_out(Event(name, kind, "", now)):
+                self._writer.event(event)
         self._writer.event(Event("", "stopped", reason, now))
         return self._writer.close()
 

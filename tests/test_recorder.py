@@ -13,6 +13,7 @@ import pytest
 
 from daq.control import ControlRefusedError, ask
 from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDeviceError
+from daq.intake import MOST_ALIKE
 from daq.protocols.block import Event
 from daq.recorder import Status, record, recording_path
 from daq.recording.healing import verify
@@ -336,6 +337,21 @@ async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
         assert ("a", "checksum", "2 frames") in [
             (e.sensor, e.kind, e.text) for e in recording.events
         ]
+
+
+async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        now = run.clock.now()
+        for k in range(1000):
+            run.device("a").items.put_nowait(Event("a", "checksum", f"noise {k}", now))
+        run.device("a").items.put_nowait(Event("a", "status", "another kind", now))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        texts = [e.text for e in recording.events if e.sensor == "a" and e.kind != "connected"]
+    expected = [f"noise {k}" for k in range(MOST_ALIKE)]
+    assert texts == [*expected, "another kind", f"{1000 - MOST_ALIKE} more of these before"]
 
 
 FULL_DISK = """
