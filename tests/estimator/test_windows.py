@@ -53,6 +53,8 @@ def test_few_segments_are_worth_no_more_than_their_number() -> None:
     assert effective_averages(window, 25, 0) == 0
     assert effective_averages(window, 25, 1) == 1
     assert effective_averages(np.ones(100), 100, 1080) == 1080
+    # two overlapping by half: correlated once, by (1/6)**2
+    assert effective_averages(window, 50, 2) == pytest.approx(2 / (1 + 1 / 36))
     worth = [effective_averages(window, 25, n) for n in range(1, 9)]
     assert np.all(np.diff(worth) > 0)
     assert np.all(np.array(worth) <= np.arange(1, 9))
