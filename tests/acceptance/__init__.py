@@ -1,0 +1,1 @@
+"""Whole huddle tests with everything going wrong."""
