@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MOST_WAITING = 8192
 """Datagrams received and not yet asked for; the oldest are dropped beyond."""
 
+_MOST_STRANGERS = 16
+
 
 class DatagramStream(asyncio.DatagramProtocol):
     """The datagrams of one UDP port. Made by :func:`open_datagrams`."""
@@ -33,14 +35,22 @@ class DatagramStream(asyncio.DatagramProtocol):
         self._waiting: deque[tuple[bytes, HostTime]] = deque(maxlen=MOST_WAITING)
         self._arrived = asyncio.Event()
         self._failure: Exception | None = None
+        self._sender: str | None = None
+        self.strangers: set[str] = set()
+        """Hosts other than the first whose datagrams were left out."""
         self._transport: asyncio.DatagramTransport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
         self._transport = cast("asyncio.DatagramTransport", transport)
 
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:  # noqa: ARG002
-        """Keep a datagram and when it came."""
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Keep a datagram and when it came; two hosts would make one sensor of two devices."""
+        self._sender = self._sender or addr[0]
+        if addr[0] != self._sender:
+            if len(self.strangers) < _MOST_STRANGERS:
+                self.strangers.add(addr[0])
+            return
         self._waiting.append((data, self._clock.now()))
         self._arrived.set()
 

@@ -21,7 +21,7 @@ from daq.datagrams import open_datagrams
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols import text
-from daq.protocols.block import Block
+from daq.protocols.block import Block, Event
 from daq.protocols.text import TextDecoder, TextFormat
 from daq.transport import open_port
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from daq.bench import Sensor
     from daq.clock import HostClock
     from daq.datagrams import DatagramStream
-    from daq.protocols.block import Event
     from daq.transport import ByteStream
 
 PRESETS = {"raspberry-shake": text.RASPBERRY_SHAKE, "lily": text.LILY, "none": TextFormat()}
@@ -131,13 +130,20 @@ class _StreamSource:
 
 
 class _DatagramSource:
-    def __init__(self, stream: DatagramStream, decoder: TextDecoder) -> None:
+    def __init__(self, stream: DatagramStream, decoder: TextDecoder, sensor: str) -> None:
         self._stream = stream
         self._decoder = decoder
+        self._sensor = sensor
+        self._told: set[str] = set()
 
     async def receive(self) -> list[Block | Event]:
         received, at = await self._stream.read()
-        return self._decoder.receive_datagram(received, at)
+        found = self._decoder.receive_datagram(received, at)
+        for host in sorted(self._stream.strangers - self._told):
+            self._told.add(host)
+            text = f"datagrams from {host} are left out: another device sends to this port"
+            found.append(Event(self._sensor, "status", text, at))
+        return found
 
     async def send(self, payload: bytes) -> None:
         """Do nothing: it listens only."""
@@ -217,7 +223,7 @@ class TextDriver:
             sensor=sensor.name,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
         )
-        async with _opened(sensor.port, clock, settings, decoder, label=label) as source:
+        async with _opened(sensor, clock, settings, decoder, label=label) as source:
             try:
                 yield TextSession(
                     source,
@@ -234,11 +240,12 @@ class TextDriver:
 
 @contextlib.asynccontextmanager
 async def _opened(
-    port: str, clock: HostClock, settings: TextSettings, decoder: TextDecoder, *, label: str
+    sensor: Sensor, clock: HostClock, settings: TextSettings, decoder: TextDecoder, *, label: str
 ) -> AsyncIterator[_Source]:
+    port = sensor.port
     if port.startswith("udp://"):
         async with open_datagrams(port, clock, listen=True, label=label) as datagrams:
-            yield _DatagramSource(datagrams, decoder)
+            yield _DatagramSource(datagrams, decoder, sensor.name)
     else:
         async with open_port(
             port, clock, label=label, baud_rate=settings.baud_rate, parity=settings.parity

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
-from daq.protocols.block import BlockFlag
+from daq.protocols.block import BlockFlag, Event
+from daq.transport import host_and_port
 from sim_devices import launch
 from tests.drivers import reading
 from tests.sim_devices.bench import device, scenario, sensors, spec
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.bench import Sensor
-    from daq.protocols.block import Block, Event
+    from daq.protocols.block import Block
     from sim_devices.launch import RunningDevice
 
 SPEED = 4.0
@@ -100,6 +102,30 @@ async def test_every_format_brings_every_sample(
         truth = type(scenario("A")).from_dict(world).samples("A", 0, 12_000) * COUNTS
         start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
         assert np.abs(truth[start : start + n] - counts).max() <= 0.5
+
+
+async def test_another_device_on_the_same_port_is_left_out(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    one = sensor(running, 0)
+    counts: list[int] = []
+    said = ""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        try:
+            other.bind(("127.0.0.2", 0))
+        except OSError:
+            pytest.skip("this system has one loopback address only")
+        async with reading.reading(DRIVER, [one], speed=SPEED) as items:
+            async for item in items:
+                if isinstance(item, Event):
+                    said = item.text
+                    break
+                counts += item.counts[:, 0].tolist()
+                where = host_and_port(one.port)
+                other.sendto(b"{'EHZ', 1582315130.292, 777777777, 777777777}", where)
+    assert said == "datagrams from 127.0.0.2 are left out: another device sends to this port"
+    assert counts
+    assert 777777777 not in counts
 
 
 async def test_a_quiet_device_is_started_and_stopped(running: tuple[RunningDevice, ...]) -> None:
