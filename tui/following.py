@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from daq.estimation import Settings, Snapshot
 
 LEAST_INTERVAL = 0.5
+LONGEST_INTERVAL = 5.0
 SHARE = 0.05
-"""Of the time, at most, that following may take."""
+"""Of one core, at most, that following may take."""
 
 
 def follow(
@@ -36,7 +37,7 @@ def follow(
     try:
         with Estimation([path], settings) as estimation:
             while not ended.is_set():
-                began = time.perf_counter()
+                began = time.thread_time()
                 estimation.update()
                 snapshot = estimation.snapshot()
                 if snapshot.closed:
@@ -45,6 +46,7 @@ def follow(
                     on_snapshot(snapshot, estimation.settings)
                     return
                 on_snapshot(snapshot, estimation.settings)
-                ended.wait(max(LEAST_INTERVAL, (time.perf_counter() - began) / SHARE))
+                pause = (time.thread_time() - began) / SHARE
+                ended.wait(min(max(LEAST_INTERVAL, pause), LONGEST_INTERVAL))
     except (HuddleError, EstimatorError, OSError) as error:
         on_trouble(str(error))

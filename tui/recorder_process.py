@@ -100,8 +100,20 @@ class RecorderProcess:
             return
         self._said.seek(0)
         lines = [line.removeprefix("huddle: ").rstrip() for line in self._said]
-        said = "\n".join(line for line in lines if line) or f"the recorder was ended by {code}"
+        said = "\n".join(line for line in lines if line) or self._how_it_ended(code)
         raise RecorderFailedError(said, code if code in {2, 3} else 3)
+
+    def _how_it_ended(self, code: int) -> str:
+        if code > 0:
+            return f"the recorder ended with exit code {code} and said nothing"
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = "unknown"
+        return (
+            f"the recorder was killed (signal {-code}, {name}); what it had acknowledged is safe: "
+            f"huddle repair {self.out} checks it, huddle estimate reads it; start anew to go on"
+        )
 
     def interrupt(self) -> None:
         """Ask it to stop by a signal, where the control channel does not answer."""
@@ -112,12 +124,19 @@ class RecorderProcess:
 
     def stop(self) -> None:
         """Stop it and wait until it has closed its file."""
-        if not self.ended:
-            self.request_stop()
+        self.request_stop()
         self.wait()
+
+    def ends_within(self, timeout: float) -> bool:
+        """Wait this long (s), or until the process is gone; return whether it is."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout)
+        return self.ended
 
     def request_stop(self) -> None:
         """Ask it to stop: over the control channel, or by a signal where that does not answer."""
+        if self.ended:
+            return
         try:
             ask(self.out, "stop")
         except HuddleError:
@@ -126,9 +145,7 @@ class RecorderProcess:
 
     def wait(self, timeout: float = STOP_TIMEOUT) -> None:
         """Wait until it has ended; kill it if it does not."""
-        try:
-            self._process.wait(timeout)
-        except subprocess.TimeoutExpired:
+        if not self.ends_within(timeout):
             self._process.kill()
             self._process.wait()
 

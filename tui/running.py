@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 INTERVAL = 0.5
+LONGEST_INTERVAL = 5.0
 SHARE = 0.03
-"""Of the time, at most, that estimating live may take."""
+"""Of one core, at most, that estimating live may take."""
 
 
 def run_test(
@@ -75,15 +76,15 @@ def run_test(
             snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
         )
         recorder.check()
-        if interrupted:
-            raise typer.Exit(INTERRUPTED)
-        if not met:
-            raise typer.Exit(LIMIT_NOT_MET)
-    except KeyboardInterrupt:
+    except BaseException:
         recorder.request_stop()
         raise
     finally:
         recorder.close()
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if not met:
+        raise typer.Exit(LIMIT_NOT_MET)
 
 
 def follow_to_end(
@@ -102,30 +103,28 @@ def follow_to_end(
     interrupted : bool
         Whether Ctrl-C was pressed.
     """
-    interrupted = False
+    interrupted, snapshot = False, None
     with Estimation([recorder.out], settings) as estimation, _progress() as show:
         while True:
             try:
-                began = time.perf_counter()
+                began = time.process_time()
                 gone = recorder.ended  # looked at first: what it wrote last is then seen
-                estimation.update()
-                snapshot = estimation.snapshot()
-                show(snapshot, settings, duration)
-                if snapshot.closed:
-                    break
-                if gone:
-                    notices().print("[red]the recorder was ended from outside")
-                    break
-                if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
-                    recorder.request_stop()
-                time.sleep(max(INTERVAL, (time.perf_counter() - began) / SHARE))
+                if estimation.update() or gone or snapshot is None:
+                    snapshot = estimation.snapshot()
+                    show(snapshot, settings, duration)
+                    if gone:
+                        break
+                    if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
+                        recorder.request_stop()
+                pause = (time.process_time() - began) / SHARE
+                recorder.ends_within(min(max(INTERVAL, pause), LONGEST_INTERVAL))
             except KeyboardInterrupt:
                 if interrupted:
                     raise
                 interrupted = True
                 recorder.request_stop()
-        recorder.wait()
         if not snapshot.closed:
+            notices().print("[red]the recorder was ended from outside")
             heal(recorder.out)
     with Estimation([recorder.out], settings) as estimation:
         return estimation.finish(), interrupted
@@ -164,6 +163,7 @@ def _progress() -> Iterator[Callable[[Snapshot, Settings, float | None], None]]:
         BarColumn(bar_width=24),
         TextColumn("{task.fields[state]}"),
         console=notices(),
+        refresh_per_second=2,
         transient=True,
     ) as bar:
         task = bar.add_task("0:00", total=None, state="")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_text
+import math
 import sys
 import threading
 from pathlib import Path
@@ -55,10 +56,9 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:
     state = "ended" if snapshot.closed else time_left(snapshot.time_left)
-    return (
-        f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  "
-        f"c.o.v. {reached_cov(snapshot, settings):.3f}  {state}"
-    )
+    cov = reached_cov(snapshot, settings)
+    known = "" if math.isnan(cov) else f"c.o.v. {cov:.3f}  "
+    return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 
 def _update(snapshot: Snapshot, settings: Settings) -> dict[str, Any]:
