@@ -18,6 +18,7 @@ next level tells, since the device makes samples at a known rate meanwhile.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -82,7 +83,7 @@ class FifoDecoder:
         self._started = False
         self._next = 0
         self._caught_up = (0, 0)  # sample that followed when the FIFO was last read up, and when
-        self._full: tuple[int, int] | None = None  # words before the gap, index after it
+        self._full: deque[tuple[int, int]] = deque()  # words before each gap, index after it
         self._last: HostTime | None = None
         self._rows: list[NDArray[np.int16]] = []
         self._n_rows = 0
@@ -128,12 +129,12 @@ class FifoDecoder:
         level = int(registers[0]) + (self._asked if self._header == "left" else 0)
         found = self._resolve_doubt(level, at)
         if self._capacity is not None and level >= self._capacity and self._started:
-            if self._full is None:
+            if not self._full:
                 text = f"{level} words wait: the FIFO is full and samples were dropped"
                 found.append(Event(self._sensor, "overflow", text, at))
             index, since = self._caught_up
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
-            self._full = (level, index)
+            self._full.append((level, index))
         self.level = max(0, level - self._asked)
         self._last = at
         found += self._take(registers[1:].view(np.int16), at)
@@ -146,14 +147,13 @@ class FifoDecoder:
             self._caught_up = (self.level // self._n_channels, at.monotonic_ns)
             return []
         found: list[Block | Event] = []
-        if self._full is not None:
-            n_old, index = self._full
-            old, words = words[:n_old], words[n_old:]
+        while self._full and len(words):
+            old, words = words[: self._full[0][0]], words[self._full[0][0] :]
             self._gather(old)
-            self._full = (n_old - len(old), index)
-            if n_old == len(old):
+            self._full = deque((n_words - len(old), index) for n_words, index in self._full)
+            if not self._full[0][0]:
+                _, index = self._full.popleft()
                 found += self._hand_over(at)
-                self._full = None
                 self._skip_to(max(self._next, index), "FIFO full")
         self._gather(words)
         if caught_up or self._n_rows >= BLOCK_SAMPLES:

@@ -229,6 +229,24 @@ def test_an_overflow_is_a_gap_of_estimated_length(header: Header) -> None:
     assert any(isinstance(e, Event) and e.kind == "overflow" for e in found)
 
 
+@pytest.mark.parametrize("header", ["size", "left"])
+def test_a_fifo_that_stays_full_loses_a_little_each_time(header: Header) -> None:
+    """100 samples are made between two reads of 41: each is where host time has it."""
+    device = Device(header, capacity=3000)
+    decoder = FifoDecoder("A", 100_000.0, header=header, capacity=3000)
+    found: list[Block | Event] = []
+    for i in range(200):
+        device.advance(100 if i > 5 else 10)
+        found += decoder.receive(device.answer(decoder.request()), at(i * 1e-3))
+    assert device.dropped > 5000
+    assert sum(isinstance(item, Event) for item in found) == 1
+    index, counts = numbered(found)
+    made = counts[:, 0].astype(int)
+    assert sum(isinstance(b, Block) and b.reason == "FIFO full" for b in found) > 50
+    late = np.array(index) - made
+    assert np.ptp(late[made > made[-1] - 5000]) <= 100
+
+
 def test_refusals_are_told() -> None:
     decoder = FifoDecoder("A", RATE)
     decoder.request()
