@@ -106,7 +106,6 @@ async def test_blocks_are_in_order_and_whole(served: dict[str, RunningDevice], d
             assert block.instants_ns is None or np.all(np.diff(block.instants_ns) > 0)
             end, at = block.end_sample, block.received.monotonic_ns
         assert np.concatenate([block.counts for block in blocks]).std(axis=0).min() > 0
-        assert sum(block.n_samples for block in blocks) > end / 2
 
 
 @pytest.mark.parametrize("driver", CASES)
