@@ -60,6 +60,8 @@ FATAL = {
     BUFFER_FULL: "the buffer is full",
 }
 DUMMY = 0xFFFF
+REPEATED = 2
+"""How far behind the last scan repeated scans may be, s; beyond, the timer was set anew."""
 MAX_SAMPLES = 512
 MAX_CR_SAMPLES = 251
 TIMER_ADDRESSES = (CORE_TIMER, STREAM_DATA_CAPTURE_16)
@@ -321,6 +323,7 @@ class StreamDecoder:
         """Make the scans gathered so far into a block for each sensor."""
         scans = np.concatenate(rows) if rows else np.empty((0, self._n_columns), np.uint16)
         rows.clear()
+        scans = scans[self._n_repeated(scans) :]
         if not len(scans):
             return []
         counter = self._place(scans, at)
@@ -335,6 +338,13 @@ class StreamDecoder:
             own = flags | BlockFlag.CLIPPED if clipped else flags
             blocks.append(Block(name, first, counts, at, counter, own, reason))
         return blocks
+
+    def _n_repeated(self, scans: NDArray[np.uint16]) -> int:
+        """Return how many scans lead that the timer says came before, when their packet did."""
+        if not self._timed or self._timer is None or not len(scans):
+            return 0
+        behind = (self._timer - (int(scans[0, 0]) | int(scans[0, 1]) << 16)) % _WRAP
+        return behind // self._ticks + 1 if behind < REPEATED * CORE_HZ else 0
 
     def _place(self, scans: NDArray[np.uint16], at: HostTime) -> int | None:
         """Put the scans in their place by timer or host time; return the timer of the first."""
