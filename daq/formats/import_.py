@@ -16,7 +16,7 @@ from daq.bench import Bench, Channel, Sensor, dump, parse
 from daq.errors import ImportFormatError
 from daq.formats.delimited import read_delimited
 from daq.formats.foreign import NS_PER_S
-from daq.formats.npz import read_npz
+from daq.formats.npz import read_mat, read_npz
 from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
@@ -60,7 +60,7 @@ def import_files(
     Parameters
     ----------
     sources : sequence of Path
-        ``.npz`` and CSV (``.csv``, ``.tsv``, ``.txt``); anything else is read by ObsPy.
+        ``.npz``, ``.mat`` and CSV (``.csv``, ``.tsv``, ``.txt``); anything else is read by ObsPy.
     out : Path
         Recording to write; must not exist.
     bench : Bench, optional
@@ -115,6 +115,8 @@ def _read(sources: Sequence[Path], sampling_rate: float | None) -> list[ForeignS
             raise ImportFormatError(f"{path}: no such file")
         if path.suffix.lower() == ".npz":
             found += read_npz(path, sampling_rate)
+        elif path.suffix.lower() == ".mat":
+            found += read_mat(path, sampling_rate)
         elif path.suffix.lower() in DELIMITED:
             found += read_delimited(path, sampling_rate)
         else:
@@ -165,6 +167,7 @@ def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses
     if bench is not None:
         listed = bench.sensor(foreign.name)
         channels = list(_matched(foreign, listed))
+        _refuse_scaling_twice(foreign, channels)
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
     if responses is not None:
         for number, name in enumerate(foreign.channels):
@@ -177,6 +180,16 @@ def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses
                 }
             )
     return sensor.model_copy(update={"channels": tuple(channels)})
+
+
+def _refuse_scaling_twice(foreign: ForeignSensor, channels: Sequence[Channel]) -> None:
+    for unit, channel in zip(foreign.units, channels, strict=False):
+        if unit == channel.unit and channel.sensitivity != 1:
+            raise ImportFormatError(
+                f"{foreign.source}: {foreign.name}.{channel.name} is in {unit} already, and the "
+                f"bench file's sensitivity, {channel.sensitivity:g} counts per {unit}, would scale "
+                "it again; expected (counts) in the file, or sensitivity 1 in the bench file"
+            )
 
 
 def _matched(foreign: ForeignSensor, listed: Sensor) -> Sequence[Channel]:

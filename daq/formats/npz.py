@@ -1,8 +1,8 @@
-"""NumPy archives: ``sampling_rate`` and one array of counts per sensor.
+"""NumPy archives and MATLAB files: ``sampling_rate`` and one array of counts per sensor.
 
 ==================  ====================================================================
 ``sampling_rate``   in Hz, one number
-any other name      a sensor: counts ``(n_samples, n_channels)``, or ``(n_samples,)`` for one
+any other name      a sensor: counts ``(n_samples, n_channels)``, or a vector for one channel
 ``start_time``      optional: UTC of the first sample, ISO 8601 or ``datetime64``
 ==================  ====================================================================
 
@@ -44,11 +44,44 @@ def read_npz(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
         raise ImportFormatError(
             f"{path}: expected a NumPy archive (numpy.savez) of plain numbers; {error}"
         ) from error
+    return _sensors(path, arrays, sampling_rate)
+
+
+def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
+    """Read the sensors of a MATLAB file (version 4 to 7); as `read_npz`.
+
+    Raises
+    ------
+    ImportFormatError
+        It is no such file, or what it holds is not as described above.
+    """
+    from scipy.io import loadmat  # noqa: PLC0415 - takes long
+
+    try:
+        found = loadmat(path)
+    except NotImplementedError as error:
+        raise ImportFormatError(
+            f"{path}: a MATLAB file of version 7.3; save it with -v7 to import it"
+        ) from error
+    except Exception as error:  # of any kind, on damaged files
+        raise ImportFormatError(f"{path}: expected a MATLAB file; {error}") from error
+    arrays = {name: np.asarray(array) for name, array in found.items() if name[:2] != "__"}
+    return _sensors(path, {name: _upright(array) for name, array in arrays.items()}, sampling_rate)
+
+
+def _upright(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a row as a column: MATLAB has no vectors."""
+    return array.T if array.ndim == 2 and array.shape[0] == 1 else array
+
+
+def _sensors(
+    path: Path, arrays: dict[str, NDArray[Any]], sampling_rate: float | None
+) -> tuple[ForeignSensor, ...]:
     rate = float(_number(path, arrays["sampling_rate"])) if "sampling_rate" in arrays else None
     rate = rate or sampling_rate
     if rate is None or not rate > 0:
         raise ImportFormatError(
-            f"{path}: expected a positive sampling_rate in Hz in the archive, "
+            f"{path}: expected a positive sampling_rate in Hz in it, "
             f"found {rate}; add it, or give --sampling-rate"
         )
     start_utc_ns = _instant_ns(path, arrays["start_time"]) if "start_time" in arrays else 0

@@ -156,3 +156,13 @@ def test_what_does_not_fit_is_said_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="exists already"):
         import_files([tmp_path / "a.npz"], out)
     assert out.exists()
+
+
+def test_samples_in_units_already_are_not_scaled_by_a_bench_in_counts(tmp_path: Path) -> None:
+    bench = parse(BENCH, check=False)
+    unit = bench.sensors[0].channels[0].unit
+    header = ",".join(f"{s}.{c} ({unit})" for s in "AB" for c in ("east", "north"))
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n1,2,3,4\n5,6,7,8\n", encoding="utf-8")
+    with pytest.raises(ImportFormatError, match="scale it again"):
+        import_files([path], tmp_path / "a.h5", bench=bench, sampling_rate=50.0)

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from daq.errors import ImportFormatError
 from daq.formats.delimited import read_delimited
 from daq.formats.miniseed import read_waveforms
-from daq.formats.npz import read_npz
+from daq.formats.npz import read_mat, read_npz
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,6 +150,27 @@ def test_npz_pickles_and_other_files_are_refused(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         with pytest.raises(ImportFormatError, match=name):
             read_npz(tmp_path / name)
+
+
+def test_mat_is_read_as_npz_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    a, b = counts(300).reshape(100, 3), np.arange(100.0)
+    start = "2026-11-21T03:00:00.005Z"
+    savemat(path, {"sampling_rate": RATE, "start_time": start, "A": a, "B": b})
+    first, second = read_mat(path)
+    assert (first.name, first.channels, first.sampling_rate) == ("A", ("1", "2", "3"), RATE)
+    np.testing.assert_array_equal(first.stretches[0].counts, a)
+    assert first.stretches[0].start_utc_ns == 1_795_230_000_005_000_000
+    assert second.stretches[0].counts.shape == (100, 1)
+
+
+@pytest.mark.parametrize(
+    "contents", [b"nothing of the kind", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"]
+)
+def test_mat_what_cannot_be_read_is_said(tmp_path: Path, contents: bytes) -> None:
+    (tmp_path / "a.mat").write_bytes(contents)
+    with pytest.raises(ImportFormatError, match=r"a\.mat: .*MATLAB"):
+        read_mat(tmp_path / "a.mat")
 
 
 def test_delimited_header_names_sensors_channels_and_units(tmp_path: Path) -> None:

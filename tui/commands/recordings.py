@@ -104,7 +104,7 @@ def estimate(
 def import_(
     sources: Annotated[
         list[Path],
-        typer.Argument(metavar="SRC", help="miniSEED (or what ObsPy reads), .npz, .csv."),
+        typer.Argument(metavar="SRC", help="miniSEED (or what ObsPy reads), .npz, .mat, .csv."),
     ],
     *,
     out: Annotated[
@@ -134,7 +134,8 @@ def import_(
 
     [b]miniSEED[/b]  a sensor is network.station.location, its channels are codes
 
-    [b].npz[/b]      sampling_rate, and one array (n_samples, n_channels) per sensor
+    [b].npz .mat[/b] sampling_rate (Hz), start_time (UTC) or none, and per sensor one array of
+    counts (n_samples, n_channels) that has its name
 
     [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
     """
