@@ -1,8 +1,10 @@
 """Spectra from those segments that nothing has disturbed.
 
 A segment is left out when samples of it are missing, when it is clipped, or when the power of any
-channel in any octave lies far from what it was in the segments accepted before, or when a channel
-stands still in part of it: one that was dead for a moment lacks too little power to show by that.
+channel in any octave lies far from what it was in the segments accepted before, or its largest step
+from one sample to the next does (a spike that the window all but hides still stands far above noise
+that is far below the motion), or when a channel stands still in part of it: one that was dead for a
+moment lacks too little power to show by that.
 The decision on a segment looks at earlier ones only, so that it is the same while the recording
 grows and afterwards.
 
@@ -51,10 +53,11 @@ class RejectionSettings:
     Attributes
     ----------
     threshold : float
-        Deviations of the logarithmic power of a band above its running median, in standard
-        deviations (1.4826 times the median absolute deviation, or the scatter of stationary noise
-        where that is more). Twice as many below: logarithms of powers have a long lower tail.
-        Infinite: transients, and channels that stand still, stay in.
+        Deviations of the logarithmic power of a band, or of the largest squared step from sample to
+        sample, above its running median, in standard deviations (1.4826 times the median absolute
+        deviation, or the scatter of stationary noise where that is more). Twice as many below:
+        logarithms of powers have a long lower tail. Infinite: transients, and channels that stand
+        still, stay in.
     start_up : int
         Segments that are judged by each other before there are earlier ones.
     memory : int
@@ -143,7 +146,8 @@ class SelectedSpectra:
         n_freqs = settings.segment_length // 2 + 1
         octaves = int(np.log2(max(1, n_freqs // FIRST_BAND)))
         self._bands = np.array([0, *FIRST_BAND * 2 ** np.arange(octaves)])
-        self._least = _stationary_scatter(self._window[:, 0], np.diff([*self._bands, n_freqs]))
+        of_bands = _stationary_scatter(self._window[:, 0], np.diff([*self._bands, n_freqs]))
+        self._least = np.append(of_bands, _scatter_of_largest(settings.segment_length - 1))
         self._held: list[_Held] = []
         self._before: deque[FloatArray] = deque(maxlen=self.rejection.memory)
         self._normal: tuple[FloatArray, FloatArray] | None = None  # median, scatter
@@ -172,11 +176,11 @@ class SelectedSpectra:
         passed = []
         for first in range(0, len(starts), SEGMENTS_PER_BLOCK):
             rows = starts[first : first + SEGMENTS_PER_BLOCK]
-            for row, power in zip(rows, self._powers(samples, rows), strict=True):
+            for row, levels in zip(rows, self._levels(samples, rows), strict=True):
                 stretch = slice(row, row + self.settings.segment_length)
-                whole = bool(np.isfinite(power).all())
+                whole = bool(np.isfinite(levels).all())
                 whole &= complete is None or bool(complete[stretch].all())
-                if self._passes(samples[stretch], power, whole=whole):
+                if self._passes(samples[stretch], levels, whole=whole):
                     passed.append(row)
         self._accepted.add(samples, np.array(passed, dtype=np.int64))
 
@@ -191,16 +195,23 @@ class SelectedSpectra:
             total.add(held.samples, np.zeros(1, dtype=np.int64))
         return total
 
-    def _powers(self, samples: FloatArray, rows: IntArray) -> FloatArray:
-        """Logarithm of the power in each band, shape (n_segments, n_bands, n_channels)."""
+    def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
+        """Logarithm of the power in each band, and last of the largest squared step.
+
+        Returns
+        -------
+        float64, shape (n_segments, n_bands + 1, n_channels)
+        """
         shape = (self.settings.segment_length, samples.shape[1])
         frames = np.lib.stride_tricks.sliding_window_view(samples, shape)[rows, 0]
+        step = np.abs(np.diff(frames, axis=1)).max(axis=1, keepdims=True)
         frames -= frames.mean(axis=1, keepdims=True)
         spectra = np.fft.rfft(frames * self._window, axis=1)
         power = np.add.reduceat(spectra.real**2 + spectra.imag**2, self._bands, axis=1)
-        return np.asarray(np.log(np.maximum(power, np.finfo(np.float64).tiny)))
+        levels = np.concatenate([power, step**2], axis=1)
+        return np.asarray(np.log(np.maximum(levels, np.finfo(np.float64).tiny)))
 
-    def _passes(self, segment: FloatArray, power: FloatArray, *, whole: bool) -> bool:
+    def _passes(self, segment: FloatArray, levels: FloatArray, *, whole: bool) -> bool:
         number, self.n_segments = self.n_segments, self.n_segments + 1
         if not whole:
             self._leave_out(Rejected(number, Reason.GAP, None, np.nan))
@@ -216,11 +227,11 @@ class SelectedSpectra:
                 self._leave_out(Rejected(number, Reason.TRANSIENT, int(np.argmax(still)), np.inf))
                 return False
         if self._normal is None:
-            self._held.append(_Held(number, segment.copy(), power))
+            self._held.append(_Held(number, segment.copy(), levels))
             if len(self._held) == self.rejection.start_up:
                 self._end_start_up()
             return False
-        off = _deviation(power, *self._normal)
+        off = _deviation(levels, *self._normal)
         if off.max() > self.rejection.threshold:
             self._leave_out(_transient(number, off))
             self._in_a_row += 1
@@ -229,7 +240,7 @@ class SelectedSpectra:
                 self._before.clear()
             return False
         self._in_a_row = 0
-        self._before.append(power)
+        self._before.append(levels)
         self._since_renewal += 1
         if self._since_renewal == self.rejection.renewal:
             self._renew()
@@ -239,7 +250,7 @@ class SelectedSpectra:
         agreeing, others = self._agreeing(self._held)
         for held in agreeing:
             self._accepted.add(held.samples, np.zeros(1, dtype=np.int64))
-            self._before.append(held.power)
+            self._before.append(held.levels)
         for rejected in others:
             self._leave_out(rejected)
         self._held.clear()
@@ -249,8 +260,8 @@ class SelectedSpectra:
         """Those that lie near the median of all, and the others."""
         if len(held) < FEWEST:
             return held, []
-        normal = self._median([segment.power for segment in held])
-        off = [_deviation(segment.power, *normal) for segment in held]
+        normal = self._median([segment.levels for segment in held])
+        off = [_deviation(segment.levels, *normal) for segment in held]
         passes = [bool(o.max() <= self.rejection.threshold) for o in off]
         return (
             [segment for segment, good in zip(held, passes, strict=True) if good],
@@ -265,8 +276,8 @@ class SelectedSpectra:
         self._normal = self._median(self._before) if self._before else None
         self._since_renewal = 0
 
-    def _median(self, powers: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        stack = np.stack(list(powers))
+    def _median(self, levels: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        stack = np.stack(list(levels))
         median = np.median(stack, axis=0)
         scatter = 1.4826 * np.median(np.abs(stack - median), axis=0)
         return median, np.maximum(scatter, self._least[:, None])
@@ -282,7 +293,7 @@ class _Held:
 
     number: int
     samples: FloatArray
-    power: FloatArray
+    levels: FloatArray
 
 
 def _stands_still(segment: FloatArray) -> BoolArray:
@@ -300,9 +311,9 @@ def _stands_still(segment: FloatArray) -> BoolArray:
     return np.asarray(still & (since[-1] > 0))
 
 
-def _deviation(power: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:
-    """Largest deviation of each channel over the bands, shape (n_channels,)."""
-    above = (power - median) / scatter
+def _deviation(levels: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:
+    """Largest deviation of each channel over the bands and the step, shape (n_channels,)."""
+    above = (levels - median) / scatter
     return np.asarray(np.maximum(above, -above / 2).max(axis=0))
 
 
@@ -317,6 +328,14 @@ def _stationary_scatter(window: FloatArray, widths: IntArray) -> FloatArray:
             for lag, width in zip(lags, widths, strict=True)
         ]
     )
+
+
+def _scatter_of_largest(n_samples: int) -> float:
+    """Return the scatter of the logarithm of the largest square of normal, independent samples.
+
+    That square is near 2 ln n, with Gumbel's distribution of scale 2 about it.
+    """
+    return float(np.pi / np.sqrt(6) / np.log(max(n_samples, 3)))
 
 
 def _transient(number: int, off: FloatArray) -> Rejected:

@@ -69,6 +69,14 @@ def test_a_transient_costs_the_segments_it_touches(frequency: float, row: int) -
     assert abs(cleaned - 1).max() < 0.1 * abs(biased - 1).max()
 
 
+@pytest.mark.parametrize("into_segment", [2, 20, 97])
+def test_a_spike_is_seen_where_the_window_hides_it(into_segment: int) -> None:
+    samples, starts = quiet(100)
+    samples[starts[60] + into_segment, 1] += 12 * samples[:, 1].std()
+    spectra = selected(samples, starts)
+    assert [(r.segment, r.channel) for r in spectra.rejected] == [(59, 1), (60, 1)]
+
+
 def test_gaps_and_clipping_are_told_apart() -> None:
     samples, starts = quiet(60)
     complete = np.ones(len(samples), dtype=bool)
