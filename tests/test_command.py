@@ -124,6 +124,36 @@ def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
     assert "Traceback" not in result.output
 
 
+def imported(tmp_path: Path) -> Path:
+    """Three sensors with a common motion, as a recording."""
+    rng = np.random.default_rng(5)
+    motion = rng.normal(size=(4000, 2))
+    sensors = {name: motion + 0.1 * rng.normal(size=(4000, 2)) for name in "ABC"}
+    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
+    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
+    huddle("import", str(source), "--out", str(out))
+    return out
+
+
+def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
+    file = str(imported(tmp_path))
+    result = CliRunner().invoke(app, ["estimate", file, "--segment", "1s", "--band", "60:70"])
+    assert result.exit_code == 2
+    assert "no frequency between 60 and 70 Hz" in result.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="locales")
+def test_output_survives_a_terminal_that_knows_no_signs(tmp_path: Path) -> None:
+    file = str(imported(tmp_path))
+    done = subprocess.run(
+        [sys.executable, "-m", "tui", "estimate", file, "--segment", "1s"],
+        capture_output=True,
+        env=os.environ | {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
+        check=True,
+    )
+    assert "(counts)²/Hz" in done.stdout.decode("utf-8")
+
+
 # --------------------------------------------------------------------------- benches
 
 
@@ -212,14 +242,6 @@ def result_of(path: Path, *options: str) -> dict[str, Any]:
     return found
 
 
-def level_db(document: dict[str, Any], sensor: str, channel: str) -> float:
-    """Level of a channel's mean noise PSD from 0.2 to 0.33 Hz, dB."""
-    frequency = np.array(document["frequency_hz"])
-    inside = (frequency >= 0.2) & (frequency <= 0.33)
-    (found,) = (c for c in document["channels"] if (c["sensor"], c["channel"]) == (sensor, channel))
-    return 10 * math.log10(np.array(found["noise_psd"], dtype=float)[inside].mean())
-
-
 def test_published_table_through_the_command(tst: Path) -> None:
     document = result_of(tst, "--method", "three-channel", *PUBLISHED)
     assert document["method"] == "three-channel"
@@ -249,10 +271,19 @@ def test_published_table_of_complex_magnitudes(tst: Path) -> None:
 
 
 def test_three_sensor_removes_the_microseism_that_leaks_through_misalignment(tst: Path) -> None:
-    options = ("--segment", "409.6s", "--overlap", "0.5", "--unit", "m/s²", "--detrend", "none")
+    settings = Settings(
+        segment=409.6, detrend="none", methods=("three-channel", "three-sensor"), unit="m/s²"
+    )
+    snapshot = estimate([tst], settings)
+    (column,) = (
+        number
+        for number, label in enumerate(snapshot.channels)
+        if (label.sensor, label.channel) == ("XX.TST5.00", "BH1")
+    )
+    inside = (snapshot.frequency >= 0.2) & (snapshot.frequency <= 0.33)
     leaking, clean = (
-        level_db(result_of(tst, "--method", method, *options), "XX.TST5.00", "BH1")
-        for method in ("three-channel", "three-sensor")
+        10 * math.log10(snapshot.results[method].noise_psd[inside, column].mean())
+        for method in settings.methods
     )
     assert leaking == pytest.approx(-161.9, abs=0.1)
     assert clean == pytest.approx(-174.8, abs=0.2)

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.errors import HuddleError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -119,18 +121,22 @@ def band_means(
     return BandMeans(mean, spread, low, high)
 
 
+class BandError(HuddleError, ValueError):
+    """A band that holds none of the frequencies."""
+
+
 def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.int64]:
     """Return first and last + 1 bin of a band, zero frequency and Nyquist left out.
 
     Raises
     ------
-    ValueError
+    BandError
         The band holds no bin.
     """
     inner = frequency[1:-1] if frequency.size > 2 else frequency
     first, last = np.searchsorted(inner, band[0]), np.searchsorted(inner, band[1], side="right")
     if first >= last:
-        raise ValueError(
+        raise BandError(
             f"no frequency between {band[0]:g} and {band[1]:g} Hz; "
             f"expected a band within {frequency[1]:g} to {frequency[-1]:g} Hz"
         )

@@ -16,9 +16,11 @@ exit  meaning
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import traceback
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
@@ -34,6 +36,9 @@ USAGE, TROUBLE, INTERRUPTED = 2, 3, 130
 
 _OTHERS = (("estimator.errors", "EstimatorError"), ("sim_devices.errors", "ServeError"))
 """Roots of errors that are trouble as well, where their module has been loaded at all."""
+
+
+_WRONG_USE = {"ScenarioError", "BandError"}
 
 
 class HuddleGroup(TyperGroup):
@@ -70,7 +75,7 @@ def exit_code(error: BaseException) -> int | None:
         return None if None in codes else max(code for code in codes if code is not None)
     if type(error).__name__ == "RecorderFailedError":
         return int(getattr(error, "code", TROUBLE))
-    if isinstance(error, BenchFileError) or type(error).__name__ == "ScenarioError":
+    if isinstance(error, BenchFileError) or type(error).__name__ in _WRONG_USE:
         return USAGE
     if isinstance(error, (HuddleError, OSError)):
         return TROUBLE
@@ -146,5 +151,19 @@ def _options(
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command and exit with its code."""
-    app(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # files and pipes hold UTF-8 everywhere
+            stream.reconfigure(
+                encoding=stream.encoding if stream.isatty() else "utf-8", errors="replace"
+            )
+    try:
+        app(arguments)
+    except SystemExit as ended:
+        if ended.code == TROUBLE and "h5py" in sys.modules:
+            # HDF5 can crash on exit after a full disk; all files of ours are closed by now.
+            with suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(TROUBLE)
+        raise
     raise SystemExit(0)
