@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
+from daq.errors import HuddleError
 from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
@@ -71,11 +72,13 @@ def run_test(
         snapshot, interrupted = follow_to_end(
             recorder, settings, duration=duration, until_cov=until_cov
         )
-        finish_recording(out, snapshot)
         met = show_result(
             snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
         )
-        recorder.check()
+        try:
+            finish_recording(out, snapshot)
+        finally:
+            recorder.check()  # its trouble says more than what follows from it
     except BaseException:
         recorder.request_stop()
         raise
@@ -125,7 +128,10 @@ def follow_to_end(
                 recorder.request_stop()
         if not snapshot.closed:
             notices().print("[red]the recorder was ended from outside")
-            heal(recorder.out)
+            try:
+                heal(recorder.out)
+            except HuddleError as error:  # a full disk; the file can be read all the same
+                notices().print(f"[red]{error}")
     with Estimation([recorder.out], settings) as estimation:
         return estimation.finish(), interrupted
 

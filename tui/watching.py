@@ -41,6 +41,8 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
     trouble: list[str] = []
 
     def tell(snapshot: Snapshot, settings: Settings) -> None:
+        if last and not snapshot.closed and snapshot.n_segments == last[0].n_segments:
+            return
         if json is None:
             console().print(_line(snapshot, settings))
         else:
