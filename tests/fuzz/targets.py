@@ -175,7 +175,8 @@ def fifo(fuzzed: bytes) -> None:
         decoder.request()
         with contextlib.suppress(RemoteProtocolError):
             decoder.receive(read, at)
-            whole = rtu.encode(1, bytes((4, len(read) & 0xFE)) + read[: len(read) & 0xFE])
+            size = min(len(read), 2 * rtu.MAX_REGISTERS) & 0xFE
+            whole = rtu.encode(1, bytes((4, size)) + read[:size])
             decoder.receive(whole, at)
         if decoder.waiting:
             decoder.timed_out(at)
