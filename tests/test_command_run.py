@@ -193,7 +193,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def test_demo_shows_which_estimate_is_right() -> None:
-    code, said, err = finished(start("demo", "--duration", "30s", "--speed", "8", "--json", "-"))
+    code, said, err = finished(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
     assert code == 0, err
     channels = json.loads(said)["channels"]
     covers = {
