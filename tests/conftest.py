@@ -6,6 +6,7 @@ import asyncio
 import functools
 import inspect
 import os
+import signal
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,6 +75,12 @@ def _leaving_no_task(test: Callable[..., Awaitable[None]]) -> Callable[..., Awai
             pytest.fail(f"tasks left behind: {sorted(left)}")
 
     return checked
+
+
+def pytest_configure() -> None:
+    """Let our commands be interrupted, even where the tests run in a shell's background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # which all children would inherit
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -35,7 +35,10 @@ def test_estimator_loads_no_input_or_output() -> None:
 
 @pytest.mark.parametrize("command", ["record", "estimate"])
 def test_headless_commands_never_load_textual(command: str) -> None:
-    run = f"from tui.command import main; sys.argv[1:] = ['{command}', 'absent.toml']"
+    run = (
+        "import os; os._exit = sys.exit  # so that it lives to say what it loaded\n"
+        f"from tui.command import main; sys.argv[1:] = ['{command}', 'absent.toml']"
+    )
     loaded = modules_after(
         f"{run}\ntry:\n    main()\nexcept SystemExit as end:\n    assert end.code\nprint()"
     )
