@@ -192,6 +192,15 @@ def children_of(pid: int) -> list[int]:
     return [int(line) for line in done.stdout.split()]
 
 
+def test_check_finds_what_is_on_a_port(bench: Path) -> None:
+    port = parse(bench.read_text(encoding="utf-8")).sensors[0].port
+    code, said, err = finished(start("check", "--port", port, "--json", "-"))
+    assert code == 0, err
+    (device,) = json.loads(said)["devices"]
+    assert device["driver"] == "epson"
+    assert device["information"]["model"].startswith("A352")
+
+
 def test_demo_shows_which_estimate_is_right() -> None:
     code, said, err = finished(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
     assert code == 0, err

@@ -10,7 +10,8 @@ from rich.table import Table
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
-from daq.probe import probe_bench
+from daq.errors import NoAnswerError
+from daq.probe import discover, probe_bench
 from tui.output import console, for_people, write_json
 from tui.results import plain
 
@@ -67,6 +68,34 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
     )
     if errors:
         raise ExceptionGroup("devices in trouble", errors)
+
+
+def check_port(port: str, *, json: str | None) -> None:
+    """Look for devices on a port, and say what a bench file must say to read them.
+
+    Raises
+    ------
+    NotConnectedError
+        The port cannot be opened.
+    NoAnswerError
+        Nothing answers there.
+    """
+    found = asyncio.run(discover(port, SystemClock()))
+    write_json(json, {"port": port, "devices": plain(found)})
+    if not found:
+        raise NoAnswerError(
+            f"port {port}: nothing answers as an Epson accelerometer or a Modbus device; check"
+            " power and cable; devices of other families must be named in a bench file"
+        )
+    table = _table(["driver", "settings", "device"])
+    for device in found:
+        about = device.information
+        said = device.remark
+        if about is not None:
+            said = f"{about.model} {about.serial_number} {about.firmware} {said}".strip()
+        settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
+        table.add_row(device.driver, settings, said)
+    for_people(json).print(table)
 
 
 def _summary(bench: Bench) -> str:

@@ -31,10 +31,24 @@ def init(
     write_template(out, force=force)
 
 
-@examples("huddle check lab.toml", "huddle check lab.toml --no-devices --json -")
+@examples(
+    "huddle check lab.toml",
+    "huddle check lab.toml --no-devices --json -",
+    "huddle check --port /dev/ttyUSB0   (what is connected there, without a bench file)",
+)
 def check(
-    bench: BenchArgument,
+    bench: Annotated[
+        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
+    ] = None,
     *,
+    port: Annotated[
+        str | None,
+        typer.Option(
+            "--port",
+            metavar="PORT",
+            help="Look for Epson accelerometers and Modbus devices on this port instead.",
+        ),
+    ] = None,
     devices: Annotated[
         bool, typer.Option("--devices/--no-devices", help="Talk to the devices as well.")
     ] = True,
@@ -44,9 +58,14 @@ def check(
 
     Every fault of the file is told at once, and so is every device that does not answer.
     """
-    from tui.benches import check_bench
+    from tui.benches import check_bench, check_port
 
-    check_bench(bench, devices=devices, json=json)
+    if (bench is None) == (port is None):
+        raise typer.BadParameter("expected either a bench file or --port PORT")
+    if bench is not None:
+        check_bench(bench, devices=devices, json=json)
+    elif port is not None:
+        check_port(port, json=json)
 
 
 @examples(
