@@ -26,6 +26,8 @@ Kinds that last ``duration`` s:
 
 ========== ==========================================================================
 jitter     each unit is kept back for up to ``level`` s
+latency    each unit is kept back for an exponential time with mean ``level`` s
+batching   units leave only every ``level`` s, as through a polled USB adapter
 stall      the device sends nothing; what it would have sent is lost
 disconnect the cable is pulled; the port comes back
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
@@ -59,12 +61,14 @@ from pydantic import (
     PositiveInt,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from typing import Self
 
     from numpy.typing import NDArray
 
@@ -72,10 +76,11 @@ if TYPE_CHECKING:
 
 Kind: TypeAlias = Literal[
     "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
-    "jitter", "stall", "disconnect",
+    "jitter", "latency", "batching", "stall", "disconnect",
     "clip", "dead", "spike",
     "reset", "wrap", "overflow",
 ]  # fmt: skip
+DELAYS = ("jitter", "latency", "batching")
 UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
 SAMPLE_KINDS = ("clip", "dead", "spike")
 PATIENCE = 1.0
@@ -96,6 +101,12 @@ class Fault(BaseModel):
     level: float = 0.0
     channel: NonNegativeInt | None = None
     seed: int = 0
+
+    @model_validator(mode="after")
+    def _delays_by_something(self) -> Self:
+        if self.kind in DELAYS and self.level <= 0:
+            raise ValueError(f"{self.kind} has level {self.level:g}; expected seconds above 0")
+        return self
 
     def times(self, begin: float = 0.0) -> Iterator[float]:
         """World times at which it strikes, in s, from ``begin`` on."""
@@ -194,8 +205,9 @@ class LineFaults:
         self._armed: deque[tuple[float, Fault]] = deque()
         self._half = b""  # the first half of a unit to be merged with the next
         self._held: deque[tuple[float, bytes]] = deque()
-        self._silent_until = self._jitter_until = -math.inf
-        self._jitter = 0.0
+        self._silent_until = self._delayed_until = -math.inf
+        self._delay: Fault | None = None
+        self._phase = self._rng.uniform()  # of the polls of an adapter, in polls
         self.down_until = -math.inf
         """World time until which the cable is out."""
         self.struck: list[tuple[float, Fault]] = []
@@ -223,8 +235,8 @@ class LineFaults:
             self.struck.append((at, fault))
             if fault.kind == "stall":
                 self._silent_until = at + fault.duration
-            elif fault.kind == "jitter":
-                self._jitter_until, self._jitter = at + fault.duration, fault.level
+            elif fault.kind in DELAYS:
+                self._delayed_until, self._delay = at + fault.duration, fault
             else:
                 if fault.kind == "disconnect":
                     self.down_until = at + fault.duration
@@ -246,15 +258,22 @@ class LineFaults:
             elif self._armed and unit:
                 struck = self._strike(self._armed.popleft()[1], unit, now)
             sent += struck
-        if now < self._jitter_until:
+        if self._delay is not None and now < self._delayed_until:
             for unit in sent:
-                self._hold(unit, now + self._rng.uniform(0, self._jitter))
+                self._hold(unit, self._delayed(self._delay, now))
             sent = []
         elif self._held:
             for unit in sent:
                 self._hold(unit, now)
             sent = []
         return [*self._released(now), *sent]
+
+    def _delayed(self, fault: Fault, now: float) -> float:
+        if fault.kind == "jitter":
+            return now + self._rng.uniform(0, fault.level)
+        if fault.kind == "latency":
+            return now + self._rng.exponential(fault.level)
+        return (math.ceil(now / fault.level - self._phase) + self._phase) * fault.level
 
     def _hold(self, unit: bytes, until: float) -> None:
         last = self._held[-1][0] if self._held else until

@@ -63,6 +63,32 @@ def test_late_units_keep_their_order() -> None:
     assert faults.send([b"d"], 1.6) == [b"d"]
 
 
+def delays(**fault: Any) -> np.ndarray[Any, np.dtype[np.float64]]:  # noqa: ANN401 -- as above
+    """Return by how much each of 2000 units, 37 ms apart, is kept back, in s."""
+    faults = LineFaults(parse([{"at": 0.0, "duration": 1e6, **fault}]), "A")
+    faults.act(0.0)
+    late = []
+    for number in range(2000):
+        now = 0.037 * (number + 1)
+        if not faults.send([UNIT], now):
+            late.append(faults.next_due() - now)
+            assert faults.act(faults.next_due())[1] == [UNIT]
+        else:
+            late.append(0.0)
+    return np.array(late)
+
+
+def test_latencies_are_exponential_or_up_to_the_next_poll() -> None:
+    late = delays(kind="latency", level=1e-3)
+    assert late.mean() == pytest.approx(1e-3, rel=4 / np.sqrt(2000))
+    assert late.std() == pytest.approx(1e-3, rel=4 * np.sqrt(2 / 2000))
+    late = delays(kind="batching", level=16e-3)
+    polls = (0.037 * np.arange(1, 2001) + late) / 16e-3
+    assert np.ptp((polls + 0.5 - polls[0]) % 1) < 1e-6  # all at one phase
+    assert late.max() <= 16e-3
+    assert late.mean() == pytest.approx(8e-3, rel=0.1)  # 37 ms meets 16 phases in turn
+
+
 def test_a_stalled_device_sends_nothing_and_comes_back() -> None:
     faults = LineFaults(parse([{"kind": "stall", "at": 1.0, "duration": 0.5, "every": 2.0}]), "A")
     faults.act(1.0)
@@ -109,6 +135,8 @@ def test_what_strikes_samples(cut: int) -> None:
 
 
 def test_a_wrong_script_says_what_is_wrong() -> None:
+    with pytest.raises(ScenarioError, match="batching has level 0; expected seconds above 0"):
+        parse([{"kind": "batching", "at": 1.0}])
     with pytest.raises(ScenarioError) as caught:
         parse([{"kind": "drop"}, {"kind": "melt", "at": -1}])
     assert "faults[0].at" in str(caught.value)
