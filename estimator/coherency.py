@@ -45,6 +45,13 @@ class Coherency:
     flags: IntArray
     duplicates: BoolArray
 
+    @property
+    def absent(self) -> BoolArray:
+        """Channels that are dead or repeat an earlier one, shape (n_freqs, n_channels)."""
+        p = self.psd.shape[1]
+        copies = self.duplicates & np.tri(p, k=-1, dtype=np.bool_)
+        return ((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2)
+
     def block(self, some: slice) -> Coherency:
         """Return the same for some frequencies only."""
         return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])

@@ -131,8 +131,7 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
     be without it.
     """
     p = given.psd.shape[1]
-    absent = (given.flags & Flag.DEAD_CHANNEL) != 0
-    absent |= (given.duplicates & np.tri(p, k=-1, dtype=np.bool_)).any(axis=2)
+    absent = given.absent
     present = ~absent
     matrix = given.matrix * (present[:, :, None] & present[:, None, :])
     i = np.arange(p)
