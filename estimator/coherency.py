@@ -50,7 +50,7 @@ class Coherency:
         """Channels that are dead or repeat an earlier one, shape (n_freqs, n_channels)."""
         p = self.psd.shape[1]
         copies = self.duplicates & np.tri(p, k=-1, dtype=np.bool_)
-        return ((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2)
+        return np.asarray(((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2))
 
     def block(self, some: slice) -> Coherency:
         """Return the same for some frequencies only."""
