@@ -107,6 +107,11 @@ class Estimation:
         self.close()
 
     @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is followed: as of the last `update`."""
+        return tuple(self._recordings)
+
+    @property
     def n_segments(self) -> int:
         """Segments taken so far."""
         return sum(each.n_segments for each in self._passes)

@@ -243,6 +243,10 @@ class Recording:
     @property
     def events(self) -> tuple[Event, ...]:
         """What has happened so far."""
+        return self.events_from(0)
+
+    def events_from(self, first: int) -> tuple[Event, ...]:
+        """Return what has happened since there were ``first`` events."""
         return tuple(
             Event(
                 sensor=row["sensor"].decode(),
@@ -250,7 +254,7 @@ class Recording:
                 text=row["text"].decode(),
                 received=HostTime(int(row["monotonic_ns"]), int(row["utc_ns"])),
             )
-            for row in self._events.rows()
+            for row in self._events.rows()[first:]
         )
 
     def sensor(self, name: str) -> SensorRecord:
