@@ -1,33 +1,39 @@
 """Noise masks of the bench file, and which channels do not stay below them.
 
 A mask is judged in bands a third of an octave wide, where single frequencies scatter less: a
-channel fails where even the lower end of the band mean's 95 % interval is above the mask.
+channel fails where even the lower end of the band mean's 95 % interval is above the mask. It meets
+the mask for certain where the upper end is below it everywhere.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.units import canonical, conversion
 from tui.bands import band_means
 from tui.results import correlation_of
-from tui.text import level
+from tui.text import decibels, level
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench import Bench, Limit
-    from daq.estimation import Settings, Snapshot
-    from tui.bands import FloatArray
+    from daq.estimation import ChannelLabel, Settings, Snapshot
+    from tui.bands import BandMeans, FloatArray
 
 BANDS_PER_OCTAVE = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Exceeded:
-    """One channel above one mask, at the band where it is furthest above; PSD in unit²/Hz."""
+class Judged:
+    """One channel beside one mask, in the band where it does worst; PSD in unit²/Hz.
+
+    NaN throughout where the estimate says nothing at any frequency of the mask.
+    """
 
     limit: str
     sensor: str
@@ -35,57 +41,117 @@ class Exceeded:
     method: str
     frequency: float
     noise_psd: float
+    low: float
+    high: float
     limit_psd: float
 
+    @property
+    def known(self) -> bool:
+        """Whether the estimate says anything at the frequencies of the mask."""
+        return math.isfinite(self.limit_psd)
+
+    @property
+    def met(self) -> bool:
+        """Whether the noise is not above the mask for certain."""
+        return not self.low > self.limit_psd
+
+    @property
+    def certain(self) -> bool:
+        """Whether the whole 95 % interval is on one side of the mask."""
+        return self.low > self.limit_psd or self.high <= self.limit_psd
+
+    @property
+    def margin_db(self) -> float:
+        """How far the noise is below the mask, in dB; NaN where it came out below zero."""
+        return decibels(self.limit_psd) - decibels(self.noise_psd)
+
     def __str__(self) -> str:
+        meets = "meets" if self.met else "does not meet"
         return (
-            f"{self.sensor}.{self.channel} does not meet {self.limit!r}: {self.method} "
+            f"{self.sensor}.{self.channel} {meets} {self.limit!r}: {self.method} "
             f"{level(self.noise_psd)} dB at {self.frequency:.3g} Hz, limit "
             f"{level(self.limit_psd)} dB"
         )
 
 
-def exceeded(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Exceeded]:
+def exceeded(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Judged]:
     """Return every channel that does not meet a mask, judged by the first method that was asked."""
-    if bench is None or not bench.limits or not snapshot.results:
+    return [each for each in judged(bench, snapshot, settings) if not each.met]
+
+
+def judged(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Judged]:
+    """Return every channel beside every mask that is for it, by the first method that was asked."""
+    if bench is None or not snapshot.results:
         return []
-    method = next(iter(snapshot.results))
-    noise = snapshot.results[method]
-    correlation = correlation_of(settings)
-    found = []
-    for limit in bench.limits:
-        edges = _edges(snapshot.frequency, limit)
-        if edges.size < 2:
-            continue
-        centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
-        mask = _at(limit, centre)
-        for column, label in enumerate(snapshot.channels):
-            if limit.sensors and label.sensor not in limit.sensors:
-                continue
-            if limit.channels and label.channel not in limit.channels:
-                continue
-            means = band_means(
-                noise.noise_psd[:, column],
-                noise.cov[:, column],
-                edges,
-                correlation,
-                weights=np.gradient(snapshot.frequency),
-            )
-            above = np.nan_to_num(means.low / mask, nan=0.0)
-            worst = int(np.argmax(above))
-            if above[worst] > 1:
-                found.append(
-                    Exceeded(
-                        limit.name,
-                        label.sensor,
-                        label.channel,
-                        method,
-                        float(centre[worst]),
-                        float(means.mean[worst]),
-                        float(mask[worst]),
-                    )
-                )
-    return found
+    return [
+        _judge(bench, limit, column, snapshot, settings)
+        for limit in bench.limits
+        for column, label in enumerate(snapshot.channels)
+        if concerns(limit, label)
+    ]
+
+
+def concerns(limit: Limit, label: ChannelLabel) -> bool:
+    """Whether a mask is for a channel."""
+    return (not limit.sensors or label.sensor in limit.sensors) and (
+        not limit.channels or label.channel in limit.channels
+    )
+
+
+def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray) -> FloatArray:
+    """Return a mask between its points, straight in log-log, in the unit of the result squared/Hz.
+
+    The file's numbers are in the unit that the channel has there.
+    """
+    mask = np.exp(np.interp(np.log(frequency), np.log(limit.frequency), np.log(limit.psd)))
+    unit = _unit_in_file(bench, label)
+    if unit is not None and canonical(unit) != label.unit:
+        mask = mask * np.abs(conversion(unit, label.unit, frequency)) ** 2
+    return np.asarray(mask)
+
+
+def _judge(
+    bench: Bench, limit: Limit, column: int, snapshot: Snapshot, settings: Settings
+) -> Judged:
+    label = snapshot.channels[column]
+    method, noise = next(iter(snapshot.results.items()))
+
+    def verdict(*numbers: float) -> Judged:
+        return Judged(limit.name, label.sensor, label.channel, method, *numbers)
+
+    edges = _edges(snapshot.frequency, limit)
+    if edges.size < 2:
+        return verdict(*[math.nan] * 5)
+    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
+    mask = mask_psd(bench, limit, label, centre)
+    means = band_means(
+        noise.noise_psd[:, column],
+        noise.cov[:, column],
+        edges,
+        correlation_of(settings),
+        weights=np.gradient(snapshot.frequency),
+    )
+    worst = _worst(means, mask)
+    if worst is None:
+        return verdict(*[math.nan] * 5)
+    values = (centre, means.mean, means.low, means.high, mask)
+    return verdict(*(float(value[worst]) for value in values))
+
+
+def _worst(means: BandMeans, mask: FloatArray) -> int | None:
+    """Return the band furthest above the mask for certain, or else the one that comes closest."""
+    above = means.low / mask
+    if not np.isfinite(above).any():
+        return None
+    return int(np.nanargmax(above if np.nanmax(above) > 1 else means.high / mask))
+
+
+def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
+    for sensor in bench.sensors:
+        for channel in sensor.channels:
+            if (sensor.name, channel.name) == (label.sensor, label.channel):
+                return channel.unit
+    return None
 
 
 def _edges(frequency: FloatArray, limit: Limit) -> NDArray[np.int64]:
@@ -98,10 +164,3 @@ def _edges(frequency: FloatArray, limit: Limit) -> NDArray[np.int64]:
     edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
     edges[-1] += 1
     return np.unique(edges).astype(np.int64)
-
-
-def _at(limit: Limit, frequency: FloatArray) -> FloatArray:
-    """Return a mask between its points: straight in log-log."""
-    return np.asarray(
-        np.exp(np.interp(np.log(frequency), np.log(limit.frequency), np.log(limit.psd)))
-    )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from importlib import resources
 
 import pytest
 
-from daq.bench import parse
+from daq.bench import Bench, parse
+from estimator.methods import self_noise
 from tests.tui.made import SETTINGS, made_snapshot
-from tui.limits import exceeded
+from tui.limits import Judged, exceeded, judged
 
 MASK = """
 [[limits]]
@@ -19,9 +22,13 @@ psd = [{psd}, {psd}]
 """
 
 
-def found(psd: float, more: str = "", *, n_effective: float = 1000.0) -> list[tuple[str, str]]:
+def bench_with(psd: float, more: str = "") -> Bench:
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    bench = parse(text + MASK.format(psd=psd, more=more), check=False)
+    return parse(text + MASK.format(psd=psd, more=more), check=False)
+
+
+def found(psd: float, more: str = "", *, n_effective: float = 1000.0) -> list[tuple[str, str]]:
+    bench = bench_with(psd, more)
     snapshot = made_snapshot(n_effective=n_effective)
     return [(e.sensor, e.channel) for e in exceeded(bench, snapshot, SETTINGS)]
 
@@ -49,8 +56,57 @@ def test_a_mask_outside_the_spectrum_says_nothing() -> None:
 
 
 def test_a_failure_says_where_and_by_how_much() -> None:
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    bench = parse(text + MASK.format(psd=8.5e-12, more=""), check=False)
-    (failure,) = exceeded(bench, made_snapshot(n_effective=5000.0), SETTINGS)
+    (failure,) = exceeded(bench_with(8.5e-12), made_snapshot(n_effective=5000.0), SETTINGS)
     assert str(failure).startswith("C.Z does not meet 'data sheet': three-sensor −110.")
     assert failure.noise_psd == pytest.approx(9e-12, rel=0.05)
+
+
+def verdicts(psd: float, *, n_effective: float = 1000.0) -> dict[str, Judged]:
+    snapshot = made_snapshot(n_effective=n_effective)
+    return {e.sensor + e.channel: e for e in judged(bench_with(psd), snapshot, SETTINGS)}
+
+
+def test_every_channel_has_its_margin_and_whether_it_is_certain() -> None:
+    of = verdicts(5e-12)
+    assert of["AX"].met
+    assert of["AX"].certain
+    assert of["AX"].margin_db == pytest.approx(10 * math.log10(5), abs=0.5)
+    assert of["BY"].met
+    assert not of["BY"].certain
+    assert not of["CZ"].met
+    assert of["CZ"].certain
+    assert of["CZ"].margin_db == pytest.approx(10 * math.log10(5 / 9), abs=0.5)
+
+
+def test_a_mask_where_nothing_can_be_said_is_neither_met_nor_missed() -> None:
+    snapshot = made_snapshot()
+    dead = snapshot.csm.copy()
+    dead[:, 0, :] = dead[:, :, 0] = 0
+    noise = self_noise("three-sensor", dead, dims=(3, 3, 3), n_effective=100.0)
+    dead_snapshot = replace(snapshot, csm=dead, results={"three-sensor": noise})
+    of = {e.sensor + e.channel: e for e in judged(bench_with(5e-12), dead_snapshot, SETTINGS)}
+    assert not of["AX"].known
+    assert not exceeded(
+        bench_with(1e-13, 'channels = ["X"]\nsensors = ["A"]'), dead_snapshot, SETTINGS
+    )
+
+
+def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:
+    snapshot = made_snapshot(n_effective=1000.0)
+    scale = 9.80665e-6**-2  # (µg)² in (m/s²)²
+    (noise,) = [snapshot.results["three-sensor"]]
+    in_micro_g = replace(
+        snapshot,
+        unit="µg",
+        channels=tuple(replace(label, unit="µg") for label in snapshot.channels),
+        results={
+            "three-sensor": replace(
+                noise,
+                noise_psd=noise.noise_psd * scale,
+                low=noise.low * scale,
+                high=noise.high * scale,
+            )
+        },
+    )
+    failing = [(e.sensor, e.channel) for e in exceeded(bench_with(6.5e-12), in_micro_g, SETTINGS)]
+    assert failing == [("C", "X"), ("C", "Y"), ("C", "Z")]
