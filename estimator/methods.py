@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from estimator import uncertainty
 from estimator.errors import UnknownMethodError
 from estimator.likelihood import maximum_likelihood
 from estimator.self_noise import Flag, SelfNoise
@@ -15,7 +16,7 @@ from estimator.two_channel import two_channel
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from estimator.arrays import ComplexArray
+    from estimator.arrays import BoolArray, ComplexArray
 
 __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
@@ -40,6 +41,7 @@ def self_noise(
     dims: tuple[int, ...],
     n_effective: float,
     correct: bool = True,
+    real: BoolArray | None = None,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
     """Self-noise PSD of every channel by a named method.
@@ -57,6 +59,9 @@ def self_noise(
         Independent averages in `csm`.
     correct : bool
         Remove the small-sample bias.
+    real : bool, shape (n_freqs,), optional
+        Where the spectra are real-valued and scatter twice as much: at 0 Hz and at the Nyquist
+        frequency (`estimator.spectra.WelchSettings.real`). Nowhere by default.
     **options
         What the method alone takes; see there.
 
@@ -73,4 +78,5 @@ def self_noise(
     """
     if method not in METHODS:
         raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")
-    return METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
+    found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
+    return found if real is None else uncertainty.widened(found, real)

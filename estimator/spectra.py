@@ -23,7 +23,7 @@ from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
-    from estimator.arrays import ComplexArray, FloatArray, IntArray
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**21  # samples of all channels in a block, at most: 16 MB
@@ -79,6 +79,11 @@ class WelchSettings:
     def frequencies(self) -> FloatArray:
         """Frequencies in Hz, shape (n_freqs,), from 0 to half the sampling rate."""
         return np.arange(self.segment_length // 2 + 1) * self.sampling_rate / self.segment_length
+
+    def real(self, frequencies: FloatArray) -> BoolArray:
+        """Where spectra are real-valued: at 0 Hz and half the sampling rate."""
+        highest = np.isclose(frequencies, self.sampling_rate / 2, rtol=1e-9, atol=0)
+        return (frequencies == 0) | highest
 
 
 class CrossSpectra:

@@ -13,12 +13,14 @@ for a mere PSD, and constant where leaking motion swamps it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from estimator.arrays import ComplexArray, FloatArray
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray
+    from estimator.self_noise import SelfNoise
 
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
@@ -90,3 +92,36 @@ def score_interval(
         np.divide(kappa * t2, reach, out=distance, where=bounded)
         ends.append(noise + side * np.where(certain, 0.0, distance))
     return ends[0], ends[1]
+
+
+def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
+    """Allow for half as many degrees of freedom where the spectra are real-valued.
+
+    Parameters
+    ----------
+    found : SelfNoise
+        With c.o.v. and intervals for complex spectra of as many averages.
+    real : bool, shape (n_freqs,)
+        At 0 Hz and the Nyquist frequency.
+
+    Returns
+    -------
+    SelfNoise
+        There with the c.o.v. and the width of the interval times the root of two: in the
+        logarithm where all of the interval is above zero, as of a chi-square.
+
+    Notes
+    -----
+    A Fourier coefficient of a real series has no imaginary part at these frequencies. The
+    small-sample bias is the same: a dimension of the motion takes one average of n in either case.
+    """
+    root = np.sqrt(2)
+    noise, low, high = (values[real] for values in (found.noise_psd, found.low, found.high))
+    above = (low > 0) & (noise > 0)
+    below = np.where(above, low / np.where(above, noise, 1.0), 1.0)
+    beyond = np.where(above, high / np.where(above, noise, 1.0), 1.0)
+    cov, lows, highs = (values.copy() for values in (found.cov, found.low, found.high))
+    cov[real] *= root
+    lows[real] = np.where(above, noise * below**root, noise + root * (low - noise))
+    highs[real] = np.where(above, noise * beyond**root, noise + root * (high - noise))
+    return replace(found, cov=cov, low=lows, high=highs)

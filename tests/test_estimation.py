@@ -71,6 +71,10 @@ def test_the_estimate_is_that_of_the_samples_in_the_file(tmp_path: Path) -> None
     np.testing.assert_allclose(
         snapshot.results["three-sensor"].noise_psd, direct.noise_psd, rtol=1e-9
     )
+    # real amplitudes at 0 Hz and Nyquist: half the degrees of freedom
+    ratio = snapshot.results["three-sensor"].cov / direct.cov
+    np.testing.assert_allclose(ratio[[0, -1]], np.sqrt(2), rtol=1e-8)
+    np.testing.assert_allclose(ratio[1:-1], 1, rtol=1e-8)
     np.testing.assert_allclose(snapshot.data_psd[:, 0], spectra.csm()[:, 0, 0].real, rtol=1e-12)
 
 

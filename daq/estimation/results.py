@@ -161,6 +161,7 @@ def noise_estimates(
                         dims=dims,
                         n_effective=band.n_effective,
                         correct=settings.correct,
+                        real=band.settings.real(band.frequencies),
                         **option,
                     )
                     for band, option in zip(bands, options, strict=True)

@@ -1,4 +1,4 @@
-"""The interval where its exact form is known."""
+"""The interval where its exact form is known, and spectra that are real-valued."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from estimator.methods import self_noise
+from estimator.spectra import WelchSettings
 from estimator.uncertainty import score_interval
+from tests.estimator.models import common_motion
 
 
 @pytest.mark.parametrize("n", [10, 20, 100, 1080])
@@ -22,3 +25,45 @@ def test_too_few_averages_leave_it_open_above(averages: float) -> None:
     low, high = score_interval(np.ones(1), np.ones((3, 1)), averages=averages)
     assert 0 < low[0] < 1
     assert np.isinf(high[0])
+
+
+@pytest.mark.parametrize("method", ["three-channel", "three-sensor", "maximum-likelihood"])
+def test_where_spectra_are_real_they_scatter_twice_as_much(method: str) -> None:
+    """Averages of squares of real amplitudes, as at 0 Hz and the Nyquist frequency."""
+    n, n_draws = 100, 3000
+    csm = common_motion(np.tile(np.eye(2), (3, 1)), np.ones(6), snr=1e3).real
+    amplitudes = np.random.default_rng(0).standard_normal((n_draws, n, 6))
+    amplitudes @= np.linalg.cholesky(csm).T
+    sample = (amplitudes.swapaxes(1, 2) @ amplitudes / n).astype(np.complex128)
+    real = np.arange(n_draws) % 2 == 0
+    found = self_noise(method, sample, dims=(2, 2, 2), n_effective=n, real=real)
+    scatter = found.noise_psd.std(axis=0)
+    # a deviation of 3000 draws has 1.5 % standard error
+    np.testing.assert_allclose(np.nanmedian(found.cov[real], axis=0), scatter, rtol=0.06)
+    np.testing.assert_allclose(np.nanmedian(found.cov[~real], axis=0), scatter / 2**0.5, rtol=0.06)
+    covers = (found.low < 1) & (found.high > 1)
+    assert 0.93 < covers[real].mean() < 0.97
+    assert covers[~real].mean() < 0.90
+    error = scatter / np.sqrt(n_draws)
+    assert np.all(np.abs(found.noise_psd.mean(axis=0) - 1) < 4 * error)
+
+
+def test_a_real_spectrum_widens_an_interval_that_reaches_below_zero_too() -> None:
+    csm = np.full((2, 3, 3), 0.5, dtype=np.complex128)
+    csm += 0.5 * np.eye(3)
+    csm[:, 0, 1:] = csm[:, 1:, 0] = 0.68
+    found = self_noise(
+        "three-channel", csm, dims=(1, 1, 1), n_effective=30, real=np.array([True, False])
+    )
+    wide, usual = (found.noise_psd[row, 0] - found.low[row, 0] for row in (0, 1))
+    assert found.low[1, 0] < 0
+    assert wide == pytest.approx(np.sqrt(2) * usual)
+
+
+@pytest.mark.parametrize(("length", "n_real"), [(64, 2), (63, 1), (1999, 1), (2000, 2)])
+def test_real_spectra_are_those_at_zero_and_nyquist(length: int, n_real: int) -> None:
+    settings = WelchSettings(0.3, length)
+    real = settings.real(settings.frequencies)
+    assert real.sum() == n_real
+    assert real[0]
+    assert real[-1] == (n_real == 2)
