@@ -13,7 +13,7 @@ import numpy as np
 
 from estimator.coherency import check_dims
 from estimator.errors import EstimatorError
-from estimator.fisher import cramer_rao_cov
+from estimator.fisher import cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
 from estimator.windows import effective_averages, get_window
 
@@ -41,6 +41,9 @@ class Plan:
         Recording length in seconds.
     bias : float64, shape (n_freqs, n_channels)
         Fractional bias however long one records: misalignment, wrong dimension.
+    efficiency : float64, shape (n_freqs, n_channels)
+        `estimator.fisher.efficiency`: share of this recording's length that the best possible
+        estimate would need. Means nothing where there is a bias.
     """
 
     method: str
@@ -48,6 +51,7 @@ class Plan:
     n_segments: FloatArray
     duration: FloatArray
     bias: FloatArray
+    efficiency: FloatArray
 
 
 def planned_csm(
@@ -126,6 +130,7 @@ def plan(
     check_dims(dims)
     if not (np.isfinite(cov) and cov > 0):
         raise EstimatorError(f"c.o.v. {cov}: expected a number above zero")
+    bound = cramer_rao_cov(csm, noise_psd, n_effective=REFERENCE)
     plans = []
     for method in METHODS:
         found = self_noise(method, csm, dims=dims, n_effective=REFERENCE, correct=False)
@@ -133,18 +138,39 @@ def plan(
         scatter = found.cov * np.abs(found.noise_psd) / noise_psd
         used = {"two-channel": 0, "three-channel": 1}.get(method, max(dims))
         averages = REFERENCE * (scatter / cov) ** 2 + used
-        plans.append(_plan(method, averages, found.noise_psd / noise_psd - 1, settings))
-    bound = cramer_rao_cov(csm, noise_psd, n_effective=1.0)
-    return [*plans, _plan(BOUND, (bound / cov) ** 2, np.zeros_like(noise_psd), settings)]
+        plans.append(
+            _plan(
+                method,
+                averages,
+                bias=found.noise_psd / noise_psd - 1,
+                settings=settings,
+                efficiency=efficiency(scatter, bound),
+            )
+        )
+    least = _plan(
+        BOUND,
+        REFERENCE * (bound / cov) ** 2,
+        bias=np.zeros_like(bound),
+        settings=settings,
+        efficiency=np.ones_like(bound),
+    )
+    return [*plans, least]
 
 
-def _plan(method: str, averages: FloatArray, bias: FloatArray, settings: WelchSettings) -> Plan:
+def _plan(
+    method: str,
+    averages: FloatArray,
+    *,
+    bias: FloatArray,
+    settings: WelchSettings,
+    efficiency: FloatArray,
+) -> Plan:
     window = get_window(settings.window, settings.segment_length)
     known = np.isfinite(averages)
     segments = np.full(averages.shape, np.nan)
     segments[known] = [segments_needed(window, settings.hop, n) for n in averages[known]]
     duration = (settings.segment_length + (segments - 1) * settings.hop) / settings.sampling_rate
-    return Plan(method, averages, segments, duration, bias)
+    return Plan(method, averages, segments, duration, bias, efficiency)
 
 
 def segments_needed(window: FloatArray, hop: int, n_effective: float) -> int:

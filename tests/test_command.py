@@ -200,6 +200,9 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     assert plans["three-sensor"]["duration"] == pytest.approx(1003 * 5.0 * 1.06, rel=0.05)
     assert max(map(abs, plans["three-sensor"]["bias"])) < 1e-3
     assert max(plans["three-channel"]["bias"]) > 1
+    assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
+    shown = huddle("plan", str(bench), "--cov", "0.05")
+    assert "efficiency" in shown
 
 
 # --------------------------------------------------------------- the real recording

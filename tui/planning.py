@@ -35,7 +35,7 @@ def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
     plans = plan(csm, noise, dims=dims, settings=settings, cov=cov)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("method")
-    for name in ("record for", "segments", "bias that stays"):
+    for name in ("record for", "segments", "bias that stays", "efficiency"):
         table.add_column(name, justify="right")
     for entry in plans:
         table.add_row(entry.method, *_row(entry))
@@ -56,6 +56,7 @@ def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
                     "duration": _worst(entry.duration),
                     "segments": _worst(entry.n_segments),
                     "bias": entry.bias[0].tolist(),
+                    "efficiency": entry.efficiency[0].tolist(),
                 }
                 for entry in plans
             ],
@@ -76,14 +77,15 @@ def _worst(values: FloatArray) -> float:
     return float(np.max(values)) if np.isfinite(values).all() else float("nan")
 
 
-def _row(entry: Plan) -> tuple[str, str, str]:
+def _row(entry: Plan) -> tuple[str, str, str, str]:
     duration, segments = _worst(entry.duration), _worst(entry.n_segments)
     if np.isnan(duration):
-        return "says nothing", "", ""
+        return "says nothing", "", "", ""
     low, high = float(entry.bias.min()), float(entry.bias.max())
     none = max(-low, high) < 1e-3
     return (
         format_duration(duration),
         f"{segments:.0f}",
         "none" if none else f"{low:+.0%} to {high:+.0%}",
+        f"{entry.efficiency.min():.0%}" if none else "",
     )

@@ -38,6 +38,10 @@ def test_channels_at_30_degrees_cost_4_6_times_as_much_without_maximum_likelihoo
     plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)}
     ratio = plans["three-sensor"].n_effective / plans["maximum-likelihood"].n_effective
     assert ratio[0, 0] == pytest.approx((0.173 / 0.0804) ** 2, rel=0.02)
+    # dimensions paid for in averages aside, efficiency is the same ratio
+    assert plans["three-sensor"].efficiency[0, 0] == pytest.approx(1 / ratio[0, 0], rel=0.01)
+    np.testing.assert_allclose(plans["maximum-likelihood"].efficiency, 1, rtol=1e-3)
+    np.testing.assert_array_equal(plans[BOUND].efficiency, 1)
 
 
 @pytest.mark.parametrize("method", ["two-channel", "three-sensor", "maximum-likelihood"])
