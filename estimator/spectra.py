@@ -83,7 +83,7 @@ class WelchSettings:
     def real(self, frequencies: FloatArray) -> BoolArray:
         """Where spectra are real-valued: at 0 Hz and half the sampling rate."""
         highest = np.isclose(frequencies, self.sampling_rate / 2, rtol=1e-9, atol=0)
-        return (frequencies == 0) | highest
+        return np.asarray((frequencies == 0) | highest)
 
 
 class CrossSpectra:
