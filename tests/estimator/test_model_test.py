@@ -43,6 +43,20 @@ def test_false_alarms_at_the_one_percent_level(
     assert test.statistic.mean() / degrees == pytest.approx(1, abs=tolerance + 4 * error)
 
 
+@pytest.mark.parametrize("n_averages", [4, 6])
+def test_what_estimated_noise_takes_from_the_statistic(n_averages: int) -> None:
+    """Without motion psi is the diagonal, and Bartlett's factor exact to order 1/n**3.
+
+    Its term 1 / (6 n) is 2 and 1.4 % of the mean here, the error of the mean 0.25 %.
+    """
+    draws = wishart(
+        np.eye(3, dtype=np.complex128), n_averages, np.random.default_rng(8), n_draws=60_000
+    )
+    test = model_test(maximise(draws, 0), n_effective=n_averages)
+    assert np.all(test.degrees == 6)
+    assert test.statistic.mean() / 6 == pytest.approx(1, abs=0.008)
+
+
 def test_correlation_of_neighbouring_bins_by_closed_form() -> None:
     """Hann, no overlap: amplitudes 2/3 and 1/6; rectangular: none."""
     hann = neighbour_correlation(get_window("hann", 256), 256, 100)
