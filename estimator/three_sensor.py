@@ -160,7 +160,6 @@ def _pair(given: Coherency, i: slice, others: tuple[slice, slice], inverse_jk: _
     used_or_target = used.copy()
     used_or_target[i] = True
     regular = regular & ~given.duplicates[:, used][:, :, used_or_target].any(axis=(1, 2))
-    regular &= ~(given.flags[:, used] & Flag.DEAD_CHANNEL).any(axis=1)
     return _Pair(j, k, P, Q, cross, regular)
 
 

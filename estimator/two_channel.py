@@ -80,9 +80,7 @@ def two_channel(
     omega = np.array([[0, 0.5], [0.5, 0]])
     for p in range(n_channels):
         others = np.flatnonzero((row == row[p]) & (sensor != sensor[p]))
-        # not those that are dead, nor the copies of this very channel
         weights = (given.flags[:, others] & Flag.DEAD_CHANNEL == 0).astype(np.float64)
-        weights[given.duplicates[:, p, others]] = 0
         n_others = weights.sum(axis=1)
         flags[n_others == 0, p] |= Flag.NO_COUNTERPART
         weights /= np.maximum(n_others, 1)[:, None]

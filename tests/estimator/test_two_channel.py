@@ -76,6 +76,13 @@ def test_mixed_and_dead_channels_are_flagged() -> None:
     assert dead.flags[1, 4] == Flag.DEAD_CHANNEL
     without = two_channel(sample[:, [1, 7]][:, :, [1, 7]], dims=(1, 1), n_effective=60)
     assert dead.noise_psd[1, 1] == pytest.approx(without.noise_psd[1, 0])
+    copied = sample.copy()
+    copied[:, 4], copied[:, :, 4] = copied[:, 1], copied[:, :, 1]
+    copied[:, 4, 4] = copied[:, 1, 1]
+    copies = two_channel(copied, dims=DIMS, n_effective=60)
+    assert np.all(copies.flags[:, [1, 4]] == Flag.DUPLICATE)
+    assert np.isnan(copies.noise_psd[:, [1, 4]]).all()
+    assert np.isfinite(copies.noise_psd[:, 7]).all()
     alone = two_channel(sample[:, :6, :6], dims=(3, 3), n_effective=60)
     assert alone.flags[1, 1] == Flag.NO_COUNTERPART
 
