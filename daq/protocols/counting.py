@@ -13,6 +13,9 @@ cannot be ahead of time. With *latest* the index that host time allows at the mo
 
 *Latest* comes from the earliest arrival seen (arrival is never early), and follows a device clock
 that is off by up to ``CLOCK_TOLERANCE``.
+
+A device that went on sampling while nobody could hear it is taken on where it is: whether it did
+:meth:`SampleCounter.expects` tells, again by host time, and how many wraps went by.
 """
 
 from __future__ import annotations
@@ -69,6 +72,7 @@ class SampleCounter:
         self._count: int | None = None  # counter of the frame before it
         self._origin = 0.0  # earliest arrival of sample 0, as far as is known, in s
         self._seen = 0.0  # host time of the read before, in s
+        self._resumed = False
 
     def place(self, counters: NDArray[np.integer[Any]], at: HostTime) -> tuple[list[Run], int]:
         """Give each frame its sample index.
@@ -114,15 +118,35 @@ class SampleCounter:
             missing = index - self._next
             runs.append(Run(row, stop, index, index + self._base, missing, restarted))
             self._next = index + stop - row
+            self._resumed = False
             self._count = int(counters[stop - 1])
             row = stop
         self._origin = min(self._origin, now - (self._next - 1) / self._rate)
         self._seen = now
         return runs, n_repeated
 
+    def expects(self, counter: int, at: HostTime) -> bool:
+        """Whether a frame received now goes on with the counting, however many were missed.
+
+        A counter that began anew meanwhile is taken for one that went on with the chance that it
+        stands where it should: twice ``SLACK`` in the time of one wrap.
+        """
+        if self._count is None:
+            return False
+        now = at.monotonic_ns * 1e-9
+        slack = (SLACK + CLOCK_TOLERANCE * (now - self._seen)) * self._rate
+        index = self._next + (counter - self._count - 1) % self.modulus
+        ahead = index - (now - self._origin) * self._rate
+        off = (ahead + self.modulus / 2) % self.modulus - self.modulus / 2
+        return abs(off) <= slack < self.modulus / 4
+
+    def resume(self) -> None:
+        """Note that any number may be missing before the next: whole wraps, too."""
+        self._resumed = True
+
     def _index(self, step: int, latest: float) -> tuple[int | None, bool]:
         """Index of a frame ``step`` counts on, None if it repeats; and whether it is a restart."""
-        if step == 1:
+        if step == 1 and not self._resumed:
             return self._next, False
         index = self._next + (step - 1) % self.modulus
         if index <= latest + SLACK * self._rate:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from daq.protocols.epson import BurstFormat
 
 COUNT_MODULUS = 65536
+LEAST_FOLLOWING = 3
+"""Bursts in a row by which a stream is known again."""
 REPORT_INTERVAL_NS = 1_000_000_000
 """Least host time between two events of one kind."""
 
@@ -73,6 +75,28 @@ class BurstDecoder:
         self._error = False
         self._counts = dict.fromkeys(("checksum", "resynchronised", "repeated"), 0)
         self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
+
+    def follows(self, data: bytes, at: HostTime) -> bool:
+        """Whether ``data``, heard on a new connection, is the stream of before, gone on meanwhile.
+
+        ``data`` holds bursts of the same format, some in a row, and COUNT stands where host time
+        says it should. Nothing is taken; :meth:`resume` and :meth:`receive` do.
+        """
+        if not self._started or "count" not in self._burst:
+            return False
+        runs, _ = find_frames(np.frombuffer(data, np.uint8), self._size, self._valid)
+        for offset, length in runs[::-1]:
+            if length >= LEAST_FOLLOWING:
+                frames = np.frombuffer(data, self._dtype, count=length, offset=offset)
+                counters = frames["count"][-LEAST_FOLLOWING:].astype(np.int64)
+                in_order = bool((np.diff(counters) % COUNT_MODULUS == 1).all())
+                return in_order and self._counter.expects(int(counters[-1]), at)
+        return False
+
+    def resume(self) -> None:
+        """Note that what comes now follows on a new connection."""
+        self._left = b""
+        self._counter.resume()
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Return the blocks and events of all frames completed by ``data``."""

@@ -23,8 +23,11 @@ Samples go round the scan list without regard to packets; N is at most 512.
 
 With CORE_TIMER and STREAM_DATA_CAPTURE_16 (its upper half) leading the scan list every scan carries
 the 40 MHz clock that makes the scan rate: gaps are then counted by it, and blocks carry it as
-``device_counter``, unwrapped (it wraps every 107 s). After a fatal status the stream is to be
-started anew and :meth:`StreamDecoder.restart` called: the clock runs on, the scans begin anew.
+``device_counter``, unwrapped (it wraps every 107 s). Where the stream is started anew, after a
+fatal status or on another connection, :meth:`StreamDecoder.restart` is to be called: the clock runs
+on, the scans begin anew. The clock then tells how many are missing, to the nearest scan, and host
+time how often it wrapped; one that is not where host time says it should be began anew too, and
+what is missing is estimated.
 
 That the scan of 0xFFFF counts among the skipped is what the U3's guide says; the T-series datasheet
 does not. Either way ``information`` scans are missing in its place.
@@ -39,7 +42,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.counting import SampleCounter
+from daq.protocols.counting import CLOCK_TOLERANCE, SLACK, SampleCounter
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack_registers import CORE_HZ, CORE_TIMER, FEEDBACK, STREAM_DATA_CAPTURE_16
 
@@ -69,6 +72,8 @@ _HEADER = struct.Struct(">HHHBBBBHHH")
 _CR_HEADER = struct.Struct(">HHHH")
 _MARK = bytes((FEEDBACK, 16))
 _WRAP = 1 << 32
+MOST_DOUBT = 40.0
+"""Of host time beyond which it does not tell the wraps of the timer any more, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +203,7 @@ class StreamDecoder:
         self._rate = scan_rate
         self._ticks = round(CORE_HZ / scan_rate)
         self._finder = PacketFinder()
-        self._next_row = 0
+        self._next_row = self._end_row = 0  # expected, as far as is known; after the last scan
         self._flags = BlockFlag.CLOCK_RESTART
         self._reason = ""
         self._timer: int | None = None  # unwrapped, of the last scan
@@ -217,8 +222,13 @@ class StreamDecoder:
         self.complete = False
         """Whether a burst has come to its end."""
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether there is a timer by which scans of another stream can be placed after these."""
+        return self._timer is not None
+
     def restart(self) -> None:
-        """Note that the stream was started anew on the same connection."""
+        """Note that the stream was started anew, on this connection or another."""
         reason = FATAL.get(self.fatal or 0, "stream restarted")
         self._finder = PacketFinder()
         self._begin()
@@ -328,6 +338,7 @@ class StreamDecoder:
             return []
         counter = self._place(scans, at)
         first, self._next_row = self._next_row, self._next_row + len(scans)
+        self._end_row = self._next_row
         flags, self._flags = self._flags, BlockFlag.NONE
         reason, self._reason = self._reason, ""
         self._latest = at
@@ -343,18 +354,22 @@ class StreamDecoder:
         """Return how many scans lead that the timer says came before, when their packet did."""
         if not self._timed or self._timer is None or not len(scans):
             return 0
-        behind = (self._timer - (int(scans[0, 0]) | int(scans[0, 1]) << 16)) % _WRAP
+        if self._flags & BlockFlag.CLOCK_RESTART:  # nothing of a new stream came before
+            return 0
+        behind = (self._timer - _timer(scans[0])) % _WRAP
         return behind // self._ticks + 1 if behind < REPEATED * CORE_HZ else 0
 
     def _place(self, scans: NDArray[np.uint16], at: HostTime) -> int | None:
         """Put the scans in their place by timer or host time; return the timer of the first."""
         n_scans = len(scans)
+        doubt = 0.0  # of host time, s; none, where it is not asked
         if self._flags & BlockFlag.MISSING_ESTIMATED and self._latest is not None:
             elapsed = (at.monotonic_ns - self._latest.monotonic_ns) * 1e-9
             self._next_row += max(0, round(elapsed * self._rate) - n_scans)
+            doubt = SLACK + CLOCK_TOLERANCE * elapsed
         if not self._timed:
             return None
-        first, last = (int(scans[i, 0]) | int(scans[i, 1]) << 16 for i in (0, -1))
+        first, last = _timer(scans[0]), _timer(scans[-1])
         if abs((last - first) % _WRAP - (n_scans - 1) * self._ticks) > n_scans * self._ticks / 2:
             return None  # samples were lost on the way: what stands there is no timer
         counter = first
@@ -362,8 +377,14 @@ class StreamDecoder:
             # What is known to be missing tells the number of wraps, the timer then the rest.
             expected = self._timer + (self._next_row - self._timer_row) * self._ticks
             counter += _WRAP * round((expected - first) / _WRAP)
-            steps = round((counter - self._timer) / self._ticks)
-            self._next_row = self._timer_row + max(1, steps)
+            if not doubt or abs(counter - expected) <= doubt * CORE_HZ <= MOST_DOUBT * CORE_HZ:
+                steps = round((counter - self._timer) / self._ticks)
+                self._next_row = max(self._timer_row + steps, self._end_row)
+                self._flags &= ~BlockFlag.MISSING_ESTIMATED
         self._timer = counter + (last - first) % _WRAP
         self._timer_row = self._next_row + n_scans - 1
         return counter
+
+
+def _timer(scan: NDArray[np.uint16]) -> int:
+    return int(scan[0]) | int(scan[1]) << 16

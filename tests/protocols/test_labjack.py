@@ -183,9 +183,51 @@ def test_fatal_statuses_end_the_stream_until_it_is_started_anew(status: int) -> 
     found += receiver.receive(encode_packet(Packet(rows.ravel())), at(4.01))
     _, blocks, events = of("A", found)
     assert indices(blocks) == [*range(10), *range(3010, 3020)]
-    assert blocks[1].flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    assert blocks[1].flags == BlockFlag.CLOCK_RESTART
     assert blocks[1].reason == labjack.FATAL[status]
     assert str(status) in events[0].text
+
+
+@pytest.mark.parametrize("missing", [0, 1, 999, 107_374, 107_375, 20 * 107_374 + 5])
+@pytest.mark.parametrize("late", [-0.3, 0.0, 0.7])
+def test_a_stream_started_anew_goes_on_where_the_timer_says(missing: int, late: float) -> None:
+    """Host time, off by its latency and 100 ppm, tells the wraps (107 374 scans) only."""
+    receiver = decoder()
+    found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
+    receiver.restart()
+    rows = scans(10 + missing, 10)
+    host = 0.01 + (missing + 10) / RATE * 1.0001 + late
+    found += receiver.receive(encode_packet(Packet(rows.ravel())), at(host))
+    _, blocks, _ = of("A", found)
+    assert indices(blocks) == [*range(10), *range(10 + missing, 20 + missing)]
+    assert blocks[1].flags == BlockFlag.CLOCK_RESTART
+
+
+@pytest.mark.parametrize("timer", [5 * TICKS * 1000, -5 * TICKS * 1000])
+def test_a_timer_that_began_anew_meanwhile_is_not_believed(timer: int) -> None:
+    receiver = decoder()
+    found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
+    receiver.restart()
+    rows = scans(3010, 10, timer=timer % 2**32)
+    found += receiver.receive(encode_packet(Packet(rows.ravel())), at(3.02))
+    rows = scans(3020, 10, timer=timer % 2**32)
+    found += receiver.receive(encode_packet(Packet(rows.ravel(), transaction=1)), at(3.03))
+    _, blocks, _ = of("A", found)
+    assert indices(blocks) == [*range(10), *range(3010, 3030)]
+    assert blocks[1].flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    assert not blocks[2].flags
+
+
+def test_host_time_that_may_be_a_wrap_off_is_not_asked_for_wraps() -> None:
+    """A stream broken off for three days: 200 ppm of them are 52 s, half a wrap."""
+    receiver = decoder()
+    found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
+    receiver.restart()
+    days = 3 * 86400
+    rows = scans(days * 1000, 10)
+    found += receiver.receive(encode_packet(Packet(rows.ravel())), at(days + 0.01))
+    _, blocks, _ = of("A", found)
+    assert blocks[1].flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 
 
 def test_a_burst_comes_to_its_end() -> None:
