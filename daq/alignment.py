@@ -48,6 +48,8 @@ class AlignedRecording:
         Of the grid, in Hz; the lowest of the sensors' where not given.
     start_utc_ns, end_utc_ns : int, optional
         Only what lies between.
+    at_face_value : bool
+        Take every clock to keep its nominal rate from the sample on that arrived first.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class AlignedRecording:
         sampling_rate: float | None = None,
         start_utc_ns: int | None = None,
         end_utc_ns: int | None = None,
+        at_face_value: bool = False,
     ) -> None:
         self._recording = recording
         self._wanted = (start_utc_ns, end_utc_ns)
@@ -83,6 +86,7 @@ class AlignedRecording:
         self._start: float | None = None
         self._set_at = (0, 0)
         self._end = math.inf
+        self._at_face_value = at_face_value
         self.refresh()
 
     @property
@@ -183,6 +187,17 @@ class AlignedRecording:
     def set_clocks(self) -> None:
         """Set every clock by all that is known now."""
         sources = self._sources
+        if self._at_face_value:
+            for source in sources:
+                rate = source.record.sampling_rate
+                source.clock = nominal(
+                    source.record.name,
+                    "nominal rate",
+                    end_sample=source.end_sample,
+                    sampling_rate=rate,
+                    first=round(source.arrivals.start * rate),
+                )
+            return
         together = len({source.clock_name for source in sources}) == 1 and not any(
             source.device_utc or source.polled for source in sources
         )
@@ -190,7 +205,7 @@ class AlignedRecording:
             for source in sources:
                 source.clock = nominal(
                     source.record.name,
-                    source.clock_name,
+                    f"clock of {source.clock_name}",
                     end_sample=source.end_sample,
                     sampling_rate=source.record.sampling_rate,
                 )

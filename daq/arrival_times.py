@@ -145,6 +145,15 @@ class ArrivalTimes:
         self._late = np.concatenate([self._late[:-1], late[kept]])
         self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
 
+    @property
+    def start(self) -> float:
+        """When sample 0 arrived, by the least lateness of the first seconds; or was taken, by UTC.
+
+        In seconds from the origin.
+        """
+        first = self._index <= self._index[0] + _NODE * self.sampling_rate
+        return float(self._late[first & (self._epoch == self._epoch[0])].min())
+
     def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:
         """Return the clock, from everything taken so far.
 

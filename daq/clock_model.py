@@ -184,11 +184,13 @@ def from_instants(
     return Clock(tuple(epochs), state)
 
 
-def nominal(sensor: str, clock: str, *, end_sample: int, sampling_rate: float) -> Clock:
-    """Return the clock that *is* the timeline: sample n is taken at n / sampling_rate."""
+def nominal(
+    sensor: str, source: str, *, end_sample: int, sampling_rate: float, first: int = 0
+) -> Clock:
+    """Return the clock that *is* the timeline: sample n is taken at (first + n) / sampling_rate."""
     index = np.array([0.0, max(float(end_sample), 1.0)])
-    epoch = Epoch(0, end_sample, index, index / sampling_rate)
-    state = ClockState(sensor, f"clock of {clock}", 0.0, 0.0, 0.0, 0.0, 0.0, 1)
+    epoch = Epoch(0, end_sample, index, (first + index) / sampling_rate)
+    state = ClockState(sensor, source, epoch.start, 0.0, 0.0, 0.0, 0.0, 1)
     return Clock((epoch,), state)
 
 

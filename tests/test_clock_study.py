@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from daq.estimation import estimate
 from tui.clock_study import Latency, free_running, residuals, study, synthesise
+from tui.command import app
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,6 +28,24 @@ def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Late
     assert rows["refined"].cov == pytest.approx(rows["oracle"].cov, rel=0.05)
     if latency.kind == "batching":
         assert np.abs(rows["arrival times"].against_oracle).max() > 0.1
+
+
+def test_the_command_takes_samples_at_face_value_only_if_told(tmp_path: Path) -> None:
+    scenario = free_running(snr=1e4, duration=60.0, seed=6)
+    path = synthesise(tmp_path / "r.h5", scenario, duration=60.0)
+    told = {}
+    for clocks in ("refined", "nominal"):
+        asked = ["estimate", str(path), "--segment", "2s", "--clocks", clocks, "--json", "-"]
+        result = CliRunner().invoke(app, asked)
+        assert result.exit_code == 0, result.output
+        told[clocks] = json.loads(result.stdout)["diagnostics"]
+    sources = {clocks: {each["source"] for each in told[clocks]["clocks"]} for clocks in told}
+    assert sources == {"refined": {"arrival times"}, "nominal": {"nominal rate"}}
+    # Lined up by the first arrivals to the sample, and left there.
+    drift = np.array(told["nominal"]["drift"])[:, 1:] * 200.0
+    assert np.ptp(drift, axis=0).max() == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(drift - np.round(drift)).max() < 1e-6
+    assert np.abs(drift[0] - [0.0, 6.42, 11.46]).max() < 1.0  # 32.1 and 57.3 ms, and latency
 
 
 def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> None:

@@ -63,7 +63,6 @@ def synthesise(
     latency: Latency | None = None,
     block: float = 0.1,
     seed: int = 1,
-    clock: str | None = None,
     instants: bool = False,
 ) -> Path:
     """Write the recording that a bench of this scenario would have given.
@@ -80,8 +79,6 @@ def synthesise(
         Seconds of samples a block holds.
     seed : int
         Of the latencies.
-    clock : str, optional
-        Name of the one clock they claim to share; each has its own where not given.
     instants : bool
         Store when each sample was really taken, as no device could.
     """
@@ -95,7 +92,7 @@ def synthesise(
             ),
             sampling_rate=scenario.sensors[name].sampling_rate,
             dtype=np.dtype(np.int32),
-            clock=clock or name,
+            clock=name,
         )
         for name in scenario.names
     ]
@@ -215,8 +212,8 @@ def study(
 ) -> list[Row]:
     """Estimate one simulated huddle test with its clocks taken in four ways.
 
-    The same samples are recorded as they would arrive (estimated with refinement off and on), with
-    the true instant of every sample (the oracle), and as if one clock had taken them (face value).
+    The same samples are recorded as they would arrive (estimated at face value, by arrival times,
+    and refined), and with the true instant of every sample (the oracle).
 
     Parameters
     ----------
@@ -230,10 +227,9 @@ def study(
     made: dict[str, Any] = {"duration": duration, "latency": latency, "seed": seed}
     arrived = synthesise(directory / "arrived.h5", scenario, **made)
     oracle = synthesise(directory / "oracle.h5", scenario, instants=True, **made)
-    face = synthesise(directory / "face.h5", scenario, clock="one", **made)
     snapshots = {
-        "face value": estimate([face], settings),
-        "arrival times": estimate([arrived], replace(settings, refine=False)),
+        "face value": estimate([arrived], replace(settings, clocks="nominal")),
+        "arrival times": estimate([arrived], replace(settings, clocks="arrivals")),
         "refined": estimate([arrived], settings),
         "oracle": estimate([oracle], settings),
     }

@@ -19,6 +19,14 @@ class Method(StrEnum):
     ALL = "all"
 
 
+class Clocks(StrEnum):
+    """What is believed of when samples were taken."""
+
+    REFINED = "refined"
+    ARRIVALS = "arrivals"
+    NOMINAL = "nominal"
+
+
 class Detrend(StrEnum):
     """What is taken out of each segment before it is transformed."""
 
@@ -115,8 +123,13 @@ DetrendOption: TypeAlias = Annotated[
 NoCorrectionOption: TypeAlias = Annotated[
     bool, typer.Option("--no-correction", help="Leave the small-sample bias in.")
 ]
-NoRefinementOption: TypeAlias = Annotated[
-    bool, typer.Option("--no-refinement", help="Set clocks by arrival times alone.")
+ClocksOption: TypeAlias = Annotated[
+    Clocks | None,
+    typer.Option(
+        "--clocks",
+        help="Set by arrival times and the common motion (refined), by arrival times alone, "
+        "or not at all: samples at face value (nominal).",
+    ),
 ]
 UnitOption: TypeAlias = Annotated[
     str | None,

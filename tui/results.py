@@ -216,6 +216,7 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
         "refused": snapshot.refused,
         "sensors": [asdict(sensor) for sensor in snapshot.sensors],
         "clocks": [asdict(clock) for clock in snapshot.clocks],
+        "drift": snapshot.drift.tolist(),
     } | {key: plain(value) for key, value in snapshot.diagnostics.items()}
 
 

@@ -49,6 +49,7 @@ class Pass:
             sampling_rate=settings.sampling_rate,
             start_utc_ns=_utc_ns(settings.start),
             end_utc_ns=_utc_ns(settings.end),
+            at_face_value=settings.clocks == "nominal",
         )
         names = {sensor for sensor, _ in self.aligned.channels}
         self._sensors = [record for record in recording.sensors if record.name in names]
@@ -221,7 +222,7 @@ class Pass:
 
     def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
         """Measure what delays are left, for the clocks' next setting."""
-        measurable = self.aligned.measurable if self._settings.refine else ()
+        measurable = self.aligned.measurable if self._settings.clocks == "refined" else ()
         if not measurable:
             return
         if self._meter is None:

@@ -36,8 +36,9 @@ class Settings:
         Wanted coefficient of variation.
     sampling_rate : float or None
         Of the common grid in Hz; the lowest of the sensors' where not given.
-    refine : bool
-        Whether clocks are refined by the motion the sensors share.
+    clocks : str
+        How it is known when samples were taken: "refined", by arrival times and the motion that the
+        sensors share; "arrivals", by arrival times alone; "nominal", samples at face value.
     reject : bool or None
         Which segments are left out, besides those with gaps: True for those that are clipped or
         have a transient in any channel (`estimator.rejection`), None for those that are clipped,
@@ -66,7 +67,7 @@ class Settings:
     band: tuple[float, float] | None = None
     target_cov: float | None = None
     sampling_rate: float | None = None
-    refine: bool = True
+    clocks: Literal["refined", "arrivals", "nominal"] = "refined"
     reject: bool | None = None
     octaves: bool = False
     dimension: int | Literal["auto"] | None = None

@@ -10,6 +10,7 @@ import typer
 from tui.commands import examples
 from tui.options import (
     BandOption,
+    ClocksOption,
     CsvOption,
     DetrendOption,
     DiagnosticsOption,
@@ -21,7 +22,6 @@ from tui.options import (
     JsonOption,
     MethodOption,
     NoCorrectionOption,
-    NoRefinementOption,
     OctavesOption,
     OverlapOption,
     RejectOption,
@@ -49,7 +49,7 @@ def estimate(
     window: WindowOption = None,
     detrend: DetrendOption = None,
     no_correction: NoCorrectionOption = False,
-    no_refinement: NoRefinementOption = False,
+    clocks: ClocksOption = None,
     reject: RejectOption = None,
     octaves: OctavesOption = False,
     dimension: DimensionOption = None,
@@ -81,7 +81,7 @@ def estimate(
         window=window,
         detrend=detrend,
         correct=False if no_correction else None,
-        refine=False if no_refinement else None,
+        clocks=clocks,
         reject=reject,
         octaves=octaves or None,
         dimension=factors(dimension),
