@@ -19,7 +19,8 @@ from daq.protocols.fifo import FifoDecoder
 from daq.protocols.guralp import SerialDecoder
 from daq.protocols.labjack import Packet, StreamDecoder
 from daq.protocols.registers import RegisterDecoder, RegisterMap
-from daq.protocols.text import RASPBERRY_SHAKE, TextDecoder
+from daq.protocols.text import TextDecoder
+from daq.protocols.text_format import RASPBERRY_SHAKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

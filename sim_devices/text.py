@@ -11,7 +11,13 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
-from daq.protocols.text import LILY, RASPBERRY_SHAKE, TextFormat, encode_fields, encode_time
+from daq.protocols.text_format import (
+    LILY,
+    RASPBERRY_SHAKE,
+    TextFormat,
+    encode_fields,
+    encode_time,
+)
 from sim_devices.device import NEVER, Line
 from sim_devices.sampling import Samples, whole
 

@@ -20,9 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 from daq.datagrams import open_datagrams
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
-from daq.protocols import text
 from daq.protocols.block import Block, Event
-from daq.protocols.text import TextDecoder, TextFormat
+from daq.protocols.text import TextDecoder
+from daq.protocols.text_format import LILY, RASPBERRY_SHAKE, TextFormat
 from daq.transport import open_port
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from daq.datagrams import DatagramStream
     from daq.transport import ByteStream
 
-PRESETS = {"raspberry-shake": text.RASPBERRY_SHAKE, "lily": text.LILY, "none": TextFormat()}
+PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 
 
 class TextSettings(BaseModel):

@@ -14,155 +14,53 @@ row
 channel
     ``{'EHZ', 1582315130.292, 14168, 14927, …}``
     The channel, the time of the first sample in seconds since 1970, then samples. Packets of one
-    time belong together (Raspberry Shake datacast; UDP, so packets get lost).
+    time belong together (Raspberry Shake datacast; UDP, so packets get lost, come twice, and
+    overtake each other: :mod:`daq.protocols.text_packets`).
 
-A counter makes gaps exact. With a time, a step longer than 1.5 times the nominal is a gap of as
-many samples as fit. With neither, a message that cannot be read is known to be one that is missing,
-and bytes that were lost altogether are not noticed.
+A counter places samples exactly (:mod:`daq.protocols.counting`), and so does a time that is written
+finely enough (:mod:`daq.protocols.sample_times`): rows that come twice are dropped and counted,
+missing ones are a gap. With neither, a message that cannot be read is known to be one that is
+missing, and bytes that were lost altogether are not noticed.
 """
 
 from __future__ import annotations
 
 import re
-from collections import deque
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from functools import reduce
-from operator import xor
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.counting import SampleCounter
 from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.sample_times import Place, SampleTimes
+from daq.protocols.text_format import (
+    MAX_MESSAGE,
+    MessageFinder,
+    TextFormat,
+    decode_time,
+    nmea_checksum,
+)
+from daq.protocols.text_packets import Group, Packets
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
-MAX_MESSAGE = 16_384
-"""Bytes without a terminator after which a message is given up."""
-MAX_WAITING = 64
-"""Packets of a channel that may wait for those of the others."""
-GAP = 1.5
-"""Time step, in nominal ones, from which on samples are missing."""
-_NS = 1_000_000_000
-_HOUR_S = 3600
-_LATEST_S = 9e9  # in ns it still fits 64 bits
 _ANNOUNCED = 200
 
 
-@dataclass(frozen=True, slots=True)
-class TextFormat:
-    """How a device writes its samples.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """A row as it was read."""
 
-    Attributes
-    ----------
-    columns : tuple of int
-        Field of each channel, counted from 0 after the tag included (layout "row").
-    channel_names : tuple of str
-        As in the messages, in the order of the channels (layout "channel").
-    time_column, time_format : int or None, str
-        Field of the time: seconds since 1970 (``"epoch"``), or as ``strptime`` has it, in UTC.
-    counter_column, counter_modulus : int or None, int
-        Field of a counter that goes up by one a row and starts anew at the modulus.
-    tag : str
-        What the first field must be; rows of other tags are skipped.
-    whole : bool
-        Whether samples are whole numbers (int32 counts) or not (float64).
-    device_time : bool
-        Whether the device's time is to be trusted more than arrival (NTP, GPS).
-    """
-
-    layout: Literal["row", "channel"] = "row"
-    delimiter: str = ","
-    terminator: str = "\n"
-    prefix: str = ""
-    suffix: str = ""
-    tag: str = ""
-    columns: tuple[int, ...] = ()
-    channel_names: tuple[str, ...] = ()
-    time_column: int | None = None
-    time_format: str = "epoch"
-    counter_column: int | None = None
-    counter_modulus: int = 1 << 16
-    nmea_checksum: bool = False
-    whole: bool = False
-    device_time: bool = False
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the counts."""
-        return np.dtype(np.int32 if self.whole else np.float64)
-
-
-RASPBERRY_SHAKE = TextFormat(
-    layout="channel",
-    terminator="}",
-    prefix="{",
-    channel_names=("EHZ",),
-    whole=True,
-)
-"""Its times are NTP's, rounded to 1 ms: good for gaps, too coarse to be the clock."""
-LILY = TextFormat(
-    tag="LILY", columns=(2, 3), time_column=1, time_format="%Y/%m/%d %H:%M:%S", terminator="\r\n"
-)
-"""Tilt X and Y in µrad; then azimuth, temperature, supply, serial number."""
-
-
-def nmea_checksum(text: str) -> int:
-    """Return the XOR of all characters."""
-    return reduce(xor, text.encode(), 0)
-
-
-def encode_fields(fields: Sequence[str], format_: TextFormat) -> bytes:
-    """Write one message."""
-    body = format_.delimiter.join(fields) + format_.suffix
-    if format_.nmea_checksum:
-        body += f"*{nmea_checksum(body):02X}"
-    return (format_.prefix + body + format_.terminator).encode("ascii")
-
-
-def encode_time(utc_ns: int, format_: TextFormat) -> str:
-    """Write a time as the format has it."""
-    if format_.time_format == "epoch":
-        return f"{utc_ns / _NS:.3f}"
-    return datetime.fromtimestamp(utc_ns // _NS, UTC).strftime(format_.time_format)
-
-
-def _decode_time(text: str, format_: TextFormat) -> int:
-    if format_.time_format == "epoch":
-        seconds = float(text)
-    else:
-        seconds = datetime.strptime(text, format_.time_format).replace(tzinfo=UTC).timestamp()
-    if not 0 <= seconds < _LATEST_S:
-        raise ValueError(text)
-    return round(seconds * 1e6) * 1000
-
-
-class MessageFinder:
-    """Cuts bytes into messages, wherever they come apart."""
-
-    def __init__(self, terminator: bytes) -> None:
-        self._terminator = terminator
-        self._buffer = bytearray()
-        self._too_long = False
-
-    def receive(self, received: bytes) -> list[bytes]:
-        """Take bytes; return whole messages, without white space around them."""
-        self._buffer += received
-        *pieces, rest = bytes(self._buffer).split(self._terminator)
-        if self._too_long and pieces:
-            pieces = [b"?", *pieces[1:]]
-            self._too_long = False
-        if len(rest) > MAX_MESSAGE:
-            self._too_long = True
-            rest = rest[-len(self._terminator) :]
-        self._buffer = bytearray(rest)
-        stripped = (piece.strip() for piece in pieces)
-        return [piece if len(piece) <= MAX_MESSAGE else b"?" for piece in stripped if piece]
+    counts: NDArray[Any]
+    message: bytes
+    counter: int
+    time_ns: int
+    resolution_ns: int
 
 
 class TextDecoder:
@@ -185,16 +83,18 @@ class TextDecoder:
     ) -> None:
         self._sensor = sensor
         self._format = format_
-        self._rate = sampling_rate
         self._joins = joins
         self._finder = MessageFinder(format_.terminator.encode())
         self._next = 0
         self._flags = BlockFlag.CLOCK_RESTART
         self._reason = ""
-        self._latest: tuple[int, HostTime] | None = None  # device time and arrival of the last
-        self._n_latest = 1  # samples that time stood for
         self._counter = SampleCounter(format_.counter_modulus, sampling_rate)
-        self._waiting: deque[tuple[int, dict[str, NDArray[Any]]]] = deque()
+        self._times = SampleTimes(sampling_rate)
+        self._packets = Packets(format_.channel_names)
+        self._doubtful: Group | None = None
+        self._latest = b""  # the last row
+        self._n_known = self._n_unreadable = self._n_given_up = 0
+        self._finest_ns: int | None = None  # how finely times are written
         delimiter = format_.delimiter.strip()
         self._between = re.compile(rf"\s*{re.escape(delimiter)}\s*" if delimiter else r"\s+")
 
@@ -203,16 +103,29 @@ class TextDecoder:
         messages = self._finder.receive(data)
         if self._joins and messages:
             messages, self._joins = messages[1:], False
-        return self._messages(messages, at)
+        return [*self._given_up(self._finder, at), *self._messages(messages, at)]
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take one datagram: whole messages, with or without a terminator at the end."""
         finder = MessageFinder(self._format.terminator.encode())
-        return self._messages(finder.receive(data + self._format.terminator.encode()), at)
+        messages = finder.receive(data + self._format.terminator.encode())
+        return [*self._given_up(finder, at), *self._messages(messages, at)]
+
+    def _given_up(self, finder: MessageFinder, at: HostTime) -> Iterator[Event]:
+        n, finder.n_given_up = finder.n_given_up, 0
+        for _ in range(n):
+            self._n_given_up += 1
+            self._unreadable()
+            text = (
+                f"{MAX_MESSAGE} bytes without {self._format.terminator!r}: given up to the next one"
+                f" ({self._n_given_up} so far); is the terminator right?"
+            )
+            yield Event(self._sensor, "resynchronised", _cut(text), at)
 
     def _messages(self, messages: list[bytes], at: HostTime) -> list[Block | Event]:
         found: list[Block | Event] = []
-        rows: list[tuple[NDArray[Any], int | None, int | None]] = []
+        rows: list[_Row] = []
+        n_known = self._n_known
         for message in messages:
             try:
                 fields = self._split(message)
@@ -221,13 +134,20 @@ class TextDecoder:
                 if self._format.layout == "channel":
                     found += self._packet(fields, at)
                 else:
-                    rows.append(self._row(fields))
+                    rows.append(self._row(fields, message))
             except RemoteProtocolError as error:
                 found += self._rows(rows, at)
                 rows = []
-                found.append(Event(self._sensor, "checksum", _cut(str(error)), at))
+                self._n_unreadable += 1
+                text = f"{_cut(str(error), 160)} ({self._n_unreadable} unreadable so far)"
+                found.append(Event(self._sensor, "checksum", _cut(text), at))
                 self._unreadable()
-        return found + self._rows(rows, at)
+        found += self._rows(rows, at)
+        if self._n_known > n_known:
+            what = "packets" if self._format.layout == "channel" else "rows"
+            text = f"{self._n_known - n_known} {what} came again or too late and were dropped"
+            found.append(Event(self._sensor, "status", f"{text} ({self._n_known} so far)", at))
+        return found
 
     def _split(self, message: bytes) -> list[str] | None:
         """Return the fields of a message, None if it is another kind."""
@@ -249,142 +169,145 @@ class TextDecoder:
 
     # --- rows --------------------------------------------------------------------------------
 
-    def _row(self, fields: list[str]) -> tuple[NDArray[Any], int | None, int | None]:
+    def _row(self, fields: list[str], message: bytes) -> _Row:
         """Return samples, time and counter of a row."""
         format_ = self._format
+        time_ns = resolution_ns = counter = 0
         try:
             values = _numbers([fields[i] for i in format_.columns], format_)
-            time_ns = counter = None
             if format_.time_column is not None:
-                time_ns = _decode_time(fields[format_.time_column], format_)
+                time_ns, resolution_ns = self._time(fields[format_.time_column])
             if format_.counter_column is not None:
                 counter = int(fields[format_.counter_column]) % format_.counter_modulus
         except (ValueError, IndexError, OverflowError) as error:
             text = format_.delimiter.join(fields)[:80]
             raise RemoteProtocolError(f"not a row of this format: {text!r}") from error
-        return values, time_ns, counter
+        return _Row(values, message, counter, time_ns, resolution_ns)
 
-    def _rows(
-        self, rows: list[tuple[NDArray[Any], int | None, int | None]], at: HostTime
-    ) -> list[Block | Event]:
+    def _time(self, text: str) -> tuple[int, int]:
+        """Return a time and how finely times are written: zeros at an end may be left out."""
+        time_ns, resolution_ns = decode_time(text, self._format)
+        self._finest_ns = min(resolution_ns, self._finest_ns or resolution_ns)
+        return time_ns, self._finest_ns
+
+    def _rows(self, rows: list[_Row], at: HostTime) -> Iterator[Block | Event]:
         if not rows:
-            return []
-        counts = np.stack([values for values, _, _ in rows])
-        times = [time for _, time, _ in rows]
+            return
         if self._format.counter_column is not None:
-            counters = np.array([counter for _, _, counter in rows], np.int64)
-            return self._counted(counts, counters, times, at)
-        found: list[Block | Event] = []
-        begin = 0
-        for i, time_ns in enumerate(times):
-            missing, events = self._step(time_ns, 1, at)
-            if missing or events:
-                found += [self._block(counts[begin:i], times[begin], at)] if i > begin else []
-                found += events
-                begin = i
-                self._skip(missing)
-        found.append(self._block(counts[begin:], times[begin], at))
-        return found
+            yield from self._counted(rows, at)
+        elif self._format.time_column is not None:
+            groups = [Group(row.time_ns, row.counts[None], at, row.resolution_ns) for row in rows]
+            before = [self._latest, *(row.message for row in rows)]
+            self._latest = before.pop()
+            alike = [row.message == one for row, one in zip(rows, before, strict=True)]
+            yield from self._timed(zip(groups, alike, strict=True))
+        else:
+            yield self._block(np.stack([row.counts for row in rows]), None, at)
 
-    def _counted(
-        self,
-        counts: NDArray[Any],
-        counters: NDArray[np.int64],
-        times: list[int | None],
-        at: HostTime,
-    ) -> list[Block | Event]:
-        found: list[Block | Event] = []
+    def _counted(self, rows: list[_Row], at: HostTime) -> Iterator[Block | Event]:
+        counts = np.stack([row.counts for row in rows])
+        counters = np.array([row.counter for row in rows], np.int64)
         runs, n_repeated = self._counter.place(counters, at)
-        if n_repeated:
-            found.append(Event(self._sensor, "status", f"{n_repeated} rows repeated", at))
+        self._n_known += n_repeated
         for run in runs:
             if run.missing:
                 self._reason = "counter"
             if run.restarted:
                 self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-                found.append(Event(self._sensor, "reset", "the counter began anew", at))
+                yield Event(self._sensor, "reset", "the counter began anew", at)
             self._next = run.first_sample
-            device = times[run.start] if self._format.device_time else run.counter
-            found.append(self._block(counts[run.start : run.stop], device, at))
-        return found
-
-    def _step(self, time_ns: int | None, n_samples: int, at: HostTime) -> tuple[int, list[Event]]:
-        """Return how many samples are missing before those of this time, and what to tell."""
-        if time_ns is None:
-            return 0, []
-        latest, self._latest = self._latest, (time_ns, at)
-        n_latest, self._n_latest = self._n_latest, n_samples
-        if latest is None:
-            return 0, []
-        step_s = (time_ns - latest[0]) / _NS
-        waited_s = (at.monotonic_ns - latest[1].monotonic_ns) / _NS
-        if -_HOUR_S <= step_s <= _HOUR_S + waited_s:
-            n_steps = step_s * self._rate
-            return (round(n_steps) - n_latest if n_steps > GAP * n_latest else 0), []
-        self._flags |= BlockFlag.CLOCK_RESTART
-        text = f"the device's time jumped by {step_s:.0f} s"
-        missing = max(0, round(waited_s * self._rate) - n_samples)
-        return missing, [Event(self._sensor, "reset", text, at)]
-
-    def _skip(self, missing: int, reason: str = "time step") -> None:
-        if missing:
-            self._next += missing
-            self._flags |= BlockFlag.MISSING_ESTIMATED
-            self._reason = reason
+            device = rows[run.start].time_ns if self._format.device_time else run.counter
+            yield self._block(counts[run.start : run.stop], device, at)
 
     def _unreadable(self) -> None:
         """Count a message that could not be read, where nothing else tells that it is missing."""
         format_ = self._format
         if format_.layout == "row" and format_.counter_column is format_.time_column is None:
-            self._skip(1, "unreadable row")
+            self._skip(1, "unreadable row", is_exact=False)
 
     # --- packets -----------------------------------------------------------------------------
 
-    def _packet(self, fields: list[str], at: HostTime) -> list[Block | Event]:
+    def _packet(self, fields: list[str], at: HostTime) -> Iterator[Block | Event]:
         name = fields[0].strip("'\"")
         try:
-            time_ns = _decode_time(fields[1], self._format)
+            time_ns, resolution_ns = self._time(fields[1])
             values = _numbers(fields[2:], self._format)
         except (ValueError, IndexError, OverflowError) as error:
             text = self._format.delimiter.join(fields)[:80]
             raise RemoteProtocolError(f"not a packet of this format: {text!r}") from error
         if name not in self._format.channel_names or not len(values):
-            return []
-        together = next((group for when, group in self._waiting if when == time_ns), None)
-        if together is None:
-            together = {}
-            self._waiting.append((time_ns, together))
-        together[name] = values
-        found: list[Block | Event] = []
-        while self._waiting and (self._complete(0) or self._later_is_complete()):
-            when, group = self._waiting.popleft()
-            if len(group) == len(self._format.channel_names):
-                found += self._grouped(when, group, at)
-        if len(self._waiting) > MAX_WAITING:
-            self._waiting.popleft()
-            silent = set(self._format.channel_names) - set(together)
-            text = f"packets dropped: nothing comes of {', '.join(sorted(silent))}"
-            found.append(Event(self._sensor, "overflow", text, at))
-        return found
+            return
+        if self._times.is_known(time_ns, at, resolution_ns=resolution_ns):
+            self._n_known += 1
+            return
+        self._n_known += self._packets.add(name, values, time_ns, at, resolution_ns)
+        for group in self._packets.ready(self._times):
+            yield from self._timed([(group, False)])
+        for text in self._packets.dropped(at):
+            yield Event(self._sensor, "overflow", _cut(text), at)
 
-    def _complete(self, index: int) -> bool:
-        return len(self._waiting[index][1]) == len(self._format.channel_names)
+    # --- placed by their time ----------------------------------------------------------------
 
-    def _later_is_complete(self) -> bool:
-        """Whether two later groups are whole: what is missing before them was lost on the way."""
-        return sum(self._complete(i) for i in range(1, len(self._waiting))) >= 2
+    def _timed(self, groups: Iterable[tuple[Group, bool]]) -> Iterator[Block | Event]:
+        """Yield what follows one another together; with each whether it repeats the one before."""
+        together: list[Group] = []
+        for group, alike in groups:
+            place = self._place(group, alike=alike)
+            if place.kind == "next" and not place.missing and self._doubtful is None:
+                together.append(group)
+                continue
+            yield from self._joined(together)
+            together = []
+            if place.kind == "reset":
+                yield from self._restarted(place, group.received)
+                place = self._place(group)
+            elif self._doubtful is not None:  # what came after tells that it was damaged
+                yield self._out_of_time(self._doubtful, group.received)
+            self._doubtful = group if place.kind == "doubtful" else None
+            if place.kind == "next":
+                self._skip(place.missing, "time step", is_exact=place.is_exact)
+                together.append(group)
+            elif place.kind == "known":
+                self._n_known += 1
+        yield from self._joined(together)
 
-    def _grouped(
-        self, time_ns: int, group: dict[str, NDArray[Any]], at: HostTime
-    ) -> list[Block | Event]:
-        n_samples = min(len(values) for values in group.values())
-        counts = np.column_stack([group[n][:n_samples] for n in self._format.channel_names])
-        if self._latest is not None and -_HOUR_S * _NS < time_ns - self._latest[0] <= 0:
-            text = "a packet was dropped: its time had passed"
-            return [Event(self._sensor, "status", text, at)]
-        missing, events = self._step(time_ns, n_samples, at)
-        self._skip(missing)
-        return [*events, self._block(counts, time_ns, at)]
+    def _place(self, group: Group, *, alike: bool = False) -> Place:
+        return self._times.place(
+            group.time_ns,
+            len(group.counts),
+            group.received,
+            resolution_ns=group.resolution_ns,
+            alike=alike,
+        )
+
+    def _joined(self, groups: list[Group]) -> Iterator[Block]:
+        if groups:
+            counts = np.concatenate([group.counts for group in groups])
+            yield self._block(counts, groups[0].time_ns, groups[-1].received)
+
+    def _restarted(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
+        """Yield what had to wait until it was clear that the device's clock was set."""
+        yield Event(self._sensor, "reset", "the device's clock was set", at)
+        self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+        self._skip(place.missing, "clock set", is_exact=False)
+        if self._doubtful is not None:
+            yield from self._joined([self._doubtful])
+            self._doubtful = None
+
+    def _out_of_time(self, group: Group, at: HostTime) -> Event:
+        self._n_unreadable += 1
+        text = (
+            f"{len(group.counts)} samples with a time that is not between those of the others"
+            f" were dropped ({self._n_unreadable} unreadable so far)"
+        )
+        return Event(self._sensor, "checksum", text, at)
+
+    def _skip(self, missing: int, reason: str, *, is_exact: bool) -> None:
+        if missing:
+            self._next += missing
+            self._reason = reason
+            if not is_exact:
+                self._flags |= BlockFlag.MISSING_ESTIMATED
 
     def _block(self, counts: NDArray[Any], device: int | None, at: HostTime) -> Block:
         first, self._next = self._next, self._next + len(counts)
@@ -407,5 +330,5 @@ def _numbers(fields: list[str], format_: TextFormat) -> NDArray[Any]:
     return whole.astype(np.int32)
 
 
-def _cut(text: str) -> str:
-    return text.encode()[:_ANNOUNCED].decode(errors="ignore")
+def _cut(text: str, n_bytes: int = _ANNOUNCED) -> str:
+    return text.encode()[:n_bytes].decode(errors="ignore")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from typing import TYPE_CHECKING, Any
 
@@ -146,3 +147,34 @@ async def test_formats_that_do_not_fit(
 ) -> None:
     with pytest.raises(BenchFileError, match=said):
         await record(sensor(running, index, settings=settings), 1)
+
+
+FAULTS = [
+    {"kind": "duplicate", "at": 6.0, "every": 0.7, "count": 2},
+    {"kind": "drop", "at": 6.3, "every": 1.1, "count": 3},
+    {"kind": "late", "at": 7.5, "every": 2.5, "duration": 0.6},
+]
+
+
+async def test_rows_twice_lost_and_late_leave_every_sample_in_its_place() -> None:
+    """Packets, counted rows, rows with a time: the motion says which sample is which."""
+    chosen = (0, 1, 3)
+    world = spec(*(TABLES[i] for i in chosen), speed=SPEED, sampling_rate=RATE)
+    with launch.start(world | {"faults": FAULTS}) as running:
+        ones = [
+            sensors(device, TABLES[i], settings=SETTINGS[i])[0]
+            for i, device in zip(chosen, running, strict=True)
+        ]
+        found = await asyncio.gather(*(record(one, 600) for one in ones))
+    same_world = scenario([one.name for one in ones], sampling_rate=RATE)
+    for one, (blocks, events) in zip(ones, found, strict=True):
+        truth = same_world.samples(one.name, 0, 6000) * COUNTS
+        start = int(np.abs(truth - blocks[0].counts[0]).max(axis=1).argmin())
+        for block in blocks:
+            expected = truth[start + block.first_sample :][: block.n_samples]
+            assert np.abs(expected - block.counts).max() <= 0.5, (one.name, block.first_sample)
+            assert not block.flags & BlockFlag.MISSING_ESTIMATED
+        reasons = {block.reason for block in blocks}
+        assert reasons == {"", "counter" if one.name == "B" else "time step"}
+        assert {event.kind for event in events} == {"status"}
+        assert "came again" in events[-1].text

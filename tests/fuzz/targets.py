@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,8 @@ from daq.protocols.labjack import Packet, StreamDecoder
 from daq.protocols.labjack_registers import AduFinder
 from daq.protocols.registers import RegisterDecoder, RegisterMap
 from daq.protocols.scream import PacketFinder
-from daq.protocols.text import RASPBERRY_SHAKE, TextDecoder, TextFormat
+from daq.protocols.text import TextDecoder
+from daq.protocols.text_format import RASPBERRY_SHAKE, TextFormat
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -191,15 +193,43 @@ def text_rows(fuzzed: bytes) -> None:
     _feed(decoder.receive, fuzzed)
 
 
+TIMED = TextFormat(columns=(1, 2), time_column=0)
+
+
+def text_times(fuzzed: bytes) -> None:
+    """Rows of text with a time and no counter."""
+    decoder = TextDecoder("A", TIMED, sampling_rate=10.0)
+    found = _feed(decoder.receive, fuzzed)
+    rows = [f"{LATER + k / 10:.1f},{k},0\n" for k in range(80)]
+    # what was fuzzed may have had a time among these: of the later ones each must come
+    settled = decoder.receive(("\n" + "".join(rows[:40])).encode(), _at(LATER + 4))
+    later = decoder.receive("".join(rows[40:]).encode(), _at(LATER + 8))
+    _demand(later, 40)
+    _demand([*found, *settled, *later], 40)
+
+
+THREE = replace(RASPBERRY_SHAKE, channel_names=("EHZ", "EHN", "EHE"))
+
+
+def text_datagrams(fuzzed: bytes) -> None:
+    """Packets of three channels, a datagram each, in any order."""
+    decoder = TextDecoder("A", THREE, sampling_rate=100.0)
+    _demand(_feed(decoder.receive_datagram, fuzzed), 0)
+
+
 def text_packets(fuzzed: bytes) -> None:
     """Packets of a Raspberry Shake."""
     decoder = TextDecoder("A", RASPBERRY_SHAKE, sampling_rate=100.0)
     _feed(decoder.receive, fuzzed)
     packets = [
-        f"{{'EHZ', {LATER + k / 4:.3f}, {', '.join(map(str, range(25)))}}}" for k in range(4)
+        f"{{'EHZ', {LATER + k / 4:.3f}, {', '.join(map(str, range(25)))}}}" for k in range(16)
     ]
     decoder.receive(b"}", _at(LATER))  # ends what was begun
-    _demand([x for packet in packets for x in decoder.receive(packet.encode(), _at(LATER + 1))], 75)
+    # what was fuzzed may have had a time among these: of the later ones each must come
+    settled = [x for p in packets[:8] for x in decoder.receive(p.encode(), _at(LATER + 2))]
+    later = [x for p in packets[8:] for x in decoder.receive(p.encode(), _at(LATER + 4))]
+    _demand(later, 8 * 25)
+    _demand([*settled, *later], 8 * 25)
 
 
 TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
@@ -213,6 +243,11 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
     "labjack_registers": (labjack_registers, [b"\xff" + bytes.fromhex("000100000006ff0400000002")]),
     "fifo": (fifo, [b"\x10" + rtu.encode(1, bytes((4, 8)) + struct.pack(">4H", 3, 1, 2, 3))]),
     "text_rows": (text_rows, [b"\xff1,2,3,0,10.0\n2,3,4,1,10.1\n", b"\x03-1e5,nan,inf,x,1\n"]),
+    "text_times": (text_times, [b"\xff10.0,1,2\n10.1,2,3\n10.1,2,3\n", b"\x091e5,1,1\n9.9,0,0\n"]),
+    "text_datagrams": (
+        text_datagrams,
+        [b"\x13" + b"".join(b"{'EH%c', 10.%d, 1}  " % (c, k) for k in range(3) for c in b"ZNE")],
+    ),
     "text_packets": (text_packets, [b"\xff{'EHZ', 1582315130.292, 14168, 14927, 7}"]),
 }
 """Name → what to run, and inputs to begin with."""

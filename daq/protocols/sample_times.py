@@ -1,0 +1,170 @@
+"""From the times a device writes beside its samples to sample indices, gaps and repetitions.
+
+Theory of operation
+-------------------
+The counterpart of :mod:`daq.protocols.counting` for devices that send a time and no counter. A
+time, in sample periods since the first, less the index it should belong to is the *offset* of the
+two: constant but for the slow drift of a clock, which is followed, and for how finely times are
+written. A time
+
+- that is half a period or more past where the next sample should be says that samples are missing:
+  as many as fit. Where times are written to half a period or finer their number is exact. Where
+  one time stands for many samples, only its first occurrence is looked at, and the number may be
+  wrong by one;
+- that came before, or lies before one that came, belongs to a sample that is known (a datagram
+  that came twice or too late). Where times are written more coarsely than half a period, only a
+  message that repeats the one before to the letter is taken for a repetition, and where they are
+  coarser than a period none is;
+- further ahead than host time allows, or long past when nothing else has come for a while, is
+  *doubtful*: damaged on the way, or somebody set the device's clock. The next one tells: if it
+  goes on from there, it was the clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from daq.protocols.block import HostTime
+
+CLOCK_TOLERANCE = 200e-6
+"""Largest relative rate error of a device's clock that is followed."""
+SLACK_NS = 1_000_000_000
+"""How far ahead of the earliest arrival a time may seem: the latency of that arrival."""
+LATE_NS = 2_000_000_000
+"""Nothing comes later than this after what was sent behind it."""
+HOUR_NS = 3600 * 10**9
+GAIN = 0.05
+"""Of the average that follows a drifting clock, a message."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where samples belong.
+
+    Attributes
+    ----------
+    kind
+        "next": after ``missing`` others; "known": they came before; "doubtful": their time says
+        nothing yet; "reset": the device's clock was set, and the doubtful ones before these come
+        first, after ``missing`` others by host time.
+    is_exact
+        Whether ``missing`` is.
+    """
+
+    kind: Literal["next", "known", "doubtful", "reset"]
+    missing: int = 0
+    is_exact: bool = True
+
+
+class SampleTimes:
+    """Places samples by the times a device states.
+
+    Parameters
+    ----------
+    sampling_rate : float
+        In Hz.
+    """
+
+    def __init__(self, sampling_rate: float) -> None:
+        self._rate = sampling_rate
+        self._origin_ns: int | None = None  # the time of index 0
+        self._next = 0  # index the next sample should have
+        self._offset: float | None = 0.0  # of times and indices, in periods
+        self._n_seen = 0
+        self._latest_ns = 0  # the last time that was believed
+        self._at_ns = 0  # when it came
+        self._lag_ns = 0.0  # least time between a sample and its arrival, but for a constant
+        self._doubtful: tuple[int, int, HostTime] | None = None  # time, samples, arrival
+
+    def missing(self, time_ns: int) -> int:
+        """Return how many samples lie between those known and these."""
+        if self._origin_ns is None or self._offset is None:
+            return 0
+        return max(0, round(self._ahead(time_ns) - self._offset))
+
+    def is_known(self, time_ns: int, at: HostTime, *, resolution_ns: int) -> bool:
+        """Return whether samples of this time came before, or come too late."""
+        if self._origin_ns is None or self._is_doubtful(time_ns, at, resolution_ns):
+            return False
+        return time_ns <= self._latest_ns
+
+    def place(
+        self, time_ns: int, n_samples: int, at: HostTime, *, resolution_ns: int, alike: bool = False
+    ) -> Place:
+        """Place samples.
+
+        Parameters
+        ----------
+        time_ns : int
+            What the device says of the first of them.
+        n_samples : int
+            How many there are.
+        at : HostTime
+            When they came.
+        resolution_ns : int
+            How finely times are written.
+        alike : bool
+            Whether the message is the one before, to the letter.
+        """
+        width = resolution_ns * 1e-9 * self._rate
+        if self._origin_ns is None:
+            self._begin(time_ns, at, width=width)
+            return self._take(time_ns, n_samples, at, 0, is_exact=True)
+        if self._is_doubtful(time_ns, at, resolution_ns):
+            return self._doubt(time_ns, n_samples, at, resolution_ns)
+        self._doubtful = None
+        if time_ns < self._latest_ns:
+            return Place("known")
+        if time_ns == self._latest_ns:
+            if width <= 0.5 or (width <= 1 and alike):
+                return Place("known")
+            return self._take(time_ns, n_samples, at, 0, is_exact=True)
+        ahead = self._ahead(time_ns)
+        if self._offset is None:  # the first time that says when it began
+            self._offset = ahead
+        missing = max(0, round(ahead - self._offset))
+        self._n_seen += 1
+        gain = max(GAIN, 1 / self._n_seen)
+        self._offset += gain * (ahead - missing - self._offset)
+        return self._take(time_ns, n_samples, at, missing, is_exact=width <= 0.5)
+
+    def _ahead(self, time_ns: int) -> float:
+        return (time_ns - (self._origin_ns or 0)) * 1e-9 * self._rate - self._next
+
+    def _begin(self, time_ns: int, at: HostTime, *, width: float) -> None:
+        self._origin_ns, self._next, self._n_seen = time_ns, 0, 1
+        self._offset = 0.0 if width <= 1 else None
+        self._lag_ns = at.monotonic_ns - time_ns
+
+    def _take(
+        self, time_ns: int, n_samples: int, at: HostTime, missing: int, *, is_exact: bool
+    ) -> Place:
+        self._next += missing + n_samples
+        self._lag_ns = min(self._least_lag(at), at.monotonic_ns - time_ns)
+        self._latest_ns, self._at_ns = time_ns, at.monotonic_ns
+        return Place("next", missing, is_exact)
+
+    def _least_lag(self, at: HostTime) -> float:
+        return self._lag_ns + CLOCK_TOLERANCE * (at.monotonic_ns - self._at_ns)
+
+    def _is_doubtful(self, time_ns: int, at: HostTime, resolution_ns: int) -> bool:
+        if at.monotonic_ns - time_ns < self._least_lag(at) - SLACK_NS - resolution_ns:
+            return True
+        back_ns, waited_ns = self._latest_ns - time_ns, at.monotonic_ns - self._at_ns
+        return back_ns > HOUR_NS or (back_ns > 0 and waited_ns > LATE_NS)
+
+    def _doubt(self, time_ns: int, n_samples: int, at: HostTime, resolution_ns: int) -> Place:
+        before, self._doubtful = self._doubtful, (time_ns, n_samples, at)
+        if before is None:
+            return Place("doubtful")
+        first_ns, n_first, came = before
+        step_ns, waited_ns = time_ns - first_ns, at.monotonic_ns - came.monotonic_ns
+        if not -SLACK_NS <= waited_ns - step_ns + resolution_ns <= HOUR_NS or step_ns < 0:
+            return Place("doubtful")
+        self._doubtful = None
+        missing = round((came.monotonic_ns - self._at_ns) * 1e-9 * self._rate) - n_first
+        self._begin(first_ns, came, width=resolution_ns * 1e-9 * self._rate)
+        self._take(first_ns, n_first, came, 0, is_exact=True)
+        return Place("reset", max(0, missing), is_exact=False)
