@@ -1,63 +1,56 @@
-"""Diagnostics in plain words: section 5 of the paper, and what the model test adds to it."""
+"""Diagnostics in plain words: section 5 of the paper, and what the model test adds to it.
+
+A model that does not hold is graded by what that may do to the noise estimate. What the averages
+show of the misfit is a share ``sqrt((ratio - 1) / (n - d))`` of the noise, with the statistic
+``ratio`` times its expectation. The estimate is off by more, because it takes up most of a misfit
+before the test sees the rest: computed on true matrices by up to `TYPICAL` times as much for noise
+that channels share, noise of a sensor's own stand, or one more dimension of motion; for waves that
+cross sensors 0.1 m apart by up to `CROSSING` times with four sensors or more, `CROSSING_THREE`
+times with three triaxial ones, and without bound with three sensors of fewer channels.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.presence import presence
 from estimator.self_noise import Flag
+from estimator.wording import Advice, in_hz, listed, percent, signed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
 
-    from estimator.arrays import IntArray
+    from estimator.coherency import Coherency
     from estimator.diagnostics import BandDiagnosis
     from estimator.response import RelativeResponse
+    from estimator.wording import Level
 
-Level = Literal["problem", "warning", "note"]
+__all__ = ["Advice", "advise"]
 
 REJECT = 0.01
 TURNED_DEG = 0.5
 SKEWED_DEG = 2.0
 GAIN = 0.02
 DELAY_SAMPLES = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """One thing to know about the test.
-
-    Attributes
-    ----------
-    level : {"problem", "warning", "note"}
-        The estimate is wrong; it may be, or is less sure than it could be; good to know.
-    sensors : tuple of int
-        It concerns, from 0; empty for all.
-    band : (float, float) or None
-        Hz; None for all frequencies.
-    text : str
-        A sentence or two.
-    numbers : mapping of str to float
-        What the text is based on.
-    """
-
-    level: Level
-    sensors: tuple[int, ...]
-    band: tuple[float, float] | None
-    text: str
-    numbers: Mapping[str, float]
+TYPICAL = 6.0
+CROSSING = 20.0
+CROSSING_THREE = 100.0
+FAR_OFF = 0.5
+"""Of the noise: an estimate that is off by this is wrong."""
+LITTLE_OFF = 0.05
 
 
 def advise(
     bands: tuple[BandDiagnosis, ...],
     responses: tuple[RelativeResponse, ...],
-    flags: IntArray,
+    given: Coherency,
     *,
     dims: tuple[int, ...],
     names: tuple[str, ...],
+    channels: tuple[str, ...],
     n_effective: float,
     nyquist: float,
 ) -> tuple[Advice, ...]:
@@ -68,11 +61,13 @@ def advise(
     bands : tuple of BandDiagnosis
         Rising.
     responses : tuple of RelativeResponse
-    flags : int64, shape (n_freqs, n_channels)
-        Of `estimator.coherency.Coherency`.
+    given : Coherency
+        The averages.
     dims : tuple of int
     names : tuple of str
         Of the sensors.
+    channels : tuple of str
+        Names of all channels.
     n_effective : float
     nyquist : float
         Hz.
@@ -82,11 +77,16 @@ def advise(
     tuple of Advice
     """
     found = [
-        *_channels(flags, dims, names),
-        *_incoherence(bands, dims),
-        *_dimensions(bands, dims, n_effective),
+        *_absent(given, dims, names, channels),
+        *_incoherence(bands, dims, n_effective),
+        *_sensor_space(bands, dims),
+        *_dimensions(bands, presence(given, dims).dims, n_effective),
         *_weak_motion(bands),
-        *(advice for response in responses for advice in _stance(response, names, nyquist)),
+        *(
+            advice
+            for response in responses
+            for advice in _stance(response, names, channels, dims, nyquist)
+        ),
     ]
     order = {"problem": 0, "warning": 1, "note": 2}
     return tuple(sorted(found, key=lambda advice: order[advice.level]))
@@ -110,51 +110,124 @@ def _is_weak(band: BandDiagnosis) -> bool:
     return len(known) > 0 and bool(known.max() < 1)
 
 
-def _words(band: tuple[float, float]) -> str:
-    return f"{band[0]:.3g}–{band[1]:.3g} Hz"
-
-
-def _channels(flags: IntArray, dims: tuple[int, ...], names: tuple[str, ...]) -> Iterator[Advice]:
+def _absent(
+    given: Coherency, dims: tuple[int, ...], names: tuple[str, ...], channels: tuple[str, ...]
+) -> Iterator[Advice]:
+    """Channels that are dead or copies, and what can be said without them."""
+    finite = (given.flags & Flag.NOT_FINITE == 0).all(axis=1)
     sensor_of = np.repeat(np.arange(len(dims)), dims)
-    for flag, words in (
-        (Flag.DEAD_CHANNEL, "has no signal"),
-        (Flag.DUPLICATE, "is a copy of another channel"),
-    ):
-        share = ((flags & flag) != 0).mean(axis=0)
-        for channel in np.flatnonzero(share > 0.5):
-            sensor = int(sensor_of[channel])
-            number = int(channel - sum(dims[:sensor])) + 1
-            yield Advice(
-                "problem",
-                (sensor,),
-                None,
-                f"Channel {number} of sensor {names[sensor]} {words}: nothing can be said of its "
-                "noise.",
-                {"share of frequencies": float(share[channel])},
-            )
-
-
-def _incoherence(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
-    for run in _runs(bands, lambda band: band.test.p_value < REJECT):
-        ratio = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
-        worst = max(run, key=lambda b: b.test.statistic / b.test.degrees)
-        most = worst.test.statistic / worst.test.degrees
-        at = f", {most:.3g} at {_words((worst.low, worst.high))}" if len(run) > 1 else ""
-        text = (
-            f"At {_words(_span(run))} one motion of {max(dims)} dimensions does not explain what "
-            f"the sensors have in common (statistic {ratio:.3g} times its expectation{at}): their "
-            "noise is estimated wrong there. Put the sensors closer together; look for tilt, "
-            "noise that two channels share (cable, digitizer), and clocks that drift."
+    labels = [f"{names[s]}.{name}" for s, name in zip(sensor_of, channels, strict=True)]
+    dead = ((given.flags[finite] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
+    copies = given.duplicates[finite].mean(axis=0)
+    for sensor, name in enumerate(names):
+        own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
+        if not len(own):
+            continue
+        which = f"{listed([labels[c] for c in own])} {'has' if len(own) == 1 else 'have'} no signal"
+        if len(own) == dims[sensor] > 1:
+            which = f"Sensor {name} has no signal on any channel"
+        yield Advice(
+            "problem",
+            (sensor,),
+            None,
+            f"{which} (no power, or always the same count): nothing can be said of its noise.",
+            {"share of frequencies": float(dead[own].max())},
+            "Look at cable, supply and the channel's place in the bench file.",
         )
-        if max(dims) < 3:
-            text += (
-                f" If the motion has more than {max(dims)} dimensions, sensors of {max(dims)} "
-                "channels must stand exactly alike: align them, or use triaxial data."
+    pairs = np.argwhere(np.triu(copies > 0.5))
+    if len(pairs):
+        same = listed([f"{labels[q]} repeats {labels[p]}" for p, q in pairs])
+        yield Advice(
+            "problem",
+            tuple(int(s) for s in np.unique(sensor_of[pairs])),
+            None,
+            f"{same}, sample for sample: they share their noise, and nothing can be said of it.",
+            {"share of frequencies": float(copies.max())},
+            "One signal is wired or named twice: look at ports and channels of the bench file.",
+        )
+    there = presence(given, dims)
+    missing = [s for s in range(len(dims)) if s not in there.whole]
+    if len(there.sensors) < 3:
+        left = [names[s] for s in there.sensors]
+        who = (
+            f"Only sensors {listed(left)} have" if len(left) == 2 else "Fewer than two sensors have"
+        )
+        yield Advice(
+            "problem",
+            there.sensors,
+            None,
+            f"{who} a signal of their own: motion and noise cannot be told apart without knowing "
+            "how the sensors stand, and neither the common motion nor alignment can be tested. "
+            "What is certain: no channel's noise is above its own spectrum.",
+            {"sensors": float(len(left))},
+            "Two sensors allow the two-channel method (--method two-channel), if like channels "
+            "point the same way and their gains are known (--gain): a gain wrong by 1 % leaves "
+            "1 % of the motion in the noise, a channel turned by 1° leaves 0.03 % of the motion "
+            "across it. For more than that mend or exchange the third sensor."
+            if len(left) == 2
+            else "Mend or exchange sensors until three have a signal.",
+        )
+    elif missing and len(there.whole) < 3:
+        whole = [names[s] for s in there.whole]
+        yield Advice(
+            "warning",
+            tuple(missing),
+            None,
+            f"With channels of {listed([names[s] for s in missing])} missing, three-sensor "
+            f"estimates say nothing of {listed(whole) if whole else 'any sensor'}: each needs two "
+            "others with all their channels. Nor can the stance of all sensors be compared.",
+            {"whole sensors": float(len(whole))},
+            "Maximum likelihood uses the channels that are left (--method maximum-likelihood).",
+        )
+
+
+def _incoherence(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
+) -> Iterator[Advice]:
+    d = max(dims)
+    crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
+    for run in _runs(bands, lambda band: band.test.p_value < REJECT):
+        ratios = [b.test.statistic / b.test.degrees for b in run]
+        ratio = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
+        most = max(ratios)
+        worst = run[ratios.index(most)]
+        seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
+        off, at_most = TYPICAL * seen, crossing * seen
+        at = f", {most:.3g} at {in_hz((worst.low, worst.high))}" if len(run) > 1 else ""
+        likely = float(np.sqrt(off * at_most)) if np.isfinite(at_most) else off
+        level: Level = "warning" if likely >= LITTLE_OFF else "note"
+        if likely >= FAR_OFF:
+            level = "problem"
+        apart = (
+            f"{percent(at_most)} of it where waves cross sensors that stand apart"
+            if np.isfinite(at_most)
+            else "any amount where waves cross sensors that stand apart, which three sensors of "
+            f"{d} channel{'s' if d > 1 else ''} cannot show"
+        )
+        few = "1 dimension" if d == 1 else f"{d} dimensions"
+        text = (
+            f"At {in_hz(_span(run))} one motion of {few} does not explain what the sensors have in "
+            f"common (statistic {ratio:.3g} times its expectation{at}). "
+            f"Unexplained is {percent(seen)} of the noise; the estimate "
+            f"{'is wrong' if off >= FAR_OFF else 'may be off'} there, by up to about "
+            f"{percent(off)} of it, and by {apart}."
+        )
+        remedy = (
+            "Put the sensors closer together; look for tilt, noise that two channels share (cable, "
+            "digitizer), and clocks that drift."
+        )
+        if d < 3:
+            remedy += (
+                f" If the motion has more than {d} dimension{'s' if d > 1 else ''}, sensors of {d} "
+                f"channel{'s' if d > 1 else ''} must stand exactly alike: align them, or use "
+                "triaxial data."
             )
         if len(dims) > 3:
-            text += f" With {len(dims)} sensors more dimensions can be allowed (dimension auto)."
+            remedy += (
+                f" With {len(dims)} sensors more dimensions can be allowed (--dimension auto)."
+            )
         yield Advice(
-            "problem" if most > 2 else "warning",
+            level,
             (),
             _span(run),
             text,
@@ -162,13 +235,41 @@ def _incoherence(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Ite
                 "statistic over expectation": ratio,
                 "worst": most,
                 "least p value": min(b.test.p_value for b in run),
+                "unexplained": seen,
+                "off": off,
+                "off at most": at_most,
             },
+            remedy,
         )
+
+
+def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
+    """Section 5: the motion's dimension against that of what a sensor can feel."""
+    d = max(dims)
+    strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
+    if d == 3 or not strong:
+        return
+    snr = float(max(np.nanmax(band.snr) for band in strong))
+    leaked = snr * np.sin(np.deg2rad(1)) ** 2
+    which = "planes" if d == 2 else "axes"
+    yield Advice(
+        "note",
+        (),
+        _span(strong),
+        f"Sensors of {d} channel{'s' if d > 1 else ''} feel {d} of three dimensions of motion: no "
+        f"bias if the motion has no more, or if their {which} are parallel; otherwise motion "
+        f"across them is taken for noise. At the SNR here ({snr:.2g}) 1° between their {which} "
+        f"adds up to {percent(leaked)} of the noise.",
+        {"SNR": snr, "added by 1 degree": leaked},
+        f"Level or align the sensors so that their {which} are parallel, or use triaxial data.",
+    )
 
 
 def _dimensions(
     bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
 ) -> Iterator[Advice]:
+    if len(dims) < 2:
+        return
     full = min(sorted(dims)[-2:])
     for run in _runs(bands, lambda band: band.dimension < full and not _is_weak(band)):
         least = min(b.dimension for b in run)
@@ -176,10 +277,11 @@ def _dimensions(
             "warning",
             (),
             _span(run),
-            f"At {_words(_span(run))} the motion has only {least:.0f} of {full} dimensions: the "
-            "three-sensor estimate stays unbiased but scatters more. Choose the dimension "
-            "by the motion (dimension auto), or stir the floor in all directions.",
+            f"At {in_hz(_span(run))} the motion has only {least:.0f} of {full} dimensions: the "
+            "three-sensor estimate stays unbiased but scatters more.",
             {"dimension": least, "condition": max(b.condition for b in run)},
+            "Choose the dimension by the motion (--dimension auto), or stir the floor in all "
+            "directions.",
         )
     limit = float(np.sqrt(n_effective))
     for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
@@ -188,7 +290,7 @@ def _dimensions(
             "note",
             (),
             _span(run),
-            f"At {_words(_span(run))} the cross-spectral matrix between two sensors is nearly "
+            f"At {in_hz(_span(run))} the cross-spectral matrix between two sensors is nearly "
             f"singular (condition {worst:.3g}): one direction moves far less than the others, "
             "and the three-sensor estimate scatters more.",
             {"condition": worst},
@@ -202,29 +304,38 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
             "note",
             (),
             _span(run),
-            f"At {_words(_span(run))} the motion is weaker than the noise (SNR {snr:.2g} at "
+            f"At {in_hz(_span(run))} the motion is weaker than the noise (SNR {snr:.2g} at "
             "most): the spectra are nearly the noise itself, and neither alignment nor method "
             "matters much.",
             {"SNR": snr},
         )
 
 
-def _stance(response: RelativeResponse, names: tuple[str, ...], nyquist: float) -> Iterator[Advice]:
+def _stance(
+    response: RelativeResponse,
+    names: tuple[str, ...],
+    channels: tuple[str, ...],
+    dims: tuple[int, ...],
+    nyquist: float,
+) -> Iterator[Advice]:
     pair = (response.first, response.second)
     band = (response.low, response.high)
     one, two = (names[sensor] for sensor in pair)
+    own = [f"{two}.{name}" for name in channels[sum(dims[: pair[1]]) :][: dims[pair[1]]]]
+    like = [f"{one}.{name}" for name in channels[sum(dims[: pair[0]]) :][: dims[pair[0]]]]
     error = response.angle_error_deg
     if response.rotation_deg > max(TURNED_DEG, 3 * error if np.isfinite(error) else 0.0):
         horizontal = response.horizontal_deg
-        where = f" ({horizontal:.2f}° in the horizontal)" if np.isfinite(horizontal) else ""
+        where = f" ({signed(horizontal, '.2f')}° in the horizontal)"
         yield Advice(
             "note",
             pair,
             band,
-            f"Sensors {one} and {two} are turned by {response.rotation_deg:.1f}°{where}: no bias "
-            "in the three-sensor or maximum likelihood estimate, but a three-channel estimate "
-            "leaks motion; aligning them can improve precision.",
+            f"Sensors {one} and {two} are turned by {response.rotation_deg:.1f}°"
+            f"{where if np.isfinite(horizontal) else ''}: no bias in the three-sensor or maximum "
+            "likelihood estimate, but a three-channel or two-channel estimate leaks motion.",
             {"angle_deg": response.rotation_deg, "horizontal_deg": horizontal, "error_deg": error},
+            "Aligning them can improve precision.",
         )
     if response.nonorthogonality_deg > SKEWED_DEG:
         yield Advice(
@@ -235,14 +346,17 @@ def _stance(response: RelativeResponse, names: tuple[str, ...], nyquist: float) 
             "from a right angle: no bias, but the noise estimate scatters more the more "
             "collinear they are.",
             {"nonorthogonality_deg": response.nonorthogonality_deg},
+            "Channels at right angles are best.",
         )
     for channel in response.reversed_channels:
         yield Advice(
             "warning",
             pair,
             band,
-            f"Channel {channel + 1} of sensor {two} has the opposite polarity of sensor {one}'s.",
+            f"{own[channel]} has the opposite polarity of {like[channel]}: no bias in the "
+            "three-sensor or maximum likelihood estimate, but its sensitivity has the wrong sign.",
             {"channel": float(channel + 1)},
+            "Give it the opposite sign in the bench file, or swap its wires.",
         )
     off = int(np.argmax(np.abs(response.gains - 1)))
     if abs(response.gains[off] - 1) > GAIN:
@@ -250,19 +364,20 @@ def _stance(response: RelativeResponse, names: tuple[str, ...], nyquist: float) 
             "note",
             pair,
             band,
-            f"Channel {off + 1} of sensor {two} reads {response.gains[off]:.3f} times what sensor "
-            f"{one} reads: no bias, but one of the two sensitivities is wrong, and with it the "
-            "noise in physical units.",
+            f"{own[off]} reads {response.gains[off]:.3f} times what {like[off]} would: no bias, "
+            "but one of the two sensitivities is wrong, and with it the noise in physical units.",
             {"gain": float(response.gains[off])},
+            "Look at the sensitivities in the bench file.",
         )
     samples = response.delay * 2 * nyquist
     if abs(samples) > DELAY_SAMPLES:
+        late, early = (two, one) if samples > 0 else (one, two)
         yield Advice(
             "warning",
             pair,
             band,
-            f"Sensor {two} lags sensor {one} by {response.delay * 1e3:.3g} ms "
-            f"({samples:.2g} samples): segments then differ at their ends. Use a tapered window, "
-            "and align the clocks.",
+            f"Sensor {late} lags sensor {early} by {abs(response.delay) * 1e3:.3g} ms "
+            f"({abs(samples):.2g} samples): segments then differ at their ends.",
             {"delay_s": response.delay, "samples": samples},
+            "Align the clocks, and use a tapered window.",
         )

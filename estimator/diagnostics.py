@@ -7,7 +7,7 @@ they apply.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from estimator.dimension import bands
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import maximise, testable
 from estimator.model_test import BandTest, ModelTest, model_test, pool
+from estimator.presence import Presence, presence
 from estimator.response import (
     RelativeResponse,
     canonical_coherence,
@@ -43,7 +44,7 @@ class BandDiagnosis:
     low, high : float
         Of its frequencies, Hz.
     coherence : float
-        Median of the least coherence between like channels of any two sensors.
+        Median of the least coherence between like channels of any two sensors that have signal.
     condition : float
         Of the worst ``S_jk``.
     dimension : float
@@ -82,12 +83,13 @@ class Diagnostics:
         Dimensions of the motion that the averages show (canonical coherences between two
         sensors, tested at 1 %).
     snr : float64, shape (n_freqs, n_channels)
-        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi.
+        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for channels that are
+        dead or copies of others, of which the model and its test know nothing.
     model : ModelTest
         At every frequency.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
-        Of the pairs that can be compared.
+        Of the pairs that can be compared: of sensors with all their channels.
     advice : tuple of Advice
         Worst first.
     """
@@ -112,9 +114,12 @@ def diagnose(
     n_effective: float,
     neighbours: FloatArray | None = None,
     names: tuple[str, ...] | None = None,
+    channels: tuple[str, ...] | None = None,
     vertical: int | None = None,
 ) -> Diagnostics:
     """Diagnose a huddle test.
+
+    Channels that are dead, or copies of earlier ones, are named and left aside.
 
     Parameters
     ----------
@@ -127,11 +132,13 @@ def diagnose(
         Channels of each sensor, three or more.
     n_effective : float
         Independent averages. With no more than channels everything that needs the likelihood
-        (SNR and model test) is NaN.
+        (SNR and model test) is NaN, and so with fewer than three sensors that have signal.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.model_test.neighbour_correlation`.
     names : tuple of str, optional
         Of the sensors; "1", "2", … by default.
+    channels : tuple of str, optional
+        Names of all channels, each within its sensor; "1", "2", … by default.
     vertical : int, optional
         Which channel of every sensor is vertical, for the horizontal angles.
 
@@ -152,26 +159,33 @@ def diagnose(
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
     pairs = tuple(combinations(range(len(dims)), 2))
     coherence = np.stack(
-        [matched_coherence(given.matrix, dims, j, k).min(axis=1) for j, k in pairs], axis=1
+        [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
     )
-    condition = np.stack([_condition(given.matrix, dims, j, k) for j, k in pairs], axis=1)
-    matrix = testable(given, frequency)
-    model, snr = _model(matrix, dims, n_effective)
-    dimension = _dimension(matrix, dims, n_effective)
+    there = presence(given, dims)
+    part = given.part(list(there.channels))
+    matrix = testable(part, frequency)
+    condition = np.full((len(csm), len(pairs)), np.nan)
+    for one, two in combinations(range(len(there.sensors)), 2):
+        pair = pairs.index((there.sensors[one], there.sensors[two]))
+        condition[:, pair] = _condition(part.matrix, there.dims, one, two)
+    model, snr = _model(matrix, there, max(dims), n_effective)
+    snr = there.spread(snr, sum(dims))
+    dimension = _dimension(matrix, there.dims, n_effective)
     number = bands(frequency)
     found = tuple(
         BandDiagnosis(
             low=float(frequency[inside][0]),
             high=float(frequency[inside][-1]),
-            coherence=_median(coherence[inside].min(axis=1)),
-            condition=_median(condition[inside].max(axis=1)),
+            coherence=_median(_least(coherence[inside])),
+            condition=_median(-_least(-condition[inside])),
             dimension=_median(dimension[inside]),
             snr=np.array([_median(channel) for channel in snr[inside].T]),
             test=pool(model, inside, neighbours=neighbours),
         )
         for inside in (number == b for b in np.unique(number))
     )
-    responses = _responses(csm, frequency, dims, vertical)
+    alive = np.ix_(range(len(csm)), there.channels, there.channels)
+    responses = _responses(csm[alive], frequency, there, vertical)
     return Diagnostics(
         frequency=frequency,
         pairs=pairs,
@@ -185,13 +199,20 @@ def diagnose(
         advice=advise(
             found,
             responses,
-            given.flags,
+            given,
             dims=dims,
             names=names or tuple(str(i + 1) for i in range(len(dims))),
+            channels=channels or tuple(str(r + 1) for d in dims for r in range(d)),
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
         ),
     )
+
+
+def _least(values: FloatArray) -> FloatArray:
+    """Least of the numbers of each row, shape (n_freqs,); NaN where there is none."""
+    least = np.where(np.isnan(values), np.inf, values).min(axis=1)
+    return np.where(np.isnan(values).all(axis=1), np.nan, least)
 
 
 def _median(values: FloatArray) -> float:
@@ -208,16 +229,16 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
 
 
 def _model(
-    matrix: ComplexArray, dims: tuple[int, ...], n_effective: float
+    matrix: ComplexArray, there: Presence, d: int, n_effective: float
 ) -> tuple[ModelTest, FloatArray]:
     """Model test and SNR at every frequency, NaN where unknown."""
     n_freqs, p = matrix.shape[:2]
     unknown = np.full(n_freqs, np.nan)
     nothing = ModelTest(unknown, unknown, unknown), np.full((n_freqs, p), np.nan)
-    if n_effective <= p:
+    if n_effective <= p or len(there.sensors) < 3:
         return nothing
     try:
-        maximum = maximise(matrix, max(dims))
+        maximum = maximise(matrix, d)
     except InsufficientDataError:  # too few channels to tell the noise from the motion
         return nothing
     snr = 1 / np.maximum(maximum.psi, np.finfo(np.float64).tiny) - 1
@@ -236,7 +257,7 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
     pairs = list(combinations(range(len(dims)), 2))
     found = np.zeros(len(matrix))
     usable = np.isfinite(matrix).all(axis=(1, 2))
-    if n_effective <= 2 * max(dims):
+    if not pairs or n_effective <= 2 * max(dims):
         return np.full(len(matrix), np.nan)
     for j, k in pairs:
         coherence = np.minimum(canonical_coherence(matrix, dims, j, k), 1 - 1e-15)
@@ -249,15 +270,18 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
 
 
 def _responses(
-    csm: ComplexArray, frequency: FloatArray, dims: tuple[int, ...], vertical: int | None
+    csm: ComplexArray, frequency: FloatArray, there: Presence, vertical: int | None
 ) -> tuple[RelativeResponse, ...]:
     found = []
-    for first, second in combinations(range(len(dims)), 2):
+    for first, second in combinations(range(len(there.sensors)), 2):
+        pair = there.sensors[first], there.sensors[second]
+        if not set(pair) <= set(there.whole):  # a like channel's motion might be missing
+            continue
         try:
             response = relative_response(
-                csm, frequency, dims=dims, first=first, second=second, vertical=vertical
+                csm, frequency, dims=there.dims, first=first, second=second, vertical=vertical
             )
         except InsufficientDataError:  # nothing to compare them by
             continue
-        found.append(response)
+        found.append(replace(response, first=pair[0], second=pair[1]))
     return tuple(found)

@@ -17,6 +17,7 @@ from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import max_factors, maximise, testable
 from estimator.likelihood import standard_error
 from estimator.model_test import HANN_HALF, BandTest, ModelTest, model_test, pool
+from estimator.presence import presence
 from estimator.prior import expected_noise, maximise_expecting
 
 if TYPE_CHECKING:
@@ -157,34 +158,42 @@ def choose_dimension(
     InvalidMatrixError
         As `estimator.coherency.coherency` says, or if `frequency` or `band` do not fit.
     InsufficientDataError
-        If there are fewer than three sensors or no more averages than channels.
+        If there are fewer than three sensors that have signal, or no more averages than channels.
 
     Notes
     -----
     Beyond ``max(dims)`` factors the likelihood carries the weak prior of
     `estimator.prior`, in the test as in the estimate. Three sensors are given
     no more than ``max(dims)``: whatever one of them feels alone is noise to the other two, so
-    further factors would take noise for motion; the test can only warn.
+    further factors would take noise for motion; the test can only warn. Channels that are dead,
+    or copies of earlier ones, count for nothing here: a fourth sensor of such channels is none.
     """
     check_dims(dims)
     given = coherency(csm, dims)
     if frequency.shape != (len(csm),):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
-    if n_effective <= sum(dims):
+    there = presence(given, dims)
+    given, n_channels = given.part(list(there.channels)), len(there.channels)
+    if len(there.sensors) < 3:
         raise InsufficientDataError(
-            f"{n_effective:.1f} averages of {sum(dims)} channels: more averages than channels "
+            f"{len(there.sensors)} sensors have a signal of their own: at least 3 are needed"
+        )
+    if n_effective <= n_channels:
+        raise InsufficientDataError(
+            f"{n_effective:.1f} averages of {n_channels} channels: more averages than channels "
             "are needed"
         )
     number = bands(frequency) if band is None else band
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number a frequency, never falling")
     matrix = testable(given, frequency)
-    most = _most_testable(sum(dims)) if len(dims) > 3 else min(max(dims), _most_testable(sum(dims)))
+    usual = max(dims)
+    most = _most_testable(n_channels)
+    most = most if len(there.sensors) > 3 else min(usual, most)
     stride = {int(b): -(-int(np.sum(number == b)) // MOST_BINS) for b in np.unique(number)}
     taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])
-    search = _Search(matrix[taken], given.psd[taken], number[taken], dims, n_effective)
+    search = _Search(matrix[taken], given.psd[taken], number[taken], there.dims, n_effective)
     r = HANN_HALF if neighbours is None else neighbours
-    usual = max(dims)
     open_bands = list(stride)
     tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
     cov: dict[int, float] = {}

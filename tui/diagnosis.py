@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from tui.text import signed
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -26,10 +28,11 @@ def summary(snapshot: Snapshot) -> list[str]:
         kinds.setdefault(next(iter(advice.numbers)), []).append(advice)
     lines = []
     for kind, found in kinds.items():
-        if kind == "share of frequencies":  # said with the channels' flags
-            continue
         in_short = _SHORT.get(kind)
-        lines += [advice.text for advice in found] if in_short is None else [in_short(found, names)]
+        if in_short is None or len(found) == 1:
+            lines += [_with_remedy(advice.text, advice.remedy) for advice in found]
+        else:
+            lines.append(_with_remedy(f"{in_short(found, names)}.", found[0].remedy))
     tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
     if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
         lines.append("model test: one common motion explains what the sensors share, in all bands")
@@ -38,13 +41,19 @@ def summary(snapshot: Snapshot) -> list[str]:
     return lines
 
 
+def _with_remedy(text: str, remedy: str) -> str:
+    return f"{text} {remedy}" if remedy else text
+
+
 def details(snapshot: Snapshot) -> list[RenderableType]:
     """Return the diagnosis of every band and pair of sensors, and all advice."""
     found = snapshot.diagnostics
     if "bands" not in found:
         return ["too few sensors or averages to diagnose the test"]
     parts: list[RenderableType] = [_bands(snapshot), _pairs(snapshot)]
-    parts += [f"{advice.level}: {advice.text}" for advice in found["advice"]]
+    parts += [
+        f"{advice.level}: {_with_remedy(advice.text, advice.remedy)}" for advice in found["advice"]
+    ]
     parts += [choice.text for choice in found.get("dimension", ())]
     return parts
 
@@ -76,11 +85,11 @@ def _pairs(snapshot: Snapshot) -> Table:
     for pair in snapshot.diagnostics["responses"]:
         table.add_row(
             f"{names[pair.first]} → {names[pair.second]}",
-            f"{pair.rotation_deg:.3f}°",
-            f"{pair.horizontal_deg:.3f}°" if math.isfinite(pair.horizontal_deg) else "?",
-            f"{pair.angle_error_deg:.3f}°" if math.isfinite(pair.angle_error_deg) else "?",
+            degrees(pair.rotation_deg),
+            degrees(pair.horizontal_deg),
+            degrees(pair.angle_error_deg),
             " ".join(f"{gain:.4f}" for gain in pair.gains),
-            f"{pair.delay * 1e6:.1f} µs".replace("-", "−"),
+            f"{signed(pair.delay * 1e6, '.1f')} µs",
             f"{pair.nonorthogonality_deg:.2f}°",
         )
     return table
@@ -100,25 +109,33 @@ def _dimensions(snapshot: Snapshot) -> list[str]:
     return lines
 
 
+def degrees(angle: float) -> str:
+    """Return an angle to a thousandth of a degree."""
+    return f"{signed(angle, '.3f')}°" if math.isfinite(angle) else "?"
+
+
 def _fails(found: Sequence[Advice], _names: list[str]) -> str:
     worst = sorted(found, key=lambda advice: advice.numbers["worst"], reverse=True)
     where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in worst)
-    hint = found[0].text.split("wrong there. ", 1)[-1]
+    most = max(found, key=lambda advice: advice.numbers["unexplained"])
+    _, effect = most.text.split(". ", 1)
     return (
         "model test fails at (statistic over its expectation) "
-        f"{where}: the sensors do not share one motion, their noise is estimated wrong there. "
-        f"{hint}"
+        f"{where}: one common motion does not explain what the sensors share. "
+        f"At {_span(most)}: {effect.rstrip('.')}"
     )
 
 
 def _turned(found: Sequence[Advice], names: list[str]) -> str:
     horizontal = all(math.isfinite(advice.numbers["horizontal_deg"]) for advice in found)
     which = "horizontal_deg" if horizontal else "angle_deg"
-    pairs = ", ".join(f"{_pair(advice, names)} {advice.numbers[which]:.3f}°" for advice in found)
+    pairs = ", ".join(
+        f"{_pair(advice, names)} {degrees(advice.numbers[which])}" for advice in found
+    )
     return (
         f"sensors are turned{' in the horizontal' if horizontal else ''}: {pairs}: no bias in the "
-        "three-sensor or maximum likelihood estimate, but a three-channel estimate leaks motion; "
-        "aligning them can improve precision"
+        "three-sensor or maximum likelihood estimate, but a three-channel or two-channel estimate "
+        "leaks motion"
     )
 
 
@@ -129,9 +146,10 @@ def _gains(found: Sequence[Advice], names: list[str]) -> str:
 
 def _delayed(found: Sequence[Advice], names: list[str]) -> str:
     pairs = ", ".join(
-        f"{_pair(advice, names)} {advice.numbers['delay_s'] * 1e3:.3g} ms" for advice in found
-    ).replace(" -", " −")
-    return f"sensors lag each other: {pairs}: align the clocks, and use a tapered window"
+        f"{_pair(advice, names)} {signed(advice.numbers['delay_s'] * 1e3, '.3g')} ms"
+        for advice in found
+    )
+    return f"sensors lag each other: {pairs}: segments then differ at their ends"
 
 
 def _singular(found: Sequence[Advice], _names: list[str]) -> str:

@@ -42,7 +42,7 @@ def level(psd: float) -> str:
     """Return a PSD in dB, and say so where it has none."""
     if math.isnan(psd):
         return "?"
-    return "below 0" if psd <= 0 else _signed(decibels(psd))
+    return "below 0" if psd <= 0 else signed(decibels(psd), ".2f")
 
 
 def level_with_error(psd: float, high: float) -> str:
@@ -61,5 +61,6 @@ def interval(low: float, high: float) -> str:
     return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
 
 
-def _signed(value: float) -> str:
-    return f"{value:.2f}".replace("-", "−")
+def signed(value: float, spec: str) -> str:
+    """Return a number with the minus sign of typography."""
+    return f"{value:{spec}}".replace("-", "−")

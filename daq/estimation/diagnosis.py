@@ -100,6 +100,7 @@ def diagnosis(
                     n_effective=band.n_effective,
                     neighbours=neighbours(band),
                     names=tuple(sensors),
+                    channels=tuple(channel.name for _, channel in channels),
                     vertical=vertical,
                 )
             except InsufficientDataError:  # two sensors, or too few averages

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.diagnostics import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.factor_analysis import maximise
+from estimator.model_test import model_test
 from tests.estimator.models import pentagon, plane_waves, random_bench, wishart
 
 if TYPE_CHECKING:
@@ -60,8 +62,8 @@ def test_turned_sensors_are_told_with_their_angle() -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (np.diag([1.0, 1.05, 1.0]), "Channel 2 of sensor 2 reads 1.05"),
-        (np.diag([1.0, -1.0, 1.0]), "Channel 2 of sensor 2 has the opposite polarity"),
+        (np.diag([1.0, 1.05, 1.0]), "2.2 reads 1.05"),
+        (np.diag([1.0, -1.0, 1.0]), "2.2 has the opposite polarity"),
         (np.array([[1, 0, 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]]), "5.7° away"),
     ],
     ids=["gain", "polarity", "not orthogonal"],
@@ -80,16 +82,16 @@ def test_incoherence_is_a_problem_where_it_is() -> None:
     assert problem.band[0] > 2
     assert problem.band[1] == FREQUENCY[-1]
     assert found.bands[-1].test.p_value < 1e-10
-    assert "dimension auto" not in problem.text
+    assert "dimension auto" not in problem.remedy
     five = of(averages(plane_waves(FREQUENCY, pentagon(), snr=400.0)), dims=(3,) * 5)
-    assert any("dimension auto" in advice.text for advice in five.advice)
+    assert any("dimension auto" in advice.remedy for advice in five.advice)
 
 
 def test_planar_sensors_in_motion_of_three_dimensions_are_told_why() -> None:
     tilted = Rotation.from_euler("x", 10, degrees=True).as_matrix()
     two = [tilted[:2], np.eye(3)[:2], tilted.T[:2]]
     found = of(averages(bench(*two)), dims=(2, 2, 2))
-    assert any("use triaxial data" in advice.text for advice in found.advice)
+    assert any("use triaxial data" in advice.remedy for advice in found.advice)
 
 
 def test_a_missing_dimension_is_seen() -> None:
@@ -117,13 +119,134 @@ def test_a_lagging_sensor() -> None:
     assert lags[0].numbers["samples"] == pytest.approx(0.8, rel=0.01)
 
 
-def test_dead_copied_and_broken_channels_do_not_stop_the_report() -> None:
-    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
+    csm = averages(bench(*[np.eye(3)] * 4))
+    whole = diagnose(csm, FREQUENCY, dims=(3,) * 4, n_effective=1080, neighbours=INDEPENDENT)
+    alive = np.delete(np.arange(12), 4)
+    part = csm[:, alive[:, None], alive]
     csm[:, 4, :] = csm[:, :, 4] = 0
     csm[5] = np.nan
-    found = of(csm)
-    assert any("Channel 2 of sensor 2 has no signal" in advice.text for advice in found.advice)
+    found = diagnose(
+        csm,
+        FREQUENCY,
+        dims=(3,) * 4,
+        n_effective=1080,
+        neighbours=INDEPENDENT,
+        names=("A", "B", "C", "D"),
+        channels=("X", "Y", "Z") * 4,
+    )
+    (problem,) = [advice for advice in found.advice if advice.level == "problem"]
+    assert problem.text.startswith("B.Y has no signal")
+    known = np.delete(np.arange(96), 5)
     assert np.isnan(found.model.statistic[5])
+    direct = model_test(maximise(part[known], 3), n_effective=1080)  # never there: fewer degrees
+    np.testing.assert_allclose(found.model.statistic[known], direct.statistic, rtol=1e-6)
+    np.testing.assert_array_equal(found.model.degrees[known], direct.degrees)
+    assert np.isnan(found.snr[:, 4]).all()
+    np.testing.assert_allclose(found.snr[known, 0], whole.snr[known, 0], rtol=0.5)
+    assert np.all(found.dimension[known] == 3)
+    assert np.isfinite(found.coherence[known]).all()
+    assert {(r.first, r.second) for r in found.responses} == {(0, 2), (0, 3), (2, 3)}
+
+
+def test_a_signal_wired_twice_is_named_with_its_twin() -> None:
+    csm = averages(bench(*[np.eye(3)] * 3))
+    csm[:, 4, :] = csm[:, 1, :]
+    csm[:, :, 4] = csm[:, :, 1]
+    found = diagnose(
+        csm,
+        FREQUENCY,
+        dims=THREE,
+        n_effective=1080,
+        names=("A", "B", "C"),
+        channels=("X", "Y", "Z") * 3,
+    )
+    problem, warning = (a for a in found.advice if a.level != "note")
+    assert "B.Y repeats A.Y" in problem.text
+    assert problem.sensors == (0, 1)
+    assert "three-sensor estimates say nothing of A and C" in warning.text
+    assert "maximum-likelihood" in warning.remedy
+    assert np.median(found.model.p_value) > 0.2
+    assert np.isfinite(found.model.p_value).all()
+
+
+@pytest.mark.parametrize("how", ["dead", "copied"])
+def test_two_sensors_that_are_left_are_told_what_can_still_be_said(how: str) -> None:
+    csm = averages(bench(*[np.eye(3)] * 3))
+    if how == "dead":
+        csm[:, 6:, :] = csm[:, :, 6:] = 0
+    else:
+        csm[:, 6:, :] = csm[:, 3:6, :]
+        csm[:, :, 6:] = csm[:, :, 3:6]
+    found = of(csm)
+    (left,) = [advice for advice in found.advice if "signal of their own" in advice.text]
+    assert left.text.startswith("Only sensors 1 and 2 have")
+    assert left.level == "problem"
+    assert "no channel's noise is above its own spectrum" in left.text
+    assert "--method two-channel" in left.remedy
+    assert np.isnan(found.model.p_value).all()
+    assert np.all(found.dimension == 3)
+
+
+def test_nothing_alive_is_said_too() -> None:
+    found = of(np.zeros((96, 9, 9), np.complex128))
+    assert any("Fewer than two sensors" in advice.text for advice in found.advice)
+    assert found.responses == ()
+
+
+def test_a_small_certain_misfit_is_graded_by_what_it_does() -> None:
+    """Noise shared by two channels: a few per cent of it, in many averages of many frequencies."""
+    turned = [Rotation.from_rotvec(v).as_matrix() for v in ([1, 2, -1], [-0.5, 0.4, 1], [0, 1, 2])]
+    csm = bench(*turned)
+    csm[0, 3] += 0.1
+    csm[3, 0] += 0.1
+    n = 8000
+    found = of(averages(csm, n=n), n=n)
+    misfits = [advice for advice in found.advice if "does not explain" in advice.text]
+    misfit = max(misfits, key=lambda advice: advice.numbers["worst"])
+    truth = maximise(csm[None], 3)
+    off = np.abs(truth.psi - 1).max()
+    seen = np.sqrt(2 * truth.discrepancy[0] / 27)
+    assert misfit.level == "warning"
+    assert misfit.numbers["worst"] < 2.5
+    assert misfit.numbers["unexplained"] == pytest.approx(seen, rel=0.2)
+    assert off < misfit.numbers["off"] < 5 * off
+    assert "may be off there, by up to about" in misfit.text
+    assert "sensors closer together" in misfit.remedy
+
+
+def test_what_waves_do_stays_within_what_is_said() -> None:
+    csm = plane_waves(FREQUENCY, pentagon()[:3], snr=100.0)
+    found = of(averages(csm, n=8000), n=8000)
+    problems = [advice for advice in found.advice if "does not explain" in advice.text]
+    off = np.abs(maximise(csm[-1:], 3).psi - 1).max()
+    assert any(off < advice.numbers["off at most"] < 4 * off for advice in problems)
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_sensors_of_fewer_channels_are_told_what_their_sensor_space_asks(d: int) -> None:
+    """Section 5: the motion's dimension against the sensors'."""
+    motion = np.diag([100.0, 150.0])[:d, :d]
+    found = of(averages(bench(*[np.eye(d)] * 3, motion=motion)), dims=(d,) * 3)
+    (space,) = [advice for advice in found.advice if "three dimensions of motion" in advice.text]
+    assert "parallel" in space.remedy
+    assert space.numbers["added by 1 degree"] == pytest.approx(
+        space.numbers["SNR"] * 3.05e-4, rel=0.01
+    )
+    assert not any(
+        "three dimensions" in a.text for a in of(averages(bench(*[np.eye(3)] * 3))).advice
+    )
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_the_dimension_is_overrated_as_seldom_as_its_level_says(rank: int) -> None:
+    """Bartlett's degrees of freedom: with fewer it would be too often, with more hardly ever."""
+    n_freqs, n = 3000, 40
+    csm = bench(*[np.eye(2)] * 3, motion=np.diag([1e6 * rank, 0.0]))
+    draws = wishart(np.broadcast_to(csm, (n_freqs, 6, 6)), n, np.random.default_rng(5))[0]
+    found = diagnose(draws, np.linspace(1, 20, n_freqs), dims=(2, 2, 2), n_effective=n)
+    share = np.mean(found.dimension > rank)
+    assert 0.004 < share < 0.016  # 1 % ± 0.18 %, and what Bonferroni and the expansion leave open
 
 
 def test_zero_frequency_is_no_part_of_the_test() -> None:

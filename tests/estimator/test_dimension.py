@@ -160,6 +160,25 @@ def test_a_singular_frequency_does_not_spoil_its_band() -> None:
     assert choice.test.n_frequencies == 19
 
 
+def test_a_dead_sensor_is_none() -> None:
+    """Four sensors of which one is dead are three: no room for further factors; two are refused."""
+    frequency = np.linspace(18, 22, 20)
+    csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
+    three = csm[:, :9, :9].copy()
+    csm[:, 9:, :] = csm[:, :, 9:] = 0
+    band = np.zeros(20, np.int64)
+    with_dead, (choice,) = choose_dimension(
+        csm, frequency, dims=(3,) * 4, n_effective=1080, band=band
+    )
+    without, (same,) = choose_dimension(three, frequency, dims=THREE, n_effective=1080, band=band)
+    np.testing.assert_array_equal(with_dead, without)
+    assert choice.test.degrees == same.test.degrees
+    assert choice.test.statistic == pytest.approx(same.test.statistic, rel=1e-6)
+    csm[:, 6:, :] = csm[:, :, 6:] = 0
+    with pytest.raises(InsufficientDataError, match="2 sensors have a signal of their own"):
+        choose_dimension(csm, frequency, dims=(3,) * 4, n_effective=1080)
+
+
 def test_bands_are_third_octaves_of_enough_frequencies() -> None:
     frequency = np.arange(1001) / 10
     number = bands(frequency)

@@ -1,0 +1,59 @@
+"""One piece of advice, and how numbers are written in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+Level = Literal["problem", "warning", "note"]
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """One thing to know about the test.
+
+    Attributes
+    ----------
+    level : {"problem", "warning", "note"}
+        The estimate is wrong; it may be, or is less sure than it could be; good to know.
+    sensors : tuple of int
+        It concerns, from 0; empty for all.
+    band : (float, float) or None
+        Hz; None for all frequencies.
+    text : str
+        A sentence or two.
+    numbers : mapping of str to float
+        What the text is based on.
+    remedy : str
+        What to do about it, where something can be done: a sentence or more.
+    """
+
+    level: Level
+    sensors: tuple[int, ...]
+    band: tuple[float, float] | None
+    text: str
+    numbers: Mapping[str, float]
+    remedy: str = ""
+
+
+def signed(value: float, spec: str) -> str:
+    """Return a number with the minus sign of typography."""
+    return f"{value:{spec}}".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent, to two digits."""
+    return f"{100 * share:.2g} %" if share < 9.95 else f"{100 * share:.0f} %"
+
+
+def in_hz(band: tuple[float, float]) -> str:
+    """Return a band in words."""
+    return f"{band[0]:.3g}–{band[1]:.3g} Hz"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return words as a list with "and"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
