@@ -260,9 +260,10 @@ def outcome(
 ) -> Outcome:
     """Run ``huddle estimate`` and compare with the truth."""
     command = [sys.executable, "-m", "tui", "estimate", str(path), *options]
-    said = subprocess.run(
-        [*command, "--method", "three-sensor", "--json", "-"], stdout=subprocess.PIPE, check=True
-    )
+    command += ["--method", "three-sensor", "--json", "-"]
+    said = subprocess.run(command, capture_output=True, text=True, check=False)
+    if said.returncode:
+        raise ValueError(f"{' '.join(command)}: {said.stderr}")
     told = json.loads(said.stdout)
     frequency = np.array(told["frequency_hz"])
     noise = np.array([each["noise_psd"] for each in told["channels"]], dtype=float).T
