@@ -172,7 +172,7 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
         rate = round(sensor.sampling_rate)
         request = rtu.write_request(settings.unit, RATE_REGISTER, rate)
     finder = ReplyFinder()
-    n_skipped = 0
+    instead = ""
     for _ in range(ATTEMPTS):
         stream.discard()
         finder.expect(request)
@@ -194,10 +194,10 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
                     f" {int.from_bytes(reply.payload[2:4], 'big')}"
                 )
             return
-        n_skipped += finder.n_skipped
-    what = f"{n_skipped} bytes that are no reply" if n_skipped else "nothing"
+        instead = finder.instead or instead
     raise NoAnswerError(
-        f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}, got {what};"
+        f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}:"
+        f" {instead or 'nothing came'};"
         " check cable, power, settings.baud_rate and settings.unit"
     )
 

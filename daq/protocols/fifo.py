@@ -80,6 +80,7 @@ class FifoDecoder:
         self._finder = ReplyFinder()
         self._asked = 0  # words asked for
         self._doubtful = 0  # words that an unanswered read may have taken
+        self._n_unanswered = self._n_refused = 0
         self._started = False
         self._next = 0
         self._caught_up = (0, 0)  # sample that followed when the FIFO was last read up, and when
@@ -109,12 +110,12 @@ class FifoDecoder:
 
     def timed_out(self, at: HostTime) -> list[Block | Event]:
         """Note that no reply came."""
+        instead = self._finder.instead
         self._finder.forget()
         self._doubtful += self._asked
-        skipped = (
-            f", {self._finder.n_skipped} bytes that are none" if self._finder.n_skipped else ""
-        )
-        return [Event(self._sensor, "status", f"no reply to a read{skipped}", at)]
+        self._n_unanswered += 1
+        text = f"no reply to a read: {instead or 'nothing came'} ({self._n_unanswered} so far)"
+        return [Event(self._sensor, "resynchronised" if instead else "status", text, at)]
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take bytes of the line."""
@@ -124,7 +125,9 @@ class FifoDecoder:
         if reply.exception is not None:
             why = rtu.EXCEPTIONS.get(reply.exception, f"exception {reply.exception}")
             self.level = 0
-            return [Event(self._sensor, "refused", f"the device refused a read: {why}", at)]
+            self._n_refused += 1
+            text = f"the device refused a read: {why} ({self._n_refused} so far)"
+            return [Event(self._sensor, "refused", text, at)]
         registers = reply.registers
         level = int(registers[0]) + (self._asked if self._header == "left" else 0)
         found = self._resolve_doubt(level, at)

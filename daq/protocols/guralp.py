@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.brp import Damaged, Frame, Lost, Receiver, Skipped
+from daq.protocols.brp import MAX_SIZE, Damaged, Frame, Lost, Receiver, Skipped
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.gcf import SampleBlock, StatusBlock, decode_block
 from daq.protocols.scream import (
@@ -322,6 +322,9 @@ class SerialDecoder:
 def _told(n_bytes: int, start: bytes) -> str:
     if sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in start) > 0.9 * len(start):
         return _cut("terminal: " + " ".join(start.decode("ascii", "replace").split()))
+    if start[:1] == b"G" and len(start) >= 4 and int.from_bytes(start[2:4], "big") > MAX_SIZE:
+        size = int.from_bytes(start[2:4], "big")
+        return f"skipped {n_bytes} bytes: a block of {size} bytes announced, at most {MAX_SIZE} fit"
     return f"skipped {n_bytes} bytes that are no block"
 
 

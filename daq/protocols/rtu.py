@@ -99,12 +99,14 @@ class ReplyFinder:
         self._unit = 0
         self._function = 0
         self._size = 0
+        self._heard = bytearray()
         self.n_skipped = 0
         """Bytes that were no part of the reply, since the request."""
 
     def expect(self, request: bytes) -> None:
         """Wait for the reply to ``request``; whatever came before is forgotten."""
         self._buffer.clear()
+        self._heard.clear()
         self.n_skipped = 0
         self._unit, self._function = request[0], request[1]
         reads = self._function in (READ_HOLDING, READ_INPUT)
@@ -114,6 +116,11 @@ class ReplyFinder:
     def waiting(self) -> bool:
         """Whether a reply is waited for."""
         return self._size > 0
+
+    @property
+    def instead(self) -> str:
+        """What came since the request and was not its reply, in words; empty if nothing did."""
+        return describe(bytes(self._heard), self._unit)
 
     def forget(self) -> None:
         """Wait no longer."""
@@ -126,6 +133,7 @@ class ReplyFinder:
             self.n_skipped += len(received)
             return None
         self._buffer += received
+        self._heard += received[: MAX_FRAME - len(self._heard)]
         buffer = bytes(self._buffer)
         head = bytes((self._unit,))
         here = 0
@@ -160,6 +168,26 @@ class ReplyFinder:
         if frame[1] not in (READ_HOLDING, READ_INPUT):
             return True
         return frame[2] == len(frame) - 5
+
+
+def describe(heard: bytes, unit: int) -> str:
+    """Say what bytes are that came instead of a reply of ``unit``; empty if there are none."""
+    for start in range(len(heard) - 4):
+        function = heard[start + 1]
+        size = 8
+        if function & 0x80:
+            size = _EXCEPTION_SIZE
+        elif function in (READ_HOLDING, READ_INPUT):
+            size = 5 + heard[start + 2]
+        frame = heard[start : start + size]
+        if len(frame) < size or size > MAX_FRAME or not is_whole(frame):
+            continue
+        if frame[0] != unit:
+            return f"a reply of unit {frame[0]} came, of unit {unit} was asked"
+        if size > 8 or function in (READ_HOLDING, READ_INPUT):
+            return f"a reply with {frame[2] // 2} registers came, as many were not asked for"
+        return f"a reply to function {function & 0x7F} came, which was not asked for"
+    return f"{len(heard)} bytes came that are no reply" if heard else ""
 
 
 @dataclass(frozen=True, slots=True)

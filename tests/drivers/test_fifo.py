@@ -114,7 +114,7 @@ async def test_an_overflow_is_told_and_the_gap_estimated(
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
-        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9, got nothing; check cable"),
+        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9: nothing came; check cable"),
         ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal value"),
         ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
     ],

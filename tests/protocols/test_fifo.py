@@ -84,9 +84,39 @@ def test_replies_that_are_not_ours() -> None:
     assert finder.receive(other_unit) is None
     assert finder.receive(short) is None
     assert finder.waiting
+    assert finder.instead == "a reply of unit 2 came, of unit 1 was asked"
     refusal = finder.receive(rtu.encode_exception(1, 4, 2))
     assert refusal is not None
     assert refusal.exception == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"", "nothing came"),
+        (bytes(7), "7 bytes came that are no reply"),
+        (b"\x01\x04\xff" + bytes(30), "33 bytes came that are no reply"),  # a length never filled
+        (
+            b"?" + rtu.encode_registers(5, 4, np.arange(4, dtype=np.uint16)),
+            "a reply of unit 5 came, of unit 1 was asked",
+        ),
+        (
+            rtu.encode_registers(1, 4, np.arange(3, dtype=np.uint16)),
+            "a reply with 3 registers came, as many were not asked for",
+        ),
+        (rtu.write_request(1, 1, 7812), "a reply to function 6 came, which was not asked for"),
+        (rtu.encode_exception(1, 3, 2), "a reply to function 3 came, which was not asked for"),
+    ],
+)
+def test_what_came_instead_is_named_and_counted(line: bytes, said: str) -> None:
+    decoder = FifoDecoder("A", RATE)
+    for n in (1, 2):
+        decoder.request()
+        assert decoder.receive(line, at(1)) == []
+        (event,) = decoder.timed_out(at(2))
+        assert isinstance(event, Event)
+        assert event.text == f"no reply to a read: {said} ({n} so far)"
+        assert event.kind == ("resynchronised" if line else "status")
 
 
 @settings(max_examples=100)
@@ -96,6 +126,7 @@ def test_any_bytes_on_either_end(data: bytes) -> None:
     finder.expect(rtu.read_request(1, 2, 125))
     finder.receive(data)
     assert len(finder._buffer) <= 255 + 1  # noqa: SLF001 -- memory stays bounded
+    assert isinstance(finder.instead, str)
     server = RequestFinder(1)
     server.receive(data)
     assert len(server._buffer) <= rtu.MAX_FRAME  # noqa: SLF001 -- memory stays bounded
@@ -252,7 +283,10 @@ def test_refusals_are_told() -> None:
     decoder.request()
     (event,) = decoder.receive(rtu.encode_exception(1, 4, 2), at(1))
     assert isinstance(event, Event)
-    assert (event.kind, event.text) == ("refused", "the device refused a read: illegal address")
+    assert (event.kind, event.text) == (
+        "refused",
+        "the device refused a read: illegal address (1 so far)",
+    )
 
 
 def test_clipping_is_flagged() -> None:

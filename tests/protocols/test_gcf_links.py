@@ -183,7 +183,7 @@ def test_terminal_text_and_noise_between_frames() -> None:
     assert [e.text for e in events] == [
         "terminal: GURALP DM24 G>",
         "skipped 72 bytes that are no block",
-        "skipped 4 bytes that are no block",
+        "skipped 4 bytes: a block of 65535 bytes announced, at most 1024 fit",
     ]
 
 
