@@ -3,8 +3,9 @@
 A segment is left out when samples of it are missing, when it is clipped, or when the power of any
 channel in any octave lies far from what it was in the segments accepted before, or its largest step
 from one sample to the next does (a spike that the window all but hides still stands far above noise
-that is far below the motion), or when a channel stands still in part of it: one that was dead for a
-moment lacks too little power to show by that.
+that is far below the motion), or when a channel stands still in part of it for far longer than it
+used to: one that was dead for a moment lacks too little power to show by that, while one whose
+noise is below a count, or that has always been dead, stands still all the time.
 The decision on a segment looks at earlier ones only, so that it is the same while the recording
 grows and afterwards.
 
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
     from estimator.arrays import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
-STILL = 32  # samples alike in a row: a channel that was dead (or one that is all below a count)
+STILL = 32  # samples alike in a row: a channel that was dead
+LONGER = 2.0  # than usual: how long a channel that often stands still must do so, at threshold 6
 FEWEST = 5  # segments that have a median worth the name
 SEGMENTS_PER_BLOCK = 32
 REPORTED = 1000  # segments left out that are remembered one by one
@@ -56,8 +58,9 @@ class RejectionSettings:
         Deviations of the logarithmic power of a band, or of the largest squared step from sample to
         sample, above its running median, in standard deviations (1.4826 times the median absolute
         deviation, or the scatter of stationary noise where that is more). Twice as many below:
-        logarithms of powers have a long lower tail. Infinite: transients, and channels that stand
-        still, stay in.
+        logarithms of powers have a long lower tail. So many also of the logarithm of the longest
+        time that a channel stands still, above its running median. Infinite: transients, and
+        channels that stand still, stay in.
     start_up : int
         Segments that are judged by each other before there are earlier ones.
     memory : int
@@ -93,8 +96,7 @@ class Rejected:
     channel : int or None
         The channel that shows it most; None for a gap.
     deviation : float
-        Standard deviations from the median, for a transient, infinite where a channel stood still;
-        NaN otherwise.
+        Standard deviations from the median, for a transient; NaN otherwise.
     """
 
     segment: int
@@ -146,8 +148,13 @@ class SelectedSpectra:
         n_freqs = settings.segment_length // 2 + 1
         octaves = int(np.log2(max(1, n_freqs // FIRST_BAND)))
         self._bands = np.array([0, *FIRST_BAND * 2 ** np.arange(octaves)])
-        of_bands = _stationary_scatter(self._window[:, 0], np.diff([*self._bands, n_freqs]))
-        self._least = np.append(of_bands, _scatter_of_largest(settings.segment_length - 1))
+        self._least = np.array(
+            [
+                *_stationary_scatter(self._window[:, 0], np.diff([*self._bands, n_freqs])),
+                _scatter_of_largest(settings.segment_length - 1),
+                np.log(LONGER) / 6,
+            ]
+        )
         self._held: list[_Held] = []
         self._before: deque[FloatArray] = deque(maxlen=self.rejection.memory)
         self._normal: tuple[FloatArray, FloatArray] | None = None  # median, scatter
@@ -196,11 +203,11 @@ class SelectedSpectra:
         return total
 
     def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
-        """Logarithm of the power in each band, and last of the largest squared step.
+        """Logarithm of the power in each band, of the largest squared step, and of the time still.
 
         Returns
         -------
-        float64, shape (n_segments, n_bands + 1, n_channels)
+        float64, shape (n_segments, n_bands + 2, n_channels)
         """
         shape = (self.settings.segment_length, samples.shape[1])
         frames = np.lib.stride_tricks.sliding_window_view(samples, shape)[rows, 0]
@@ -208,7 +215,8 @@ class SelectedSpectra:
         frames -= frames.mean(axis=1, keepdims=True)
         spectra = np.fft.rfft(frames * self._window, axis=1)
         power = np.add.reduceat(spectra.real**2 + spectra.imag**2, self._bands, axis=1)
-        levels = np.concatenate([power, step**2], axis=1)
+        still = np.stack([_longest_still(samples[row : row + shape[0]]) for row in rows])
+        levels = np.concatenate([power, step**2, still[:, None]], axis=1)
         return np.asarray(np.log(np.maximum(levels, np.finfo(np.float64).tiny)))
 
     def _passes(self, segment: FloatArray, levels: FloatArray, *, whole: bool) -> bool:
@@ -220,11 +228,6 @@ class SelectedSpectra:
             clipped = (np.abs(segment) >= self._full_scale).any(axis=0)
             if clipped.any():
                 self._leave_out(Rejected(number, Reason.CLIPPED, int(np.argmax(clipped)), np.nan))
-                return False
-        if np.isfinite(self.rejection.threshold):
-            still = _stands_still(segment)
-            if still.any():
-                self._leave_out(Rejected(number, Reason.TRANSIENT, int(np.argmax(still)), np.inf))
                 return False
         if self._normal is None:
             self._held.append(_Held(number, segment.copy(), levels))
@@ -296,25 +299,27 @@ class _Held:
     levels: FloatArray
 
 
-def _stands_still(segment: FloatArray) -> BoolArray:
-    """Return which channels hardly move over `STILL` samples or more: (n_channels,).
+def _longest_still(segment: FloatArray) -> FloatArray:
+    """Return for how many samples each channel hardly moves, half of `STILL` at least.
 
-    Not those that are so from end to end: a channel may be dead for good.
+    Returns
+    -------
+    float64, shape (n_channels,)
+        A segment's length for a channel that does not move in it; NaN for one with a NaN.
     """
-    if len(segment) <= STILL:
-        return np.zeros(segment.shape[1], dtype=np.bool_)
     steps = np.abs(np.diff(segment, axis=0))
-    moved = steps > 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
-    since = np.cumsum(moved, axis=0)
-    since = np.concatenate([np.zeros_like(since[:1]), since])
-    still = (since[STILL - 1 :] == since[: len(since) - STILL + 1]).any(axis=0)
-    return np.asarray(still & (since[-1] > 0))
+    limit = 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
+    place = np.arange(1, len(steps) + 1, dtype=np.int32)[:, None]
+    last_moved = np.maximum.accumulate(np.where(steps > limit, place, 0), axis=0)
+    longest = (place - last_moved).max(axis=0) + 1.0
+    return np.where(np.isnan(limit), np.nan, np.maximum(longest, (STILL - 1) / LONGER))
 
 
 def _deviation(levels: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:
-    """Largest deviation of each channel over the bands and the step, shape (n_channels,)."""
+    """Largest deviation of each channel, shape (n_channels,); nothing is wrong with moving more."""
     above = (levels - median) / scatter
-    return np.asarray(np.maximum(above, -above / 2).max(axis=0))
+    below = -above[:-1] / 2
+    return np.asarray(np.maximum(above.max(axis=0), below.max(axis=0)))
 
 
 def _stationary_scatter(window: FloatArray, widths: IntArray) -> FloatArray:
