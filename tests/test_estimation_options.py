@@ -78,9 +78,10 @@ def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snap
     [
         {"reject": True},
         {"octaves": True},
+        {"octaves": True, "reject": True},
         {"dimension": "auto", "methods": ("maximum-likelihood",)},
     ],
-    ids=["reject", "octaves", "dimension"],
+    ids=["reject", "octaves", "undisturbed octaves", "dimension"],
 )
 def test_what_was_followed_ends_as_the_estimate_from_the_file(
     tmp_path: Path, options: dict[str, Any]
@@ -94,6 +95,11 @@ def test_what_was_followed_ends_as_the_estimate_from_the_file(
     offline = estimate([tmp_path / "r.h5"], settings)
     assert live.left_out == offline.left_out
     assert live.octaves == offline.octaves
+    if "reject" in options:
+        assert live.left_out["transient"] == 2
+        assert all(octave.left_out["transient"] == 2 for octave in live.octaves[-1:])
+    if live.octaves:
+        assert live.n_segments == live.octaves[-1].n_segments
     (one,), (other,) = live.results.values(), offline.results.values()
     np.testing.assert_allclose(one.noise_psd, other.noise_psd, rtol=1e-9)
     np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9)

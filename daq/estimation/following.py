@@ -347,6 +347,7 @@ def _octave(band: Band) -> Octave:
         segment=band.settings.segment_length / band.settings.sampling_rate,
         n_segments=band.n_segments,
         n_effective=band.n_effective,
+        left_out={reason.value: count for reason, count in band.left_out.items()},
     )
 
 

@@ -13,7 +13,7 @@ from daq.alignment import AlignedRecording
 from daq.protocols.block import BlockFlag
 from daq.refinement import DelayMeter
 from estimator.multiresolution import MultiResolution
-from estimator.rejection import Reason, SelectedSpectra
+from estimator.rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.windows import get_window
 
@@ -71,7 +71,12 @@ class Pass:
         self.octaves: MultiResolution | None = None
         self._undisturbed: SelectedSpectra | None = None
         if wanted.octaves:
-            self.octaves = MultiResolution(self.welch, self.n_channels, n_stages=OCTAVES)
+            self.octaves = MultiResolution(
+                self.welch,
+                self.n_channels,
+                n_stages=OCTAVES,
+                rejection=RejectionSettings() if wanted.reject else None,
+            )
         elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
         self._all = CrossSpectra(self.welch, self.n_channels)
@@ -94,7 +99,9 @@ class Pass:
 
     @property
     def n_segments(self) -> int:
-        """Segments that count."""
+        """Segments that count; with octaves those of the highest."""
+        if self.octaves is not None:
+            return self.octaves.n_segments
         return self._n_taken if self._undisturbed is None else self.spectra.n_segments
 
     @property

@@ -45,7 +45,8 @@ class Settings:
         False for none.
     octaves : bool
         Whether each octave has segments of its own length (`estimator.multiresolution`):
-        `segment` in the highest one, twice as long in each one below. Without `reject`.
+        `segment` in the highest one, twice as long in each one below. With `reject` each octave's
+        segments are judged by those before them in the same octave.
     dimension : int, "auto" or None
         Factors of the common motion that maximum likelihood allows: that many, as many as the
         model test of each band demands (`estimator.dimension`), or as many as the largest sensor

@@ -49,6 +49,8 @@ class Octave:
     """Seconds."""
     n_segments: int
     n_effective: float
+    left_out: dict[str, int] = field(default_factory=dict)
+    """Its segments that do not count: "gap" (or clipped), and "transient"."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

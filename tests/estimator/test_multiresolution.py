@@ -7,6 +7,7 @@ import pytest
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.multiresolution import MultiResolution
+from estimator.rejection import Reason, RejectionSettings
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.three_sensor import three_sensor
 from tests.estimator.models import rotation
@@ -133,3 +134,46 @@ def test_what_makes_no_sense_is_refused() -> None:
         spectra.add(noise(100, 3))
     with pytest.raises(EstimatorError, match="completeness"):
         spectra.add(noise(100), np.ones(99, dtype=bool))
+
+
+def knocked(n_pieces: int = 1) -> MultiResolution:
+    """White noise in which somebody knocks, at 20 Hz, and a gap."""
+    samples = noise(60_000)
+    t = np.arange(100) / 100
+    samples[30_000:30_100, 1] += 300 * np.exp(-3 * t) * np.sin(2 * np.pi * 20 * t)
+    complete = np.ones(len(samples), dtype=bool)
+    complete[45_000:45_010] = False
+    spectra = MultiResolution(SETTINGS, 2, n_stages=5, rejection=RejectionSettings())
+    for rows in np.array_split(np.arange(len(samples)), n_pieces):
+        spectra.add(samples[rows], complete[rows])
+    return spectra
+
+
+def test_what_disturbs_an_octave_costs_its_own_segments_only() -> None:
+    bands = knocked().bands()
+    quiet = ladder(noise(60_000)).bands()
+    assert all(not band.left_out.total() for band in quiet)
+    for band, without in zip(bands, quiet, strict=True):
+        psd, known = (np.einsum("fpp->fp", b.csm).real for b in (band, without))
+        few_less = 0.35 * known.mean()
+        np.testing.assert_allclose(psd, known, rtol=0, atol=few_less)
+        assert band.left_out[Reason.GAP] in {2, 3}
+        assert band.n_segments + band.left_out.total() == without.n_segments
+    assert bands[-1].left_out[Reason.TRANSIENT] == 2  # the two segments it lies in
+    assert bands[0].left_out[Reason.TRANSIENT] <= 2  # 32 s each
+    assert knocked().n_segments == bands[-1].n_segments
+
+
+def test_undisturbed_octaves_are_the_same_however_samples_arrive_and_add() -> None:
+    once, pieces = knocked(), knocked(37)
+    for one, other in zip(once.bands(), pieces.bands(), strict=True):
+        assert one.left_out == other.left_out
+        np.testing.assert_allclose(one.csm, other.csm, rtol=1e-9, atol=1e-12)
+    twice = MultiResolution.like(once)
+    twice.merge(once)
+    twice.merge(pieces)
+    for one, both in zip(once.bands(), twice.bands(), strict=True):
+        assert both.n_segments == 2 * one.n_segments
+        assert both.left_out == one.left_out + one.left_out
+    with pytest.raises(EstimatorError, match="judged"):
+        once.merge(pieces)
