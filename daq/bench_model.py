@@ -102,6 +102,20 @@ def _pair_to_complex(value: object) -> object:
     raise ValueError("expected a number or [real, imaginary], in rad/s")
 
 
+def _dimension(value: object) -> object:
+    if value is None or value == "auto":
+        return value
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value
+    raise ValueError('expected "auto", or a number of dimensions such as 3')
+
+
+def _gain(value: object) -> object:
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
+        return float(value)
+    raise ValueError("expected a number other than 0, such as 1.02")
+
+
 Number = Annotated[float, Field(strict=True)]
 PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
 Name = Annotated[str, AfterValidator(_name)]
@@ -215,6 +229,14 @@ class EstimateSettings(Table):
     """Wanted coefficient of variation of the noise PSD within ``band``."""
     band: tuple[PositiveNumber, PositiveNumber] | None = None
     """Lowest and highest frequency of interest, in Hz."""
+    reject: Annotated[bool, Field(strict=True)] | None = None
+    """Whether segments with transients are left out; those that are clipped, if not given."""
+    octaves: Annotated[bool, Field(strict=True)] = False
+    """Whether each octave has segments of its own length."""
+    dimension: Annotated[int | Literal["auto"] | None, BeforeValidator(_dimension)] = None
+    """Dimensions of the common motion, for maximum likelihood; a sensor's, if not given."""
+    gains: dict[str, Annotated[float, BeforeValidator(_gain)]] = Field(default_factory=dict)
+    """What sensors ("B") or channels ("B.X") make of the motion, for the two-channel method."""
 
 
 class RecordingSettings(Table):
@@ -225,6 +247,8 @@ class RecordingSettings(Table):
     duration: Duration | None = None
     retention: Duration | None = None
     """Recordings older than this are removed by ``huddle serve``; never, if not given."""
+    report: Literal["html", "pdf"] | None = None
+    """Whether a calibration report is written beside each recording, and as what."""
 
 
 class Schedule(Table):

@@ -31,6 +31,7 @@ COMMANDS = (
     "simulate",
     "import",
     "estimate",
+    "report",
     "tui",
     "serve",
     "repair",

@@ -123,7 +123,12 @@ _PANELS = {
         acquisition.watch,
         acquisition.serve,
     ),
-    "Recordings": (recordings.estimate, recordings.import_, recordings.repair),
+    "Recordings": (
+        recordings.estimate,
+        recordings.report,
+        recordings.import_,
+        recordings.repair,
+    ),
     "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),
 }
 for _panel, _commands in _PANELS.items():

@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from daq.bench import parse_duration
@@ -44,6 +45,23 @@ def estimate_recordings(
     ``wanted`` holds method and fields of Settings, each None where not given. ``diagnostics``
     shows all of them and not only what applies.
     """
+    snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
+    met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
+    notices().print(
+        f"[dim]for a report of it: huddle report {escape(str(files[0]))}", soft_wrap=True
+    )
+    if not met:
+        raise typer.Exit(LIMIT_NOT_MET)
+
+
+def estimated(
+    files: Sequence[Path],
+    *,
+    start: str | None,
+    end: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of Settings
+) -> tuple[Snapshot, Settings, Bench | None]:
+    """Estimate, showing how far it is; return also the settings used and the first bench."""
     with Recording.open(files[0]) as recording:
         bench = recording.bench
         settings = chosen(Settings.of(bench), **wanted)
@@ -67,9 +85,7 @@ def estimate_recordings(
             settings,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
-    if not met:
-        raise typer.Exit(LIMIT_NOT_MET)
+    return snapshot, settings, bench
 
 
 def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> Settings:  # noqa: ANN401 - fields of Settings
@@ -93,11 +109,6 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
             name = "--gain" if option == "gains" else f"--{option}"
             raise typer.BadParameter(f"{name} is for the {needed} method, not for {method}")
         settings = replace(settings, methods=(needed,))
-    if settings.octaves and settings.reject:
-        raise typer.BadParameter(
-            "--octaves and --reject do not go together: one transient lies in segments of many "
-            "lengths; choose one of them"
-        )
     return settings
 
 

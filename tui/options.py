@@ -131,6 +131,13 @@ ClocksOption: TypeAlias = Annotated[
         "or not at all: samples at face value (nominal).",
     ),
 ]
+StartOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
+]
+EndOption: TypeAlias = Annotated[
+    str | None, typer.Option("--end", metavar="T", help="To here: UTC, or after the start.")
+]
 UnitOption: TypeAlias = Annotated[
     str | None,
     typer.Option("--unit", metavar="UNIT", help="As in m/s², m/s, µg: spectra are in UNIT²/Hz."),
@@ -149,10 +156,11 @@ RejectOption: TypeAlias = Annotated[
     ),
 ]
 OctavesOption: TypeAlias = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--octaves",
+        "--octaves/--no-octaves",
         help="Each octave with its own segments: --segment in the highest, doubling downwards.",
+        show_default=False,
     ),
 ]
 DimensionOption: TypeAlias = Annotated[

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
 from daq.bench import format_duration, load
@@ -18,8 +19,9 @@ from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
 from tui.estimating import LIMIT_NOT_MET, check_gains, chosen, show_result
-from tui.output import notices
+from tui.output import for_people, notices
 from tui.recorder_process import RecorderProcess
+from tui.reporting import checked, write_report
 from tui.results import reached_cov, result_arrays
 from tui.text import clock_time, time_left
 
@@ -46,6 +48,7 @@ def run_test(
     json: str | None,
     csv: str | None,
     diagnostics: bool = False,
+    report: Path | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of Settings
 ) -> None:
     """Run one huddle test and show its result.
@@ -65,6 +68,10 @@ def run_test(
     duration = bench.recording.duration if duration is None and until_cov is None else duration
     refuse_hopeless(bench, settings, duration)
     out = recording_path(bench, SystemClock().now()) if out is None else out
+    if report is not None:
+        checked(report)
+    elif bench.recording.report is not None:
+        report = out.with_suffix(f".{bench.recording.report}")
     recorder = RecorderProcess(path, out, duration=duration)
     try:
         recorder.wait_for_file()
@@ -84,6 +91,14 @@ def run_test(
         raise
     finally:
         recorder.close()
+    if report is not None:
+        write_report(
+            snapshot, report, recordings=[out], settings=settings, screen=for_people(json, csv)
+        )
+    else:
+        notices().print(
+            f"[dim]for a report of it: huddle report {escape(str(out))}", soft_wrap=True
+        )
     if interrupted:
         raise typer.Exit(INTERRUPTED)
     if not met:

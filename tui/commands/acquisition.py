@@ -50,7 +50,7 @@ def tui(
 @examples(
     "huddle run lab.toml --duration 3h",
     "huddle run lab.toml --until-cov 0.05 --band 1:20",
-    "huddle run lab.toml -d 20min --json result.json",
+    "huddle run lab.toml -d 20min --json result.json --report result.pdf",
 )
 def run(
     bench: BenchArgument,
@@ -71,10 +71,16 @@ def run(
     unit: UnitOption = None,
     band: BandOption = None,
     reject: RejectOption = None,
-    octaves: OctavesOption = False,
+    octaves: OctavesOption = None,
     dimension: DimensionOption = None,
     gain: GainOption = None,
     diagnostics: DiagnosticsOption = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report", metavar="FILE", help="Write the calibration report: .html or .pdf."
+        ),
+    ] = None,
     json: JsonOption = None,
     csv: CsvOption = None,
 ) -> None:
@@ -94,10 +100,11 @@ def run(
         unit=unit,
         band=frequencies(band),
         reject=reject,
-        octaves=octaves or None,
+        octaves=octaves,
         dimension=factors(dimension),
         gains=gains(gain),
         diagnostics=diagnostics,
+        report=report,
         json=json,
         csv=csv,
     )

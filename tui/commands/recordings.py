@@ -1,4 +1,4 @@
-"""``estimate``, ``import``, ``simulate``, ``repair``."""
+"""``estimate``, ``report``, ``import``, ``simulate``, ``repair``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -16,6 +16,7 @@ from tui.options import (
     DiagnosticsOption,
     DimensionOption,
     DurationOption,
+    EndOption,
     FileArgument,
     FilesArgument,
     GainOption,
@@ -26,6 +27,7 @@ from tui.options import (
     OverlapOption,
     RejectOption,
     SegmentOption,
+    StartOption,
     UnitOption,
     WindowOption,
     factors,
@@ -51,16 +53,11 @@ def estimate(
     no_correction: NoCorrectionOption = False,
     clocks: ClocksOption = None,
     reject: RejectOption = None,
-    octaves: OctavesOption = False,
+    octaves: OctavesOption = None,
     dimension: DimensionOption = None,
     gain: GainOption = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option("--end", metavar="T", help="To here: UTC, or after the start.")
-    ] = None,
+    start: StartOption = None,
+    end: EndOption = None,
     unit: UnitOption = None,
     band: BandOption = None,
     diagnostics: DiagnosticsOption = False,
@@ -83,7 +80,7 @@ def estimate(
         correct=False if no_correction else None,
         clocks=clocks,
         reject=reject,
-        octaves=octaves or None,
+        octaves=octaves,
         dimension=factors(dimension),
         gains=gains(gain),
         start=start,
@@ -93,6 +90,70 @@ def estimate(
         diagnostics=diagnostics,
         json=json,
         csv=csv,
+    )
+
+
+@examples(
+    "huddle report night.h5",
+    "huddle report night.h5 --out night.pdf --band 1:20",
+    "huddle report monday.h5 tuesday.h5 --method all --out week.html",
+)
+def report(
+    files: FilesArgument,
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Where to write it: .html for a page, .pdf for paper; beside the recording "
+            "where not given.",
+        ),
+    ] = None,
+    method: MethodOption = None,
+    segment: SegmentOption = None,
+    overlap: OverlapOption = None,
+    window: WindowOption = None,
+    detrend: DetrendOption = None,
+    no_correction: NoCorrectionOption = False,
+    clocks: ClocksOption = None,
+    reject: RejectOption = None,
+    octaves: OctavesOption = None,
+    dimension: DimensionOption = None,
+    gain: GainOption = None,
+    start: StartOption = None,
+    end: EndOption = None,
+    unit: UnitOption = None,
+    band: BandOption = None,
+) -> None:
+    """Write the calibration report of a huddle test, for the screen and for paper.
+
+    Noise of every channel with its uncertainty, pass or fail by the limits of the bench file,
+    alignment, clocks, what happened, and a place to sign. Reports on what there is of a recording
+    that is still being written, too. What is not given here is taken from the bench file inside
+    the recording. Exit code 1 where a limit is not met.
+    """
+    from tui.reporting import report_recordings
+
+    report_recordings(
+        files,
+        out=out,
+        method=method,
+        segment=segment,
+        overlap=overlap,
+        window=window,
+        detrend=detrend,
+        correct=False if no_correction else None,
+        clocks=clocks,
+        reject=reject,
+        octaves=octaves,
+        dimension=factors(dimension),
+        gains=gains(gain),
+        start=start,
+        end=end,
+        unit=unit,
+        band=frequencies(band),
     )
 
 

@@ -1,0 +1,226 @@
+"""What stands in a report, in which order."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from daq.bench import format_duration
+from tui.report.evidence import (
+    advice_section,
+    alignment_section,
+    clocks_section,
+    happenings_section,
+    model_test_section,
+)
+from tui.report.noise import judgements, limits_section, noise_section, verdict
+from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
+from tui.report.wording import local_time, plain_number, span, utc_time
+from tui.results import band_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.bench import Channel
+    from daq.clock_model import ClockState
+    from daq.estimation import Settings, Snapshot
+    from tui.report.source import RecordedSensor, Source
+
+_CLOCKS = {
+    "refined": "by arrival times and the motion that the sensors share",
+    "arrivals": "by arrival times alone",
+    "nominal": "samples taken at face value",
+}
+
+
+def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -> Report:
+    """Return the whole report.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A finished estimate, with its diagnostics.
+    settings : Settings
+        It was made with.
+    found : sequence of Source
+        The recordings it was made from.
+    """
+    bench = found[0].bench
+    judged = judgements(bench, snapshot, settings)
+    running = not all(source.closed for source in found)
+    sentence = verdict(bench, judged)
+    if running:
+        sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")
+    sections = [
+        _test_section(found),
+        _sensors_section(snapshot, found),
+        limits_section(bench, snapshot, judged),
+        noise_section(snapshot, settings, bench),
+        advice_section(snapshot),
+        model_test_section(snapshot, settings),
+        alignment_section(snapshot),
+        clocks_section(snapshot, settings),
+        happenings_section(snapshot, found),
+        _settings_section(snapshot, settings),
+        Section(
+            "Signed off",
+            (Signatures(("Name", "Date", "Signature")), Signatures(("Remarks",))),
+        ),
+    ]
+    name = found[0].path.stem if bench is None else bench.name
+    return Report(
+        title="Calibration report: self-noise",
+        subtitle=f"Huddle test {name}, {utc_time(found[0].started)}",
+        verdict=sentence,
+        sections=tuple(section for section in sections if section is not None),
+    )
+
+
+def _test_section(found: Sequence[Source]) -> Section:
+    first = found[0]
+    rows: list[tuple[str, str]] = []
+    if first.bench is not None:
+        rows.append(("Bench", first.bench.name))
+    rows += [
+        ("Operator", first.operator or "not given"),
+        ("Location", first.location or "not given"),
+        ("Report made by", f"huddle {version('huddle-bench')}"),
+    ]
+    parts: list[Part] = [Facts(tuple(rows))]
+    for source in found:
+        state = "closed" if source.closed else "still being written"
+        length = (source.last - source.started).total_seconds()
+        size = f"{source.n_bytes / 1e6:.1f} MB, {state}"
+        parts.append(
+            Facts(
+                (
+                    ("Recording", f"{source.path.name} ({size})"),
+                    ("Started", utc_time(source.started)),
+                    ("Local time", local_time(source.started, source.bench)),
+                    ("Last sample received", utc_time(source.last)),
+                    ("Duration", format_duration(round(length))),
+                    ("Recorded by", source.software),
+                    ("Run", source.run_id),
+                    ("SHA-256", source.sha256 or "none: the file is still being written"),
+                )
+            )
+        )
+    return Section("The test", tuple(parts))
+
+
+def _sensors_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
+    sensors = found[-1].sensors
+    clocks = {clock.sensor: clock for clock in snapshot.clocks}
+    rows = tuple(
+        (
+            sensor.name,
+            sensor.model or "not given",
+            sensor.serial_number or "not given",
+            sensor.driver,
+            f"{sensor.sampling_rate:.10g}",
+            _actual_rate(sensor, clocks.get(sensor.name)),
+        )
+        for sensor in sensors
+    )
+    header = (
+        "sensor", "model", "serial number", "driver", "nominal rate (Hz)", "actual rate (Hz)",
+    )  # fmt: skip
+    channels = Table(
+        ("sensor", "channels", "sensitivity (counts per unit)", "unit", "response"),
+        tuple(row for sensor in sensors for row in _channel_rows(sensor)),
+        left=frozenset({0, 1, 3, 4}),
+    )
+    return Section("Sensors", (Table(header, rows, left=frozenset({0, 1, 2, 3})), channels))
+
+
+def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:
+    if clock is None:
+        return "?"
+    rate = sensor.sampling_rate * (1 + clock.ppm * 1e-6)
+    error = sensor.sampling_rate * clock.ppm_std * 1e-6
+    return f"{rate:.6f} ±{error:.6f}" if clock.ppm_std > 0 else f"{rate:.6f}"
+
+
+def _channel_rows(sensor: RecordedSensor) -> list[tuple[str, ...]]:
+    """Return a row for each kind of channel of a sensor: those alike go together."""
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for channel in sensor.channels:
+        key = (f"{channel.sensitivity:.10g}", channel.unit, _response(channel))
+        name = channel.name + (f" ({channel.direction})" if channel.direction else "")
+        alike.setdefault(key, []).append(name)
+    return [(sensor.name, ", ".join(names), *key) for key, names in alike.items()]
+
+
+def _response(channel: Channel) -> str:
+    if channel.auxiliary:
+        return "auxiliary: recorded, not estimated"
+    if channel.response is None:
+        return "flat"
+    response = channel.response
+    return (
+        f"{len(response.poles)} poles, {len(response.zeros)} zeros; "
+        f"sensitivity at {response.frequency:g} Hz"
+    )
+
+
+def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
+    rate = 2 * float(snapshot.frequency[-1])
+    low, high = band_of(settings, snapshot.frequency)
+    rows = [
+        ("Method", ", ".join(snapshot.results) or ", ".join(settings.methods)),
+        ("Time used", _time_used(snapshot, settings)),
+        ("Common grid", f"{rate:.10g} Hz"),
+        ("Segment", f"{settings.segment:g} s ({settings.segment * rate:.0f} samples)"),
+        ("Overlap", f"{100 * settings.overlap:g} %"),
+        ("Window", settings.window),
+        ("Detrend", settings.detrend),
+        ("Frequency resolution", f"{1 / settings.segment:.4g} Hz between frequencies"),
+        ("Segments used", f"{snapshot.n_segments}, n = {snapshot.n_effective:.1f} effective"),
+        ("Small-sample bias", "removed" if settings.correct else "left in"),
+        ("Segments left out", _rejection(settings)),
+        ("Clocks", _CLOCKS[settings.clocks]),
+        ("Band of the tables", span(low, high)),
+        ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),
+    ]
+    if settings.dimension is not None:
+        rows.append(("Dimension of the motion", str(settings.dimension)))
+    if settings.gains:
+        gains = ", ".join(f"{name} {gain:g}" for name, gain in settings.gains.items())
+        rows.append(("Known gains", gains))
+    if settings.target_cov is not None:
+        rows.append(("Wanted c.o.v.", plain_number(settings.target_cov, "g")))
+    parts: list[Part] = [Facts(tuple(rows))]
+    if snapshot.octaves:
+        parts.append(
+            Table(
+                ("octave", "segment (s)", "segments", "effective averages"),
+                tuple(
+                    (
+                        span(octave.low, octave.high),
+                        f"{octave.segment:g}",
+                        str(octave.n_segments),
+                        f"{octave.n_effective:.1f}",
+                    )
+                    for octave in snapshot.octaves
+                ),
+                title="Segments of each octave",
+            )
+        )
+    return Section("Settings of the estimate", tuple(parts))
+
+
+def _time_used(snapshot: Snapshot, settings: Settings) -> str:
+    text = format_duration(round(snapshot.elapsed))
+    if settings.start is not None:
+        text += f", from {utc_time(settings.start)}"
+    if settings.end is not None:
+        text += f", to {utc_time(settings.end)}"
+    return text
+
+
+def _rejection(settings: Settings) -> str:
+    if settings.reject is None:
+        return "those with gaps or at the end of a sensor's range"
+    if settings.reject:
+        return "those with gaps, at the end of a sensor's range, or with transients"
+    return "those with gaps"

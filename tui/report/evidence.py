@@ -1,0 +1,312 @@
+"""The sections about the test itself: can its numbers be trusted, and what happened."""
+
+from __future__ import annotations
+
+import math
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tui.diagnosis import summary
+from tui.report.parts import Items, Paragraph, Part, Section, Table
+from tui.report.plots import REJECT, drift_plot, model_test_plot
+from tui.report.wording import (
+    NOTHING,
+    plain_number,
+    probability,
+    scientific,
+    several,
+    share,
+    span,
+)
+from tui.results import band_of, left_out
+from tui.text import utc
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.clock_model import ClockState
+    from daq.estimation import Settings, Snapshot
+    from estimator.diagnostics import BandDiagnosis
+    from estimator.response import RelativeResponse
+    from tui.report.parts import Tone
+    from tui.report.source import Happening, Source
+
+LISTED = 40
+"""Most lines of the list of what happened; with more, those of one kind go together."""
+MATTERS = 0.01
+"""Share of the noise from which an error of the clocks is worth a word."""
+_USUAL = {"started", "connected", "stopped", "mark"}
+
+
+def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
+    """Return where one common motion explains the sensors, and where not."""
+    title = "Model test: do the sensors share one motion?"
+    bands: Sequence[BandDiagnosis] = snapshot.diagnostics.get("bands", ())
+    tested = [band for band in bands if math.isfinite(band.test.p_value)]
+    if not tested:
+        text = "Not tested: that takes three sensors, and more averages than channels."
+        return Section(title, (Paragraph(text, "doubtful"),))
+    runs = [list(run) for fails, run in groupby(tested, key=_fails) if fails]
+    parts: list[Part] = []
+    if runs:
+        where = "; ".join(_run_in_words(run) for run in runs)
+        parts.append(
+            Paragraph(
+                f"The test fails at {where}. There the sensors do not feel, or do not tell, the "
+                "same motion, and what they do not share counts as noise.",
+                "bad" if any(_ratio(band) > 2 for run in runs for band in run) else "doubtful",
+            )
+        )
+        if len(runs[0]) < len(tested):
+            parts.append(Paragraph("Elsewhere one common motion explains what they share."))
+    else:
+        parts.append(
+            Paragraph("One common motion explains what the sensors share, in all bands.", "good")
+        )
+    plot = model_test_plot(snapshot, settings)
+    if plot is not None:
+        parts += [
+            Paragraph(
+                "Likelihood ratio statistic over its expectation; chance puts one point in a "
+                "hundred above the dashed line.",
+                "quiet",
+            ),
+            plot,
+        ]
+    rows: list[tuple[str, ...]] = []
+    tones: dict[tuple[int, int], Tone] = {}
+    for number, band in enumerate(tested):
+        snr = band.snr[np.isfinite(band.snr)]
+        if _fails(band):
+            tones[number, 6] = "bad" if _ratio(band) > 2 else "doubtful"
+        rows.append(
+            (
+                span(band.low, band.high).removesuffix(" Hz"),
+                plain_number(band.coherence, ".4f"),
+                scientific(band.condition, 2),
+                plain_number(band.dimension, ".0f"),
+                f"{_decibels(snr.min())} … {_decibels(snr.max())}" if snr.size else NOTHING,
+                plain_number(_ratio(band), ".3f"),
+                "fails" if _fails(band) else "holds",
+                probability(band.test.p_value),
+            )
+        )
+    header = (
+        "band (Hz)", "least coherence", "condition", "dimension", "SNR (dB)",
+        "statistic / expected", "test", "p",
+    )  # fmt: skip
+    parts.append(Table(header, tuple(rows), left=frozenset({6}), tones=tones))
+    return Section(title, tuple(parts))
+
+
+def alignment_section(snapshot: Snapshot) -> Section:
+    """Return how the sensors stand to the first one."""
+    title = "Alignment of the sensors"
+    found: Sequence[RelativeResponse] = snapshot.diagnostics.get("responses", ())
+    if not found:
+        text = "Not known: that takes three sensors and motion that they share."
+        return Section(title, (Paragraph(text, "quiet"),))
+    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    reference = min(response.first for response in found)
+    shown = [response for response in found if response.first == reference]
+    rows = []
+    for response in shown:
+        error = plain_number(response.angle_error_deg, ".3f")
+        rows.append(
+            (
+                names[response.second],
+                f"{plain_number(response.rotation_deg, '.3f')}",
+                f"{plain_number(response.horizontal_deg, '.3f')}",
+                f"±{error}" if error != NOTHING else NOTHING,
+                " / ".join(plain_number(gain, ".4f") for gain in response.gains),
+                plain_number(response.nonorthogonality_deg, ".2f"),
+                plain_number(response.delay * 1e6, ".1f"),
+                _reversed(snapshot, names[response.second], response) or "none",
+            )
+        )
+    header = (
+        "sensor", "turned (°)", "in the horizontal (°)", "standard error (°)", "gains",
+        "not orthogonal (°)", "delay (µs)", "reversed",
+    )  # fmt: skip
+    missing = [
+        name
+        for number, name in enumerate(names)
+        if number != reference and all(response.second != number for response in shown)
+    ]
+    parts: list[Part] = [
+        Paragraph(
+            f"Against sensor {names[reference]}, from the motion they share at "
+            f"{span(min(r.low for r in shown), max(r.high for r in shown))}. Gains are of like "
+            "channels. Turning alone does not bias the three-sensor and maximum-likelihood "
+            "estimates.",
+            "quiet",
+        ),
+        Table(header, tuple(rows), left=frozenset({0, 7})),
+    ]
+    if missing:
+        parts.append(Paragraph(f"Could not be compared: {', '.join(missing)}.", "doubtful"))
+    return Section(title, tuple(parts))
+
+
+def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
+    """Return what is known of each clock, and what it does to the noise."""
+    effects = _clock_effects(snapshot, settings)
+    worst = max((effect for effect in effects.values() if math.isfinite(effect)), default=math.nan)
+    parts: list[Part] = []
+    if math.isfinite(worst):
+        band = span(*band_of(settings, snapshot.frequency))
+        if worst < MATTERS:
+            text = f"What is left between the clocks adds {share(worst)} to the noise at most"
+            parts.append(Paragraph(f"{text}, within {band}: they do not matter here.", "good"))
+        else:
+            text = f"What is left between the clocks may add up to {share(worst)} to the noise"
+            parts.append(Paragraph(f"{text}, within {band}: they matter here.", "doubtful"))
+    rows = [
+        _clock_row(clock, effects.get(clock.sensor, math.nan), snapshot)
+        for clock in snapshot.clocks
+    ]
+    header = (
+        "sensor", "time from", "offset (ms)", "rate (ppm)", "±", "wander (ppm)",
+        "left (µs rms)", "refined by motion", "adds to noise",
+    )  # fmt: skip
+    if rows:
+        parts.append(Table(header, tuple(rows), left=frozenset({0, 1, 7})))
+    plot = drift_plot(snapshot)
+    if plot is not None:
+        parts += [
+            Paragraph(
+                "Drift: by how much each sensor's own count of time lags behind the host's, "
+                "without its straight line; the line's slope is the rate in ppm.",
+                "quiet",
+            ),
+            plot,
+        ]
+    elif rows:
+        parts.append(Paragraph("No clock drifts against the others.", "quiet"))
+    return Section("Clocks", tuple(parts))
+
+
+def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
+    """Return what happened while recording, and which segments were used."""
+    text = f"{several(snapshot.n_segments, 'segment')} used"
+    text += f" ({snapshot.n_effective:.0f} effective averages)."
+    if snapshot.n_dropped:
+        text += f" {several(snapshot.n_dropped, 'segment')} left out{left_out(snapshot)}."
+    else:
+        text += " None left out."
+    parts: list[Part] = [Paragraph(text)]
+    for sensor in snapshot.sensors:
+        if sensor.n_gaps:
+            gaps = several(sensor.n_gaps, "gap")
+            missing = several(sensor.n_missing, "sample")
+            parts.append(Paragraph(f"{sensor.name}: {gaps}, {missing} missing.", "doubtful"))
+    happenings = [each for source in found for each in source.happenings]
+    if not happenings:
+        parts.append(Paragraph("The recordings hold no events.", "quiet"))
+        return Section("What happened", tuple(parts))
+    rows = [
+        (
+            _when(each.utc_ns),
+            each.sensor or "all",
+            each.kind,
+            each.text + (f" ({count} of this kind, until {_when(last)})" if count > 1 else ""),
+        )
+        for each, count, last in _together(happenings)
+    ]
+    left = len(rows) - LISTED
+    header = ("when (UTC)", "sensor", "what", "in words")
+    tones: dict[tuple[int, int], Tone] = {
+        (number, 2): "doubtful" for number, row in enumerate(rows[:LISTED]) if row[2] not in _USUAL
+    }
+    parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4)), tones=tones))
+    if left > 0:
+        parts.append(Paragraph(f"… and {several(left, 'further line')}: see the file.", "quiet"))
+    return Section("What happened", tuple(parts))
+
+
+def advice_section(snapshot: Snapshot) -> Section:
+    """Return what to know and to do, in plain words."""
+    lines = summary(snapshot)
+    if not lines:
+        return Section("Advice", (Paragraph("Nothing to remark."),))
+    return Section("Advice", (Items(tuple(Paragraph(_sentence(line)) for line in lines)),))
+
+
+def _fails(band: BandDiagnosis) -> bool:
+    return band.test.p_value < REJECT
+
+
+def _ratio(band: BandDiagnosis) -> float:
+    return band.test.statistic / band.test.degrees if band.test.degrees else math.nan
+
+
+def _run_in_words(run: Sequence[BandDiagnosis]) -> str:
+    worst = max(run, key=_ratio)
+    where = span(run[0].low, run[-1].high)
+    at = f" at {span(worst.low, worst.high)}" if len(run) > 1 else ""
+    return f"{where} (statistic {_ratio(worst):.3g} times its expectation{at})"
+
+
+def _decibels(ratio: float) -> str:
+    return plain_number(10 * math.log10(ratio), ".0f") if ratio > 0 else "< 0"
+
+
+def _reversed(snapshot: Snapshot, sensor: str, response: RelativeResponse) -> str:
+    channels = [label.channel for label in snapshot.channels if label.sensor == sensor]
+    return ", ".join(channels[number] for number in response.reversed_channels)
+
+
+def _clock_effects(snapshot: Snapshot, settings: Settings) -> dict[str, float]:
+    """Return what the clocks' errors add to each sensor's noise within the band, at worst."""
+    bias = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
+    if bias is None:
+        return {}
+    low, high = band_of(settings, snapshot.frequency)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    effects: dict[str, float] = {}
+    for column, label in enumerate(snapshot.channels):
+        values = bias[inside, column]
+        values = values[np.isfinite(values)]
+        if values.size:  # a median: single frequencies scatter with the noise they are shares of
+            effect = max(0.0, float(np.median(values)))
+            effects[label.sensor] = max(effects.get(label.sensor, 0.0), effect)
+    return effects
+
+
+def _clock_row(clock: ClockState, effect: float, snapshot: Snapshot) -> tuple[str, ...]:
+    others = any(each.refined for each in snapshot.clocks)
+    refined = "yes" if clock.refined else "the others against it" if others else "no"
+    return (
+        clock.sensor,
+        clock.source
+        + (f", {several(clock.n_epochs - 1, 'restart')}" if clock.n_epochs > 1 else ""),
+        plain_number(clock.offset * 1e3, ".3f"),
+        plain_number(clock.ppm, "+.3f"),
+        plain_number(clock.ppm_std, ".3f"),
+        scientific(clock.wander_ppm, 2),
+        plain_number(clock.residual * 1e6, ".2f"),
+        refined,
+        share(effect),
+    )
+
+
+def _together(happenings: Sequence[Happening]) -> list[tuple[Happening, int, int]]:
+    """Return what happened in time order: how often, until when; alike ones together if many."""
+    ordered = sorted(happenings, key=lambda each: each.utc_ns)
+    if len(ordered) <= LISTED:
+        return [(each, 1, each.utc_ns) for each in ordered]
+    alike: dict[tuple[str, str], tuple[Happening, int, int]] = {}
+    for each in ordered:
+        first, count, _ = alike.get((each.sensor, each.kind), (each, 0, 0))
+        alike[each.sensor, each.kind] = (first, count + 1, each.utc_ns)
+    return list(alike.values())
+
+
+def _when(utc_ns: int) -> str:
+    return utc(utc_ns)[:19].replace("T", " ")
+
+
+def _sentence(line: str) -> str:
+    return line[:1].upper() + line[1:] + ("" if line.endswith((".", "!", "?")) else ".")

@@ -1,0 +1,130 @@
+"""What a report consists of, whatever it is written on.
+
+`contents` makes sections of these parts out of an estimate and its recordings; `page` writes them
+as HTML and `paper` as PDF, so both say the same. All text is plain: who writes it escapes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from matplotlib.axes import Axes
+
+Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
+
+
+@dataclass(frozen=True, slots=True)
+class Paragraph:
+    """A few sentences."""
+
+    text: str
+    tone: Tone = "plain"
+
+
+@dataclass(frozen=True, slots=True)
+class Items:
+    """A list of sentences, each with its tone."""
+
+    entries: tuple[Paragraph, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Names and what they are, a line each."""
+
+    rows: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows under a header.
+
+    Attributes
+    ----------
+    header : tuple of str
+    rows : tuple of tuple of str
+        As wide as the header.
+    left : frozenset of int
+        Columns of words, flush left; the others are numbers, flush right.
+    tones : mapping of (row, column) to Tone
+    title : str
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    left: frozenset[int] = frozenset({0})
+    tones: Mapping[tuple[int, int], Tone] = field(default_factory=dict)
+    title: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Pairs of axes side by side, that share their vertical scale.
+
+    Attributes
+    ----------
+    title : str
+    panels : tuple of callables
+        Each draws into its axes.
+    n_columns : int
+        Panels that would fit; those there are stand at the left.
+    height : float
+        Of the axes, in inches.
+    right : float
+        Room to the right of the last panel, in inches, for a second scale.
+    alt : str
+        What it shows, for those who cannot see it.
+    key_rows : int
+        Rows of the key above the panels, of what they have labelled.
+    titled : bool
+        Whether panels have titles of their own.
+    """
+
+    title: str
+    panels: tuple[Callable[[Axes], None], ...]
+    n_columns: int
+    height: float
+    alt: str
+    right: float = 0.15
+    key_rows: int = 0
+    titled: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Signatures:
+    """Empty boxes to be filled in by hand, each under its words."""
+
+    labels: tuple[str, ...]
+
+
+Part: TypeAlias = Paragraph | Items | Facts | Table | Plot | Signatures
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Parts under a title."""
+
+    title: str
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A whole report.
+
+    Attributes
+    ----------
+    title, subtitle : str
+    verdict : Paragraph
+        The one sentence that everything comes to.
+    sections : tuple of Section
+    """
+
+    title: str
+    subtitle: str
+    verdict: Paragraph
+    sections: tuple[Section, ...]

@@ -1,0 +1,154 @@
+"""What the recordings themselves say, beside the estimate made of them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.bench import Bench, Channel
+    from daq.recording.reader import SensorRecord
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """An event or a gap: when (UTC), of which sensor ("" for the run), what kind, and in words."""
+
+    utc_ns: int
+    sensor: str
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSensor:
+    """One sensor as a recording has it."""
+
+    name: str
+    model: str
+    serial_number: str
+    driver: str
+    sampling_rate: float
+    channels: tuple[Channel, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One recording.
+
+    Attributes
+    ----------
+    path : Path
+    sha256 : str
+        Of the file; empty while it is being written.
+    n_bytes : int
+    run_id, software, operator, location : str
+    started : datetime
+        UTC.
+    last : datetime
+        UTC of the last block received.
+    closed : bool
+    bench : Bench or None
+    sensors : tuple of RecordedSensor
+    happenings : tuple of Happening
+        In time order.
+    """
+
+    path: Path
+    sha256: str
+    n_bytes: int
+    run_id: str
+    software: str
+    operator: str
+    location: str
+    started: datetime
+    last: datetime
+    closed: bool
+    bench: Bench | None
+    sensors: tuple[RecordedSensor, ...]
+    happenings: tuple[Happening, ...]
+
+
+def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
+    """Read what recordings say, growing ones up to now.
+
+    Raises
+    ------
+    RecordingError
+        If one cannot be read.
+    """
+    return tuple(_source(Path(path)) for path in paths)
+
+
+def _source(path: Path) -> Source:
+    with Recording.open(path, alone=True) as recording:
+        created = recording.created_at.utc_ns
+        last = max(
+            (int(s.blocks["utc_ns"][-1]) for s in recording.sensors if len(s.blocks)),
+            default=created,
+        )
+        happenings = [
+            Happening(event.received.utc_ns, event.sensor, event.kind, event.text)
+            for event in recording.events
+        ]
+        for sensor in recording.sensors:
+            happenings += _gaps(sensor, created)
+        happenings.sort(key=lambda each: each.utc_ns)
+        return Source(
+            path=path,
+            sha256=_sha256(path) if recording.closed else "",
+            n_bytes=path.stat().st_size,
+            run_id=recording.run_id,
+            software=recording.software,
+            operator=recording.operator,
+            location=recording.location,
+            started=recording.created.astimezone(UTC),
+            last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
+            closed=recording.closed,
+            bench=recording.bench,
+            sensors=tuple(
+                RecordedSensor(
+                    sensor.name,
+                    sensor.model,
+                    sensor.serial_number,
+                    sensor.driver,
+                    sensor.sampling_rate,
+                    sensor.channels,
+                )
+                for sensor in recording.sensors
+            ),
+            happenings=tuple(happenings),
+        )
+
+
+def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:
+    """Return gaps at the time at which the block before each was received."""
+    gaps, blocks = sensor.gaps, sensor.blocks
+    before = np.searchsorted(blocks["first_sample"], gaps["first_sample"], side="left") - 1
+    found = []
+    for gap, place in zip(gaps, before, strict=True):
+        missing = int(gap["missing"])
+        about = "about " if gap["estimated"] else ""
+        text = (
+            f"{about}{missing} {'sample' if missing == 1 else 'samples'} missing"
+            f" ({missing / sensor.sampling_rate:.3g} s): {gap['reason'].decode(errors='replace')}"
+        )
+        at = int(blocks["utc_ns"][place]) if place >= 0 else created_ns
+        found.append(Happening(at, sensor.name, "gap", text))
+    return found
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

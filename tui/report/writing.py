@@ -1,0 +1,103 @@
+"""Writes a report into a file, whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daq.errors import HuddleError
+from tui.report.contents import report_of
+from tui.report.page import page
+from tui.report.paper import write_paper
+from tui.report.source import sources
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.estimation import Settings, Snapshot
+    from tui.report.parts import Report
+
+PAPER = (".pdf",)
+PAGES = (".html", ".htm")
+
+
+class ReportError(HuddleError, OSError):
+    """A report that cannot be written."""
+
+
+def write(
+    snapshot: Snapshot,
+    path: str | Path,
+    *,
+    recordings: Sequence[str | Path],
+    settings: Settings,
+) -> Report:
+    """Write the calibration report of a huddle test.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The finished estimate: what `daq.estimation.estimate` or `Estimation.finish` returned.
+    path : path
+        ``.html`` for a page, ``.pdf`` for paper. A file that was there is replaced when the new
+        one is complete, and not before.
+    recordings : sequence of path
+        What the estimate was made from. In a process that follows one of them while it grows,
+        stop that first: HDF5 shares what it remembers of a file among its readers.
+    settings : Settings
+        What the estimate was made with.
+
+    Returns
+    -------
+    Report
+        What was written.
+
+    Raises
+    ------
+    ReportError
+        If the file cannot be written, or has another suffix.
+    RecordingError
+        If a recording cannot be read.
+    """
+    path = Path(path)
+    check_suffix(path)
+    report = report_of(snapshot, settings, sources(recordings))
+    if path.suffix.lower() in PAPER:
+        paper = io.BytesIO()
+        write_paper(report, paper)
+        content = paper.getvalue()
+    else:
+        content = page(report).encode("utf-8")
+    _replace(path, content)
+    return report
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file whose name does not say which kind of report it is to be.
+
+    Raises
+    ------
+    ReportError
+        With the suffixes there are.
+    """
+    if path.suffix.lower() not in PAPER + PAGES:
+        raise ReportError(f"{path}: expected a name that ends in .html or .pdf")
+
+
+def _replace(path: Path, content: bytes) -> None:
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise ReportError(
+            f"{path}: the report cannot be written ({error.strerror}); choose another place with "
+            "--out, or make room"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
