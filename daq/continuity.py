@@ -9,7 +9,9 @@ protocol itself says it is an estimate). Where a session begins, or a device res
 (``BlockFlag.CLOCK_RESTART``), the length of the gap comes from the device's UTC where both sides of
 the gap have it and the host's clock agrees within an hour (a device may send what it kept, or come
 back with a date of its own), and else from the host's clock, and then says that it is an estimate;
-the block after it carries ``CLOCK_RESTART``, because the phase of the sampling is new.
+the block after it carries ``CLOCK_RESTART``, because the phase of the sampling is new. A session
+may also go on in the index of the one before, where the device counted on (``daq.drivers.base``,
+``Resuming``): then nothing changes but the reason of the gap.
 
 Samples that were recorded already (late or repeated blocks) are never recorded twice.
 """
@@ -63,6 +65,13 @@ class Continuity:
         self._offset = None
         self._reason = reason
 
+    def resume(self, reason: str) -> None:
+        """Say that the next block comes from a new session that goes on in the index of the last.
+
+        What is missing before it is missing for ``reason``.
+        """
+        self._reason = reason
+
     def place(self, block: Block) -> Placed:
         """Return the block where it belongs in the recording.
 
@@ -87,7 +96,8 @@ class Continuity:
         if self._offset is None:
             self._offset = -block.first_sample
         estimated = bool(block.flags & BlockFlag.MISSING_ESTIMATED)
-        return self._placed(block, block.reason or "lost", estimated=estimated)
+        reason, self._reason = self._reason or block.reason or "lost", ""
+        return self._placed(block, reason, estimated=estimated)
 
     def lost_until(self, now: HostTime, reason: str) -> Gap | None:
         """Return what is missing at the end of a recording that ends while the device is lost."""

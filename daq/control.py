@@ -28,6 +28,8 @@ HOST = "127.0.0.1"
 COMMANDS = ("stop", "mark", "status")
 _MAX_LINE = 4096
 _IDLE_TIMEOUT = 10.0
+_LAST_WORDS = 1.0
+"""For answers to be read when the recorder ends, s."""
 
 Answer = dict[str, Any]
 
@@ -54,29 +56,45 @@ async def serve(
     """
     token = secrets.token_hex(16)
     conversations: set[asyncio.Task[None]] = set()
+    silent: set[asyncio.Task[None]] = set()  # of them, who have not said anything yet
 
     async def converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         if task is not None:
             conversations.add(task)
+            silent.add(task)
             task.add_done_callback(conversations.discard)
+            task.add_done_callback(silent.discard)
         try:
             async with asyncio.timeout(_IDLE_TIMEOUT):
                 line = await reader.readline()
+                if task is not None:
+                    silent.discard(task)
                 reply = await _reply(line, token, answer)
                 writer.write(json.dumps(reply, ensure_ascii=False).encode() + b"\n")
                 await writer.drain()
         except (TimeoutError, ConnectionError, ValueError):
             pass  # Whoever it was has gone, or talks nonsense of any length.
+        except asyncio.CancelledError:
+            writer.transport.abort()
         finally:
             writer.close()
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
 
     server = await asyncio.start_server(converse, HOST, 0, limit=_MAX_LINE)
-    async with server:
+    try:
         yield int(server.sockets[0].getsockname()[1]), token
-    await asyncio.gather(*conversations, return_exceptions=True)
+    finally:
+        server.close()
+        # Who asked is answered, "stop" above all; who is silent is not waited for.
+        for task in silent:
+            task.cancel()
+        if conversations:
+            _, unread = await asyncio.wait(conversations, timeout=_LAST_WORDS)
+            for task in unread:
+                task.cancel()
+        await server.wait_closed()
 
 
 async def _reply(

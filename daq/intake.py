@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from daq.continuity import Continuity, Gap
 from daq.protocols.block import Block, Event
+from daq.session import Trouble
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 _SAY_INTERVAL_NS = 1_000_000_000
 MOST_ALIKE = 20
 """Events of one kind of one sensor that are written of each second."""
-LOST_KINDS = frozenset({"disconnected", "refused", "stalled"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class SensorStatus:
     """How one sensor is doing."""
 
     state: str
-    """``waiting`` for its first block, ``recording``, or ``lost``."""
+    """``waiting`` for its first block, ``recording``, ``late`` with the next, or ``lost``."""
     samples: int
     """Safe on disk."""
     gaps: int
@@ -43,6 +43,7 @@ class _Sensor:
         self.rate = sampling_rate
         self.continuity = Continuity(sampling_rate)
         self.state = "waiting"
+        self.late: Event | None = None  # to be written if nothing comes after all
         self.missing = 0
         self.repeated = 0
         self.said_ns = -_SAY_INTERVAL_NS
@@ -94,10 +95,9 @@ class Intake:
             if isinstance(item, Block):
                 self._block(item)
             elif isinstance(item, Event):
-                for event in self._alike[item.sensor, item.kind].take(item):
-                    self._writer.event(event)
-                if item.kind in LOST_KINDS and item.sensor in self._sensors:
-                    self._sensors[item.sensor].state = "lost"
+                self._event(item)
+            elif isinstance(item, Trouble):
+                self._trouble(item)
             else:
                 self._connected(item)
 
@@ -135,10 +135,36 @@ class Intake:
         """Return how much of the sensor that has least is recorded, gaps included, in s."""
         return min(s.continuity.next_sample / s.rate for s in self._sensors.values())
 
+    def states(self) -> dict[str, str]:
+        """Return how the sensors are doing, in a word."""
+        return {name: sensor.state for name, sensor in self._sensors.items()}
+
+    def _event(self, event: Event) -> None:
+        for said in self._alike[event.sensor, event.kind].take(event):
+            self._writer.event(said)
+
+    def _trouble(self, trouble: Trouble) -> None:
+        """Change a sensor's state. That it was late is recorded once it is lost, not before.
+
+        A line that is a little late now and then would fill the file with it.
+        """
+        sensor = self._sensors[trouble.event.sensor]
+        if trouble.state == "late":
+            if sensor.state == "recording":
+                sensor.state, sensor.late = "late", trouble.event
+            return
+        if sensor.late is not None:
+            self._event(sensor.late)
+        sensor.state, sensor.late = "lost", None
+        self._event(trouble.event)
+
     def _connected(self, item: Connected) -> None:
-        if item.reason:
-            for name in item.sensors:
-                self._sensors[name].continuity.new_session(item.reason)
+        for name in item.sensors if item.reason else ():
+            continuity = self._sensors[name].continuity
+            if item.resumed:
+                continuity.resume(item.reason)
+            else:
+                continuity.new_session(item.reason)
 
     def _block(self, block: Block) -> None:
         sensor = self._sensors[block.sensor]
@@ -149,7 +175,7 @@ class Intake:
         if placed.gap is not None:
             self._gap(block.sensor, sensor, placed.gap)
         if placed.block is not None:
-            sensor.state = "recording"
+            sensor.state, sensor.late = "recording", None
             self._writer.append(placed.block)
 
     def _say_repeated(self, sensor: _Sensor, block: Block) -> None:

@@ -25,14 +25,16 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from daq import control
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
+from daq.errors import DeviceError
 from daq.intake import Intake, SensorStatus
 from daq.protocols.block import Event
+from daq.protocols.errors import RemoteProtocolError
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
-from daq.session import Connection
+from daq.session import LEAVE_TIMEOUT, Connection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from daq.bench_model import Bench
     from daq.clock import HostClock
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 QUEUE_LENGTH = 4096
 COMMIT_INTERVAL = 0.5
+CANCEL_TIMEOUT = LEAVE_TIMEOUT + 2.0
+"""For all connections to end, s."""
 _BATCH_INTERVAL = 0.1
 _LAST_BLOCKS = 1.0
 _Result = TypeVar("_Result")
@@ -116,7 +120,7 @@ async def record(
     stop : asyncio.Event, optional
         Ends the recording properly when set.
     acknowledged : callable, optional
-        Called after every commit.
+        Called after every commit, and when the state of a sensor has changed.
     drivers : callable
         Finds drivers by name.
 
@@ -135,13 +139,7 @@ async def record(
     """
     clock = SystemClock(bench.speed) if clock is None else clock
     recorder = _Recorder(bench, Path(path), clock, stop or asyncio.Event(), acknowledged)
-    try:
-        return await recorder.run(duration, drivers)
-    except BaseExceptionGroup as group:
-        # The task group wraps what ended it.
-        if len(group.exceptions) == 1:
-            raise group.exceptions[0] from group
-        raise
+    return await recorder.run(duration, drivers)
 
 
 class _Recorder:
@@ -169,8 +167,8 @@ class _Recorder:
             for sensors in self._bench.ports().values()
         ]
         go = asyncio.Event()
-        async with control.serve(self._answer) as address, asyncio.TaskGroup() as group:
-            tasks = [group.create_task(c.run(self._queue, go), name=c.port) for c in connections]
+        async with control.serve(self._answer) as address:
+            tasks = [asyncio.create_task(c.run(self._queue, go), name=c.port) for c in connections]
             try:
                 if not await self._all_connected(connections):
                     return self._status
@@ -178,15 +176,32 @@ class _Recorder:
                     intake = await thread.run(lambda: self._create(connections, address))
                     try:
                         go.set()
-                        await self._write(intake, thread, duration)
-                        await _cancel(tasks)
+                        await self._write(intake, thread, duration, tasks)
+                        await self._cancel(tasks)
                         await self._finish(intake, thread)
                     except BaseException:
                         await asyncio.shield(thread.run(intake.abandon))
                         raise
             finally:
-                await _cancel(tasks)
+                await self._cancel(tasks)
         return self._status
+
+    async def _cancel(self, tasks: list[asyncio.Task[None]]) -> None:
+        """Cancel what is left of tasks; wait until they have left their devices quiet.
+
+        Not for ever: one that does not end is said to, and left alone.
+        """
+        going = [task for task in tasks if not task.done()]
+        for task in going:
+            task.cancel()
+        if not going:
+            return
+        _, stuck = await asyncio.wait(going, timeout=CANCEL_TIMEOUT)
+        for task in stuck:
+            tasks.remove(task)
+            text = f"the driver on {task.get_name()} does not end; it was left alone"
+            with contextlib.suppress(asyncio.QueueFull):
+                self._queue.put_nowait(Event("", "status", text, self._clock.now()))
 
     async def _all_connected(self, connections: list[Connection]) -> bool:
         stopped = asyncio.ensure_future(self._stop.wait())
@@ -197,8 +212,12 @@ class _Recorder:
                 return False
             failures = [e for e in waiting.result() if isinstance(e, Exception)]
         finally:
-            stopped.cancel()
             waiting.cancel()
+            stopped.cancel()
+            await asyncio.wait([stopped])
+        for failure in failures:
+            if not isinstance(failure, (DeviceError, RemoteProtocolError)):
+                raise failure  # the bench's fault, or the program's, but no device's
         if failures:
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
         return True
@@ -226,16 +245,27 @@ class _Recorder:
         writer.event(Event("", "started", f"{len(ordered)} sensors", self._started))
         return Intake(writer, {layout.name: layout.sampling_rate for layout in ordered})
 
-    async def _write(self, intake: Intake, thread: _WritingThread, duration: float | None) -> None:
+    async def _write(
+        self,
+        intake: Intake,
+        thread: _WritingThread,
+        duration: float | None,
+        tasks: Sequence[asyncio.Task[None]],
+    ) -> None:
         """Take what comes from the queue until it is time to stop."""
         loop = asyncio.get_running_loop()
         next_commit = loop.time()
         while not self._stop.is_set():
             batch = await self._batch()
             await thread.run(partial(intake.take, batch))
+            for task in tasks:
+                if task.done():  # a connection ends only by a fault in the code
+                    task.result()
             if loop.time() >= next_commit:
                 self._acknowledge(intake, await thread.run(intake.commit))
                 next_commit = loop.time() + COMMIT_INTERVAL
+            elif (sensors := self._with_states(intake)) != self._status.sensors:
+                self._tell(replace(self._status, sensors=sensors))
             if duration is not None and self._is_complete(intake, duration):
                 self._reason = "duration reached"
                 return
@@ -259,11 +289,19 @@ class _Recorder:
         self._acknowledge(intake, await thread.run(close))
 
     def _acknowledge(self, intake: Intake, committed: Committed) -> None:
-        self._status = Status(
-            str(self._path), self._elapsed(), intake.status(committed), committed.closed
+        self._tell(
+            Status(str(self._path), self._elapsed(), intake.status(committed), committed.closed)
         )
+
+    def _tell(self, status: Status) -> None:
+        self._status = status
         if self._acknowledged is not None:
-            self._acknowledged(self._status)
+            self._acknowledged(status)
+
+    def _with_states(self, intake: Intake) -> dict[str, SensorStatus]:
+        """Return what was acknowledged last, with what the sensors' states are now."""
+        states = intake.states()
+        return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
 
     def _elapsed(self) -> float:
         return (self._clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
@@ -304,11 +342,3 @@ class _WritingThread:
         except asyncio.CancelledError:
             await asyncio.wait([future])
             raise
-
-
-async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
-    """Cancel tasks and wait until they have left their devices quiet."""
-    for task in tasks:
-        task.cancel()
-    if tasks:
-        await asyncio.wait(tasks)

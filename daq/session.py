@@ -1,7 +1,8 @@
 """One port's device, kept connected for as long as a run lasts.
 
-Connects, reads, and hands on; when the device is lost or stalls, says so, and tries again with
-back-off. What it hands on is in its sessions' own indices (:mod:`daq.continuity` places it).
+Connects, reads, and hands on; when a block is late says so (:mod:`daq.overdue`), when the device is
+lost or stalls says that, and tries again with back-off. What it hands on is checked
+(:mod:`daq.yielded`), and in its sessions' own indices (:mod:`daq.continuity` places it).
 """
 
 from __future__ import annotations
@@ -9,28 +10,26 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal
 
+from daq.drivers.base import Resuming
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
+from daq.overdue import Watch
 from daq.protocols.block import Block, Event
-from daq.protocols.errors import RemoteProtocolError
+from daq.yielded import Checked
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Iterator, Sequence
-    from types import TracebackType
+    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+    from contextlib import AbstractAsyncContextManager
 
     from daq.bench_model import Sensor
     from daq.clock import HostClock
     from daq.drivers.base import DeviceInformation, DriverType, Session
+    from daq.overdue import Stage
 
-FIRST_PATIENCE = 10.0
-"""How long to wait for the first block of a session, in s, if it is short; drivers know better."""
-LONGEST_FIRST_BLOCK = 1100
-"""Samples a first block may have: one block of GCF holds up to a thousand."""
-LEAST_PATIENCE = 0.5
-LATENESS = 0.25
-"""What a block may come late by, s: one that is lost whole must not look like a stall."""
 FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
+LEAVE_TIMEOUT = 5.0
+"""How long a driver may take to leave its device, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,113 +39,20 @@ class Connected:
     sensors: tuple[str, ...]
     reason: str
     """Why the one before ended; empty for the first."""
+    resumed: bool = False
+    """The index of the session before goes on."""
 
 
-Item = Block | Event | Connected
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A sensor is late or lost until its next block."""
+
+    state: Literal["late", "lost"]
+    event: Event
+    """What there is to be recorded of it."""
 
 
-class _Patience:
-    """How long the next block may take: twice as long as blocks took so far."""
-
-    def __init__(self, now: float, first: float) -> None:
-        self.last = now
-        self._first = first
-        self._longest = 0.0
-        self._begun = False
-
-    @property
-    def seconds(self) -> float:
-        """From the last block on."""
-        return max(LEAST_PATIENCE, 2 * self._longest + LATENESS) if self._begun else self._first
-
-    def block_came(self, now: float, duration: float) -> None:
-        """Learn from a block and the time its samples took; what was long is forgotten slowly."""
-        interval = now - self.last if self._begun else 0.0
-        self._longest = max(0.98 * self._longest, interval, duration)
-        self._begun, self.last = True, now
-
-
-class _Watch:
-    """Interrupts who waits for a block, when that is overdue; ``sampling_rates`` in samples per s.
-
-    One look every ``TICK`` instead of one timer a block; and when the event loop itself was held
-    up, nobody's device is to blame.
-    """
-
-    TICK = 0.1
-
-    def __init__(self, sampling_rates: dict[str, float]) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._rates = sampling_rates
-        now = self._loop.time()
-        first = FIRST_PATIENCE + LONGEST_FIRST_BLOCK / min(sampling_rates.values())
-        self._whole = _Patience(now, first)
-        self._each = {name: _Patience(now, first) for name in sampling_rates}
-        self._stalled: set[str] = set()
-        self._timeout = asyncio.timeout(None)
-        self._is_waiting = False
-        self._last_look = now
-        self._timer: asyncio.TimerHandle | None = None
-
-    @property
-    def seconds(self) -> float:
-        """How long a block may take."""
-        return self._whole.seconds
-
-    async def __aenter__(self) -> Self:
-        await self._timeout.__aenter__()
-        self._timer = self._loop.call_later(self.TICK, self._look)
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        await self._timeout.__aexit__(kind, error, trace)
-
-    @contextlib.contextmanager
-    def waiting(self) -> Iterator[None]:
-        """Interrupt only what happens within."""
-        self._is_waiting = True
-        try:
-            yield
-        finally:
-            self._is_waiting = False
-
-    def block_came(self, block: Block) -> None:
-        """Take note of a block."""
-        now = self._loop.time()
-        duration = block.n_samples / self._rates[block.sensor]
-        self._whole.block_came(now, duration)
-        self._each[block.sensor].block_came(now, duration)
-        self._stalled.discard(block.sensor)
-
-    def newly_stalled(self) -> list[str]:
-        """Return the sensors that are overdue while others on the port go on, each once."""
-        now = self._loop.time()
-        late = [
-            name
-            for name, patience in self._each.items()
-            if name not in self._stalled and now - patience.last > patience.seconds
-        ]
-        self._stalled.update(late)
-        return late
-
-    def _look(self) -> None:
-        now = self._loop.time()
-        held_up = now - self._last_look > 2 * self.TICK
-        self._last_look = now
-        if held_up or not self._is_waiting:
-            for patience in (self._whole, *self._each.values()):
-                patience.last = max(patience.last, now - patience.seconds / 2)
-        elif now - self._whole.last > self._whole.seconds:
-            self._timeout.reschedule(now)
-            return
-        self._timer = self._loop.call_later(self.TICK, self._look)
+Item = Block | Event | Connected | Trouble
 
 
 class Connection:
@@ -164,6 +70,7 @@ class Connection:
         self.alive = False
         self._delay = FIRST_DELAY
         self._said = ""
+        self._before: Session | None = None
         self._clock = clock
 
     async def run(self, queue: asyncio.Queue[Item], go: asyncio.Event) -> None:
@@ -171,16 +78,18 @@ class Connection:
         reason = ""
         while True:
             try:
-                async with self.driver.open(self.sensors, self._clock) as session:
+                async with self._in_time(self._open(), queue) as session:
                     self._check_identity(session)
                     if not self.connected.done():
                         self.connected.set_result(None)
                         await go.wait()
-                    await queue.put(Connected(self.names, reason))
+                    resumed = self._before is not None and getattr(session, "resumed", False)
+                    await queue.put(Connected(self.names, reason, resumed))
                     for name in self.names:
                         text = self._describe(session, name)
                         await queue.put(Event(name, "connected", text, self._clock.now()))
                     self.alive = True
+                    self._before = session
                     try:
                         await self._forward(session, queue)
                     except Exception as error:
@@ -188,13 +97,9 @@ class Connection:
                         reason = await self._say(error, queue)
                         raise
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
-            except (DeviceError, RemoteProtocolError) as error:
-                failure = error
-            except Exception as error:
-                # Whatever a driver raises concerns its device only: a fault of one must not end
-                # the recording of the others. At the start it is reported, later recorded.
-                if not self.connected.done():
-                    raise
+            # Whatever a driver raises concerns its device only: a fault of one must not end the
+            # recording of the others. At the start it is reported, later recorded.
+            except Exception as error:  # noqa: BLE001 -- a driver may be anybody's
                 failure = error
             if not self.connected.done():
                 self.connected.set_exception(failure)
@@ -207,18 +112,76 @@ class Connection:
             await asyncio.sleep(self._delay)
             self._delay = min(2 * self._delay, LONGEST_DELAY)
 
+    def _open(self) -> AbstractAsyncContextManager[Session]:
+        if self._before is not None and isinstance(self.driver, Resuming):
+            return self.driver.resume(self.sensors, self._clock, self._before)
+        return self.driver.open(self.sensors, self._clock)
+
+    @contextlib.asynccontextmanager
+    async def _in_time(
+        self, context: AbstractAsyncContextManager[Session], queue: asyncio.Queue[Item]
+    ) -> AsyncIterator[Session]:
+        """Open a session; leave it within ``LEAVE_TIMEOUT``, and say where that is not enough."""
+        session = await context.__aenter__()
+        try:
+            yield session
+        except BaseException as error:
+            await self._leave(context, error, queue)
+            raise
+        await self._leave(context, None, queue)
+
+    async def _leave(
+        self,
+        context: AbstractAsyncContextManager[Session],
+        error: BaseException | None,
+        queue: asyncio.Queue[Item],
+    ) -> None:
+        """Let the driver leave its device; why the session ended matters more than how."""
+        limit = asyncio.timeout(LEAVE_TIMEOUT)
+        try:
+            async with limit:
+                await context.__aexit__(
+                    type(error) if error else None, error, error.__traceback__ if error else None
+                )
+        except asyncio.CancelledError:
+            if not isinstance(error, asyncio.CancelledError):
+                raise
+        except Exception:
+            if error is None and not limit.expired():
+                raise
+        if limit.expired():
+            text = f"the driver did not leave the device within {LEAVE_TIMEOUT:g} s"
+            for name in self.names:
+                with contextlib.suppress(asyncio.QueueFull):
+                    queue.put_nowait(Event(name, "status", text, self._clock.now()))
+
     async def _say(self, failure: Exception, queue: asyncio.Queue[Item]) -> str:
         """Record that the device is lost, and why; return the kind of the event."""
         self.alive = False
         kind, self._said = _kind(failure), str(failure)
         for name in self.names:
-            await queue.put(Event(name, kind, self._said, self._clock.now()))
+            await queue.put(Trouble("lost", Event(name, kind, self._said, self._clock.now())))
         return kind
 
     async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
         """Hand on what the session yields; raise if nothing comes for too long."""
+
+        def say(name: str, stage: Stage, seconds: float) -> bool:
+            now = self._clock.now()
+            text = f"no block for {seconds:.2g} s"
+            event = Event(name, "late", f"{text}, two of its block periods", now)
+            if stage == "lost":
+                # One of several on a port: its driver looks after it; here it is said.
+                event = Event(name, "stalled", f"{text}; others on the port go on", now)
+            try:
+                queue.put_nowait(Trouble(stage, event))
+            except asyncio.QueueFull:
+                return False
+            return True
+
         speed = self._clock.speed
-        watch = _Watch({s.name: s.sampling_rate * speed for s in self.sensors})
+        watch = Watch({s.name: s.sampling_rate * speed for s in self.sensors}, say)
+        checked = Checked(self.driver, self.sensors)
         async with contextlib.aclosing(_generator(session)) as items:
             try:
                 async with watch:
@@ -227,14 +190,11 @@ class Connection:
                             item = await anext(items, None)
                         if item is None:
                             return
+                        item = checked.check(item)
                         if isinstance(item, Block):
                             watch.block_came(item)
                             self._delay = FIRST_DELAY
                         await queue.put(item)
-                        for name in watch.newly_stalled():
-                            # One of several on a port: its driver looks after it; here it is said.
-                            text = "others on the port go on"
-                            await queue.put(Event(name, "stalled", text, self._clock.now()))
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise

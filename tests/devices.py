@@ -53,6 +53,8 @@ class PlayedDevice:
     items: asyncio.Queue[Block | Event | Exception] = field(default_factory=asyncio.Queue)
     opened: asyncio.Event = field(default_factory=asyncio.Event)
     left_quiet: bool = True
+    hangs: bool = False
+    """When it is to be left."""
     sampling_rate: float | None = None
 
 
@@ -113,6 +115,8 @@ class PlayedDriver:
         try:
             yield PlayedSession(device, information)
         finally:
+            if device.hangs:
+                await asyncio.Event().wait()
             device.left_quiet = True
 
 

@@ -68,6 +68,20 @@ def test_a_new_session_is_placed_by_host_time() -> None:
     assert follows.block.first_sample == 530
 
 
+def test_a_session_that_is_resumed_goes_on_in_the_index_of_the_last() -> None:
+    continuity = Continuity(RATE)
+    continuity.place(block(0, 10, 0.1))
+    continuity.new_session("refused")
+    continuity.place(block(0, 10, 1.1))
+    continuity.resume("disconnected")
+    placed = continuity.place(block(510, 10, 99.0))
+    assert placed.gap == Gap(110, 500, "disconnected", estimated=False)
+    assert placed.block is not None
+    assert not placed.block.flags
+    placed = continuity.place(block(530, 10, 99.2))
+    assert placed.gap == Gap(620, 10, "lost", estimated=False)
+
+
 def test_device_time_makes_it_exact() -> None:
     continuity = Continuity(RATE)
     utc = BlockFlag.DEVICE_UTC

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -158,12 +159,119 @@ async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -
         run.send("a", 100, 100)
         await run.until("a", 200)
         # Nothing comes any more, and nothing says so.
+        await run.until("a", 200, "late")
         await run.until("a", 200, "lost")
         run.send("a", 0, 100)
         await run.until("a", 300)
     with Recording.open(run.path) as recording:
         kinds = [event.kind for event in recording.events if event.sensor == "a"]
-        assert kinds == ["connected", "stalled", "connected"]
+        assert kinds == ["connected", "late", "stalled", "connected"]
+
+
+async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.overdue.LATENESS", 5.0)  # however busy the machine is
+    run = Run(tmp_path / "r.h5", "a")
+    async with asyncio.timeout(10), run.going():
+        run.send("a", 0, 50)
+        run.send("a", 50, 50)
+        await run.until("a", 100, "late")
+        run.clock.advance(0.5)
+        run.send("a", 150, 100)
+        await run.until("a", 200)
+    assert run.device("a").n_sessions == 1
+    with Recording.open(run.path) as recording:
+        assert [e.kind for e in recording.events if e.sensor == "a"] == ["connected"]
+        (gap,) = recording.sensors[0].gaps
+        assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (100, 50, 0)
+
+
+async def test_a_word_of_the_decoder_does_not_make_a_sensor_lost(tmp_path: Path) -> None:
+    """Decoders call an answer or a block refused, too."""
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        for kind in ("refused", "stalled", "disconnected"):
+            run.device("a").items.put_nowait(Event("a", kind, "a block", run.clock.now()))
+        run.device("a").items.put_nowait(Event("a", "status", "last", run.clock.now()))
+        n_statuses = len(run.statuses)
+        while len(run.statuses) < n_statuses + 2:
+            run.news.clear()
+            await run.news.wait()
+        assert run.statuses[-1].sensors["a"].state == "recording"
+
+
+async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("a", 100)
+        wrong = replace(block("a", 100, 10, run.clock.now()), counts=np.full((10, 2), 0.5))
+        run.device("a").items.put_nowait(wrong)
+        await run.until("a", 100, "lost")
+        run.send("b", 100, 100)
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+        await run.until("b", 200)
+    assert run.statuses[-1].closed
+    assert verify(run.path).intact
+    with Recording.open(run.path) as recording:
+        assert [e.text for e in recording.events if e.kind == "disconnected"] == [
+            "a: driver 'played' yielded counts of type float64 that do not fit int32"
+        ]
+
+
+async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    items: asyncio.Queue[Any] = run.device("a").items
+    async with run.going():
+        items.put_nowait(b"raw bytes")
+        items.put_nowait(Event("c", "status", "of nobody", run.clock.now()))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        assert [e.text for e in recording.events if e.kind == "disconnected"] == [
+            "a: driver 'played' yielded bytes; expected a Block or an Event",
+            "a: driver 'played' yielded an event of 'c'; expected 'a'",
+        ]
+
+
+async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.session.LEAVE_TIMEOUT", 0.2)
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.device("a").hangs = True
+    async with asyncio.timeout(10), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    assert run.statuses[-1].closed
+    assert run.device("b").left_quiet
+    with Recording.open(run.path) as recording:
+        assert "the driver did not leave the device within 0.2 s" in [
+            e.text for e in recording.events if e.sensor == "a"
+        ]
+
+
+async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
+    tmp_path: Path,
+) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with asyncio.timeout(5), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        address = control_address(run.path)
+        assert address is not None
+        reader, writer = await asyncio.open_connection("127.0.0.1", address[0])
+        await asyncio.to_thread(ask, run.path, "stop")
+    with contextlib.suppress(ConnectionError):
+        assert await reader.read() == b""
+    writer.close()
+    with contextlib.suppress(ConnectionError):
+        await writer.wait_closed()
 
 
 async def test_another_device_on_the_port_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ A third-party package adds a driver by an entry point in the group ``huddle.driv
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -39,6 +39,9 @@ class DeviceInformation:
     temperature: float | None = None
     """In °C."""
     details: dict[str, str] = field(default_factory=dict)
+    trouble: str = ""
+    """Why nothing is known: one of several on its port that does not answer. The driver goes on
+    asking; a run does not begin without it."""
 
 
 class Session(Protocol):
@@ -100,5 +103,32 @@ class DriverType(Protocol):
         ------
         NotConnectedError, NoAnswerError, WrongDeviceError
             Each naming sensor, port, what was expected and what came.
+        """
+        ...
+
+
+class ResumedSession(Session, Protocol):
+    """A session that may go on where another ended."""
+
+    @property
+    def resumed(self) -> bool:
+        """Whether its blocks are in the index of the session before."""
+        ...
+
+
+@runtime_checkable
+class Resuming(Protocol):
+    """A driver (:class:`DriverType`) of devices that count on while nobody can hear them.
+
+    With a counter that runs on, what is missing is known exactly. The driver decides whether it
+    does: where the device was restarted, or may have been, it opens it as at first.
+    """
+
+    def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AbstractAsyncContextManager[ResumedSession]:
+        """Open a port again after ``before``, the last session there, was lost.
+
+        As :meth:`DriverType.open`; ``before`` is over.
         """
         ...
