@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -145,6 +146,9 @@ def cross_faults(table: Mapping[str, Any], drivers: Mapping[str, DriverType]) ->
     yield from _simulation_faults(table)
     if estimate is not None:
         yield from _set_faults(sensors, len(entries), estimate)
+        yield from _method_faults(estimate)
+        if len(sensors) == len(entries):
+            yield from _option_faults(estimate, sensors)
     if rate is not None:
         yield from _rate_faults(sensors, rate)
         if estimate is not None:
@@ -221,6 +225,42 @@ def _set_faults(
                     f"{sensor.n_main_channels} channels",
                     f"expected {usual} that are not auxiliary, as the other sensors have",
                 )
+
+
+def _method_faults(estimate: EstimateSettings) -> Iterator[Fault]:
+    """Yield options of a method that is not asked for."""
+    for key, value, method in (
+        ("dimension", estimate.dimension, "maximum-likelihood"),
+        ("gains", estimate.gains or None, "two-channel"),
+    ):
+        if value is not None and estimate.method not in {method, "all"}:
+            yield Fault(
+                f"estimate.{key}",
+                value,
+                f'expected with method = "{method}" or "all" only, not "{estimate.method}"',
+            )
+
+
+def _option_faults(estimate: EstimateSettings, sensors: Sequence[Sensor]) -> Iterator[Fault]:
+    """Yield options that these sensors do not allow."""
+    channels = [
+        f"{sensor.name}.{channel.name}"
+        for sensor in sensors
+        for channel in sensor.channels
+        if not channel.auxiliary
+    ]
+    known = (*(sensor.name for sensor in sensors), *channels)
+    for name, gain in estimate.gains.items():
+        if name not in known:
+            yield Fault(f'estimate.gains["{name}"]', gain, _expected(name, known))
+    most = math.floor(len(channels) - math.sqrt(len(channels)))  # (p - q)² ≥ p
+    if isinstance(estimate.dimension, int) and estimate.dimension > most:
+        yield Fault(
+            "estimate.dimension",
+            estimate.dimension,
+            f"expected at most {most}: more cannot be told from the noise of {len(channels)} "
+            "channels",
+        )
 
 
 def _rate_faults(sensors: Sequence[Sensor], rate: float) -> Iterator[Fault]:

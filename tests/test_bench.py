@@ -108,6 +108,11 @@ zeros = [0]
 [estimate]
 segment = "20s"
 band = [0.5, 50]
+method = "all"
+reject = false
+octaves = true
+dimension = "auto"
+gains = {b = 1.02, "c.x" = 1}
 [recording]
 duration = "1h"
 [[limits]]
@@ -148,6 +153,35 @@ psd = [[1, 2], [3, 4]]
         (
             "[estimate]\nband = [0.01, 50]\n",
             "estimate.band = [0.01, 50.0]: expected [low, high] Hz from 0.1",
+        ),
+        (
+            '[estimate]\nreject = "yes"\n',
+            'estimate.reject = "yes": expected a valid boolean',
+        ),
+        ("[estimate]\noctaves = 1\n", "estimate.octaves = 1: expected a valid boolean"),
+        (
+            '[estimate]\ndimension = "all"\n',
+            'estimate.dimension = "all": expected "auto", or a number of dimensions such as 3',
+        ),
+        (
+            '[estimate]\nmethod = "maximum-likelihood"\ndimension = 4\n',
+            "estimate.dimension = 4: expected at most 3: more cannot be told from the noise of 6",
+        ),
+        (
+            "[estimate]\ndimension = 2\n",
+            'estimate.dimension = 2: expected with method = "maximum-likelihood" or "all" only',
+        ),
+        (
+            "[estimate]\ngains = {b = 1.1}\n",
+            'expected with method = "two-channel" or "all" only, not "three-sensor"',
+        ),
+        (
+            '[estimate]\nmethod = "two-channel"\ngains = {b = 0}\n',
+            "estimate.gains.b = 0: expected a number other than 0, such as 1.02",
+        ),
+        (
+            '[estimate]\nmethod = "all"\ngains = {"b.z" = 2}\n',
+            'estimate.gains["b.z"] = 2.0: expected one of a, b, c, a.x',
         ),
         ("[estimate]\noverlap = 1\n", "estimate.overlap = 1: expected less than 1"),
         (

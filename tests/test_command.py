@@ -327,7 +327,6 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
 
 def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -> None:
     for options in (
-        ("--octaves", "--reject"),
         ("--dimension", "2", "--method", "three-sensor"),
         ("--dimension", "many"),
         ("--gain", "Q=2"),
@@ -339,8 +338,7 @@ def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -
 
 def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
     document = result_of(
-        tst, "--end", "2h", "--octaves", "--dimension", "auto", "--unit", "m/s²", "--reject",
-        "--no-reject",
+        tst, "--end", "2h", "--octaves", "--dimension", "auto", "--unit", "m/s²", "--reject"
     )  # fmt: skip
     assert document["method"] == "maximum-likelihood"
     frequency = document["frequency_hz"]
@@ -349,4 +347,5 @@ def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
     assert frequency[-1] == 20.0
     octaves = document["diagnostics"]["octaves"]
     assert octaves[0]["segment"] > 100 * 0.99
+    assert all(octave["left_out"]["gap"] == 0 for octave in octaves)
     assert len(document["diagnostics"]["dimension"]) >= len(octaves)

@@ -29,7 +29,7 @@ def summary(snapshot: Snapshot) -> list[str]:
     lines = []
     for kind, found in kinds.items():
         in_short = _SHORT.get(kind)
-        if in_short is None or len(found) == 1:
+        if in_short is None or (len(found) == 1 and kind != FAILS):
             lines += [_with_remedy(advice.text, advice.remedy) for advice in found]
         else:
             lines.append(_with_remedy(f"{in_short(found, names)}.", found[0].remedy))

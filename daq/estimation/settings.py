@@ -89,4 +89,8 @@ class Settings:
             correct=wanted.correct,
             band=wanted.band,
             target_cov=wanted.target_cov,
+            reject=wanted.reject,
+            octaves=wanted.octaves,
+            dimension=wanted.dimension,
+            gains=wanted.gains,
         )
