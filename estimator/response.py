@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 LEAST_COHERENCE = 0.5
 """Below it a frequency says nothing of the response, and its phase could mislead the delay."""
+_STEPS = 4  # of least squares from the coarse delay
 _PARTS = 8  # of the band, for the scatter of the angles
 
 
@@ -181,7 +182,9 @@ def relative_response(
     (least squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P the mean
     PSD of sensor i and g their coherence in the direction in which it is least, so that every
     frequency counts by its signal-to-noise ratio and incoherent ones do not count. The delay tau
-    is the slope through the origin of half the phase of ``det(T(f))**2`` over d, weighted alike.
+    is sought on a grid, where ``Re sum_f w T(f) exp(2 pi i f tau)`` is largest: as far as half a
+    segment either way, however many periods of the band that is. From there the phase that is
+    left, weighted alike, has a slope through the origin: least squares.
     """
     check_dims(dims)
     given = coherency(csm, dims)
@@ -262,12 +265,34 @@ def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> Flo
 
 
 def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> float:
-    """Seconds by which the second sensor lags, from the phase of its determinant."""
+    """Seconds by which the second sensor lags: where its answers add up, then by their phase."""
     transfer = S_jk @ np.linalg.pinv(S_ik)
-    turned = np.linalg.det(transfer)
-    phase = np.unwrap(np.angle(turned**2)) / (2 * S_jk.shape[1])
-    spread = np.where(np.isfinite(phase), weight, 0.0)
-    return float(-(spread * f) @ phase / ((spread * f) @ f) / (2 * np.pi))
+    known = np.isfinite(transfer).all(axis=(1, 2))
+    f, weight, transfer = f[known], weight[known], transfer[known]
+    delay = _coarse_delay(f, np.asarray(weight[:, None, None] * transfer, np.complex128))
+    for _ in range(_STEPS):
+        aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
+        mean = np.einsum("f,fab->ab", weight, aligned).real
+        phase = np.angle(np.einsum("ab,fab->f", mean, aligned))
+        delay -= float((weight * f) @ phase / ((weight * f) @ f) / (2 * np.pi))
+    return delay
+
+
+def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
+    """Delay at which the real part of the sum over frequencies is largest, on a grid.
+
+    The sum at all delays is a Fourier transform over frequency; frequencies are taken to the
+    nearest multiple of their least distance.
+    """
+    step = float(np.diff(f).min()) if len(f) > 1 else float(f[0])
+    place = np.rint((f - f[0]) / step).astype(np.int64)
+    # eight delays to the period of the highest frequency, so that no peak lies between them
+    n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
+    spectrum = np.zeros((n, *transfer.shape[1:]), np.complex128)
+    np.add.at(spectrum, place, transfer)
+    delays = np.fft.fftfreq(n, step)
+    total = np.fft.ifft(spectrum, axis=0) * np.exp(2j * np.pi * f[0] * delays)[:, None, None]
+    return float(delays[np.argmax((total.real**2).sum(axis=(1, 2)))])
 
 
 def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None:

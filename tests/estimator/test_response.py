@@ -70,6 +70,45 @@ def test_a_known_delay_has_the_sign_the_convention_says() -> None:
     assert found.delay == pytest.approx(0.015, rel=0.01)
 
 
+@pytest.mark.parametrize("delay", [0.02, -0.13, 0.5, -1.7, 4.0])
+@pytest.mark.parametrize("low", [0.5, 8.0])
+def test_a_delay_of_many_periods_is_not_mistaken_for_a_short_one(delay: float, low: float) -> None:
+    """At 40 samples/s these are 0.8 to 160 samples; the band's top turns 0.4 to 80 times."""
+    turned = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
+    csm = bench([np.eye(3), turned, np.eye(3)], delays=(0, delay, 0), snr=100)
+    draw = wishart(csm, 300, np.random.default_rng(4))[0]
+    found = relative_response(draw, FREQUENCY, dims=(3, 3, 3), first=0, second=1, band=(low, 20.0))
+    assert found.delay == pytest.approx(delay, abs=1e-4)
+    np.testing.assert_allclose(found.matrix, turned, atol=0.02)
+
+
+def test_a_delay_is_found_at_frequencies_that_are_not_evenly_spaced() -> None:
+    """As where octaves have segments of their own, or frequencies are flagged."""
+    csm = bench([np.eye(3)] * 3, delays=(0, 0.31, 0))
+    some = np.sort(np.random.default_rng(0).choice(200, 60, replace=False))
+    found = relative_response(csm[some], FREQUENCY[some], dims=(3, 3, 3), first=0, second=1)
+    assert found.delay == pytest.approx(0.31, rel=1e-6)
+
+
+def test_frequencies_count_by_their_signal_to_noise_ratio() -> None:
+    """Half the band at SNR 1e4, half at 8, as strong: as good as the good half alone."""
+    good = np.arange(200) % 2 == 0
+    level = np.where(good, 1.0, 1e6)[:, None, None]  # the weak half has the larger spectra
+    clean = bench([np.eye(3)] * 3, snr=1e4)
+    poor = bench([np.eye(3)] * 3, snr=8.0)
+    csm = np.where(good[:, None, None], clean, poor) * level
+    alone: list[list[float]] = []
+    whole: list[list[float]] = []
+    for draw in wishart(csm, 100, np.random.default_rng(6), n_draws=25):
+        for found, some in ((alone, good), (whole, np.ones(200, bool))):
+            response = relative_response(
+                draw[some], FREQUENCY[some], dims=(3, 3, 3), first=0, second=1
+            )
+            found.append([*response.gains - 1, response.delay * 100])
+    spread = np.std(whole, axis=0) / np.std(alone, axis=0)
+    assert spread.max() < 1.5  # all alike would make it 15 times as large
+
+
 def test_horizontal_angle_follows_the_first_horizontal_channel() -> None:
     """North turned 10 degrees towards west, east 12: two degrees short of a right angle."""
     north, east = np.deg2rad([10.0, 12.0])
