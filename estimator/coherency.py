@@ -123,14 +123,15 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     matrix = np.where(finite[:, None, None], csm, np.eye(n_channels))
     matrix *= scale[:, :, None]
     matrix *= scale[:, None, :]
-    deviation = np.abs(matrix - matrix.conj().swapaxes(1, 2)).max(axis=(1, 2))
+    p, q = np.tril_indices(n_channels)
+    deviation = np.abs(matrix[:, p, q] - matrix[:, q, p].conj()).max(axis=1)
     if (deviation > HERMITIAN_TOLERANCE).any():
         raise InvalidMatrixError(
             f"cross-spectral matrix is not Hermitian at frequency {np.argmax(deviation)}: "
             f"csm[f, p, q] and the conjugate of csm[f, q, p] differ by {deviation.max():.1e} of "
             "the channels' PSDs"
         )
-    duplicates = np.abs(matrix) ** 2 >= 1 - DUPLICATE
+    duplicates = matrix.real**2 + matrix.imag**2 >= 1 - DUPLICATE
     duplicates[:, np.arange(n_channels), np.arange(n_channels)] = False
     flags = np.zeros(psd.shape, dtype=np.int64)
     flags[dead] |= Flag.DEAD_CHANNEL

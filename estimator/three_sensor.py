@@ -15,14 +15,16 @@ Only j and k need as many channels as the motion has dimensions; the target may 
 
 from __future__ import annotations
 
+import functools
 import itertools
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimator.coherency import check_averages, check_dims, coherency, from_parts, inverse
 from estimator.self_noise import Flag
+from estimator.spectra import THREADS
 from estimator.uncertainty import moments, score_interval
 
 if TYPE_CHECKING:
@@ -30,22 +32,8 @@ if TYPE_CHECKING:
     from estimator.coherency import Coherency
     from estimator.self_noise import SelfNoise
 
-    _Inverse = tuple[ComplexArray, BoolArray]
 
-
-FREQUENCIES = 256  # worked on at a time: what the processor's cache holds
-
-
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """Residuals of one target's channels against two other sensors; shapes (n_freqs, rows, …)."""
-
-    j: slice
-    k: slice
-    P: ComplexArray
-    Q: ComplexArray
-    cross: ComplexArray  # E[u conj(v)]
-    regular: BoolArray  # (n_freqs,)
+FREQUENCIES = 128  # worked on at a time: what the processor's cache holds
 
 
 def three_sensor(
@@ -96,93 +84,157 @@ def estimate(
     given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool
 ) -> SelfNoise:
     """Do what `three_sensor` does, from a matrix that has been checked and normalised."""
-    n_freqs = len(given.psd)
     blocks = [
-        _estimate(given.block(slice(low, low + FREQUENCIES)), dims, n_effective, correct=correct)
-        for low in range(0, n_freqs, FREQUENCIES)
+        given.block(slice(low, low + FREQUENCIES)) for low in range(0, len(given.psd), FREQUENCIES)
     ]
+    of_block = functools.partial(_estimate, dims=dims, n_effective=n_effective, correct=correct)
+    with ThreadPoolExecutor(min(THREADS, len(blocks))) as pool:
+        found = list(pool.map(of_block, blocks))
     noise, deviation, low, high, flags = (
-        np.concatenate(parts) for parts in zip(*blocks, strict=True)
+        np.concatenate(parts) for parts in zip(*found, strict=True)
     )
     return from_parts("three-sensor", given, (noise, deviation, low, high), flags)
 
 
 def _estimate(
-    given: Coherency, dims: tuple[int, ...], n_effective: float, *, correct: bool
+    given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
     """Noise, its deviation and interval, all in parts of the channel's PSD; flags."""
     noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
     flags = given.flags.copy()
-    first = [int(start) for start in np.cumsum([0, *dims])]
-    inverses: dict[tuple[int, int, int], _Inverse] = {}
-    for i in range(len(dims)):
-        others, d = _counterparts(dims, i)
+    first = np.cumsum([0, *dims])
+    shared = [_shared(dims, i) for i in range(len(dims))]
+    for d in sorted(set(shared)):
         check_averages(n_effective, d)
-        leading = {j: slice(first[j], first[j] + d) for j in others}
-        rows = slice(first[i], first[i] + min(d, dims[i]))
-        flags[:, rows.stop : first[i + 1]] |= Flag.NO_COUNTERPART
-        pairs = []
-        for j, k in itertools.combinations(others, 2):
-            if (j, k, d) not in inverses:
-                inverses[j, k, d] = inverse(given.matrix[:, leading[j], leading[k]])
-            pairs.append(_pair(given, rows, (leading[j], leading[k]), inverses[j, k, d]))
-        weights = np.array([pair.regular for pair in pairs], dtype=np.float64)
-        n_regular = weights.sum(axis=0)
-        flags[n_regular == 0, rows] |= Flag.SINGULAR
-        weights /= np.maximum(n_regular, 1)
+        targets = [i for i, n in enumerate(shared) if n == d]
+        others = [j for j, n in enumerate(dims) if n >= d]
+        rows = np.concatenate([first[i] + np.arange(min(d, dims[i])) for i in targets])
+        target = np.repeat(targets, [min(d, dims[i]) for i in targets])
+        for i in targets:
+            flags[:, first[i] + d : first[i + 1]] |= Flag.NO_COUNTERPART
+        columns = np.add.outer(first[others], np.arange(d))
+        part, traces, n_pairs = _mean_of_pairs(
+            given, rows, columns, target=target, others=np.not_equal.outer(target, others)
+        )
+        unknown = np.zeros(flags.shape, dtype=np.bool_)
+        unknown[:, rows] = n_pairs == 0
+        flags[unknown] |= Flag.SINGULAR
         gain, averages = (
             (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
         )
-        mean = gain * np.einsum("tf,tfr->fr", weights, [pair.cross.real for pair in pairs])
-        traces = _traces(given.matrix, rows, pairs, weights)
+        part *= gain
         traces *= gain ** np.arange(2, 5)[:, None, None]
-        noise[:, rows] = mean
+        noise[:, rows] = part
         deviation[:, rows] = np.sqrt(np.maximum(traces[0], 0) / averages)
-        low[:, rows], high[:, rows] = score_interval(mean, traces, averages=averages)
+        low[:, rows], high[:, rows] = score_interval(part, traces, averages=averages)
     return noise, deviation, low, high, flags
 
 
-def _counterparts(dims: tuple[int, ...], i: int) -> tuple[list[int], int]:
-    """Sensors to compare sensor i with, and the d channels that all of them have."""
-    d = sorted((n for j, n in enumerate(dims) if j != i), reverse=True)[1]
-    return [j for j, n in enumerate(dims) if j != i and n >= d], d
+def _shared(dims: tuple[int, ...], i: int) -> int:
+    """Return how many channels two or more sensors besides sensor i have."""
+    return sorted((n for j, n in enumerate(dims) if j != i), reverse=True)[1]
 
 
-def _pair(given: Coherency, i: slice, others: tuple[slice, slice], inverse_jk: _Inverse) -> _Pair:
-    S, (j, k), (inv_jk, regular) = given.matrix, others, inverse_jk
-    S_ij, S_ik = S[:, i, j], S[:, i, k]
-    P = S_ik @ inv_jk
-    Q = S_ij @ inv_jk.conj().swapaxes(1, 2)
-    # Eq. (25); its conjugate, j and k swapped, is the other half of (26).
-    cross = np.einsum("frr->fr", S[:, i, i]) - np.einsum("frc,frc->fr", P, S_ij.conj())
-    used = np.zeros(S.shape[1], dtype=bool)
-    used[j] = used[k] = True
-    used_or_target = used.copy()
-    used_or_target[i] = True
-    regular = regular & ~given.duplicates[:, used][:, :, used_or_target].any(axis=(1, 2))
-    return _Pair(j, k, P, Q, cross, regular)
+def _mean_of_pairs(
+    given: Coherency, rows: IntArray, columns: IntArray, *, target: IntArray, others: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean of (26) over all pairs of other sensors, the moments of that mean, and how many pairs.
 
+    Parameters
+    ----------
+    given : Coherency
+    rows : int64, shape (n_rows,)
+        Channels to estimate.
+    columns : int64, shape (m, d)
+        Channels of the sensors they are compared with.
+    target : int64, shape (n_rows,)
+        Sensor of each row.
+    others : bool, shape (n_rows, m)
+        Whether that is another sensor.
 
-def _traces(S: ComplexArray, i: slice, pairs: list[_Pair], weights: FloatArray) -> FloatArray:
-    """`estimator.uncertainty.moments` of the weighted mean of the pairs' estimates.
-
-    One residual a sensor: those of sensor j paired with different k differ by their sampling
-    error only, and their mean is taken. With W the rows of these residuals, M = W^H omega W, where
-    omega holds half of each pair's weight; so ``tr((M S)**k) = tr((omega G)**k)``, where
-    G = W S W^H are the residuals' spectra.
+    Returns
+    -------
+    noise : float64, shape (n_freqs, n_rows)
+    traces : float64, shape (3, n_freqs, n_rows)
+        `estimator.uncertainty.moments` of the noise.
+    n_pairs : float64, shape (n_freqs, n_rows)
+        Pairs, counted both ways, that can be used; zero where nothing can be said.
     """
-    n_freqs, n_rows = pairs[0].cross.shape
-    others = sorted({start for pair in pairs for start in (pair.j.start, pair.k.start)})
-    n = len(others)
-    W = np.zeros((n_freqs, n_rows, n, S.shape[1]), dtype=np.complex128)
-    omega = np.zeros((n_freqs, 1, n, n))
-    for weight, pair in zip(weights, pairs, strict=True):
-        a, b = others.index(pair.j.start), others.index(pair.k.start)
-        W[:, :, a, pair.j] -= weight[:, None, None] * pair.P
-        W[:, :, b, pair.k] -= weight[:, None, None] * pair.Q
-        omega[:, 0, a, b] = omega[:, 0, b, a] = weight / 2
-    share = 2 * omega[:, 0].sum(axis=1)[:, None, :, None]
-    np.divide(W, share, out=W, where=share > 0)
-    W[:, np.arange(n_rows), :, i.start + np.arange(n_rows)] = 1
-    WS = (W.reshape(n_freqs, n_rows * n, -1) @ S).reshape(W.shape)
-    return moments(WS @ W.conj().swapaxes(-1, -2), omega)
+    S, (m, d), columns = given.matrix, columns.shape, columns.ravel()
+    between, towards = S[:, columns[:, None], columns], S[:, rows[:, None], columns]
+    inverses, pairs = _inverses(given, between, columns, m)
+    usable = others[None]
+    if given.duplicates.any():  # a copy of one of the target's channels spoils that sensor for it
+        copies = given.duplicates[:, rows[:, None], columns].reshape(len(S), len(rows), m, d)
+        usable = usable & ~((target[:, None] == target) @ copies.any(axis=3))
+    partners = usable * (usable @ pairs)  # (n_freqs, n_rows, m)
+    n_pairs = partners.sum(axis=2)
+    weight = 1 / np.maximum(n_pairs, 1)
+    # The mean of P = S_ik inv(S_jk) over k, at the columns of j.
+    motion = (towards * np.repeat(usable, d, axis=2)) @ inverses
+    motion *= np.repeat(usable / np.maximum(partners, 1), d, axis=2)
+    own = _summed(motion * towards.conj(), m)
+    power = np.einsum("fpp->fp", S).real[:, rows]
+    noise = power - weight * np.einsum("frj,frj->fr", partners, own.real)
+    # One residual a sensor: those of sensor j paired with different k differ by their sampling
+    # error only, and their mean is taken. M = W^H omega W, with W the rows of these residuals and
+    # omega half of each pair's weight; so tr((M S)^k) = tr((omega G)^k), G = W S W^H.
+    omega = (usable * weight[:, :, None])[:, :, :, None] * pairs[:, None]
+    omega *= usable[:, :, None, :]
+    return noise, moments(_residuals(between, motion, own, power), omega), n_pairs
+
+
+def _inverses(
+    given: Coherency, between: ComplexArray, columns: IntArray, m: int
+) -> tuple[ComplexArray, FloatArray]:
+    """Invert S_jk of all pairs of m sensors; zero for a pair that cannot be used.
+
+    Returns
+    -------
+    inverses : complex128, shape (n_freqs, m * d, m * d)
+        ``inv(S_jk)`` in the rows of k and the columns of j.
+    pairs : float64, shape (n_freqs, m, m)
+        One where a pair can be used.
+    """
+    n_freqs, d = len(between), len(columns) // m
+    j, k = np.array(list(itertools.combinations(range(m), 2))).T
+    blocks = between.reshape(n_freqs, m, d, m, d)[:, j, :, k]  # (n_pairs, n_freqs, d, d)
+    inverted, regular = inverse(blocks.reshape(-1, d, d))
+    inverted, regular = inverted.reshape(blocks.shape), regular.reshape(len(j), n_freqs)
+    dead = (given.flags[:, columns] & Flag.DEAD_CHANNEL) != 0
+    out = dead.reshape(n_freqs, m, d).any(axis=2)
+    regular &= ~(out[:, j] | out[:, k]).T
+    if given.duplicates.any():
+        copies = given.duplicates[:, columns[:, None], columns].reshape(n_freqs, m, d, m, d)
+        alike: BoolArray = np.asarray(copies.any(axis=(2, 4)))
+        regular &= ~(alike[:, j, k] | alike[:, j, j] | alike[:, k, k]).T
+    inverted *= regular[:, :, None, None]
+    inverses = np.zeros((n_freqs, m, d, m, d), dtype=np.complex128)
+    inverses[:, k, :, j] = inverted
+    inverses[:, j, :, k] = inverted.conj().swapaxes(2, 3)
+    pairs = np.zeros((n_freqs, m, m))
+    pairs[:, j, k] = pairs[:, k, j] = regular.T
+    return inverses.reshape(between.shape), pairs
+
+
+def _residuals(
+    between: ComplexArray, motion: ComplexArray, own: ComplexArray, power: FloatArray
+) -> ComplexArray:
+    """Spectra ``G[f, r, j, k] = E[u_j conj(u_k)]`` of what is left of row r without j, and k."""
+    n_freqs, n_rows, m = own.shape
+    n_columns = motion.shape[2]
+    by_sensor = motion.reshape(n_freqs, n_rows, m, -1).swapaxes(1, 2)
+    taken = by_sensor @ between.reshape(n_freqs, m, -1, n_columns)
+    taken *= motion.conj()[:, None]
+    G = np.ascontiguousarray(_summed(taken, m).swapaxes(1, 2))
+    G += power[:, :, None, None]
+    G -= own[:, :, :, None]
+    G -= own.conj()[:, :, None, :]
+    return G
+
+
+def _summed(values: ComplexArray, m: int) -> ComplexArray:
+    """Sum the last axis over each of m sensors' channels: one product, faster than many sums."""
+    n_columns = values.shape[-1]
+    of_sensors = np.repeat(np.eye(m), n_columns // m, axis=0)
+    return np.asarray((values.reshape(-1, n_columns) @ of_sensors).reshape(*values.shape[:-1], m))

@@ -40,8 +40,8 @@ def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> Float
     float64, shape (3, ...)
         ``tr((M S)**k)`` for k = 2, 3, 4; the first is n times the variance of the estimate.
     """
-    once = differential @ csm
-    twice = once @ once
+    once = _product(differential, csm)
+    twice = _product(once, once)
     return np.stack(
         [
             np.einsum("...pp->...", twice).real,
@@ -49,6 +49,16 @@ def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> Float
             np.einsum("...pq,...qp->...", twice, twice).real,
         ]
     )
+
+
+def _product(a: ComplexArray | FloatArray, b: ComplexArray) -> ComplexArray:
+    """Multiply many small matrices in real arithmetic, which takes half the time."""
+    b = np.ascontiguousarray(b)
+    if np.iscomplexobj(a):  # column by column, real part times b and imaginary part times i b
+        a = np.ascontiguousarray(a).view(np.float64)
+        *many, p, q = b.shape
+        b = np.stack([b, 1j * b], axis=-2).reshape(*many, 2 * p, q)
+    return np.asarray((a @ b.view(np.float64)).view(np.complex128))
 
 
 def score_interval(
