@@ -5,7 +5,8 @@ reason in register 55000; scan lists of analog inputs, CORE_TIMER, SYSTEM_TIMER_
 half of a 32-bit channel, and the channel's own position; a scan interval of whole 100 ns; packets
 of the wanted size; a buffer that overflows when nobody takes the samples (2940, then 2941 and one
 scan of 0xFFFF), 2943 when it lasts, 2942 when the rate is too high, bursts (2944); calibration in
-flash; temperature.
+flash; temperature; CORE_TIMER, which stood at 0 at world time 0 and after each power failure (the
+fault ``reset``), and SYSTEM_TIMER_20HZ, which begins anew with the process, too.
 
 An analog input reads its channel's counts above the centre of the converter. Of ``settings`` it
 takes beyond the driver's: ``ends_with``, a fatal status with which the first stream breaks off
@@ -106,11 +107,15 @@ class LabJack:
             self._store(41500 + n, bytes(2))  # AINn_RESOLUTION_INDEX
         self.stream: Stream | None = None
         self.stream_started = 0  # how many times
+        self._core_began = 0  # CORE_TIMER at world time 0, below 0, in ticks
+        self._system_began: float | None = None  # world time; the first time it is spoken to
 
     # --- registers ---------------------------------------------------------------------------
 
     def answer(self, adu: Adu, now: float) -> bytes:
         """Answer a request."""
+        if self._system_began is None:
+            self._system_began = now
         function = adu.pdu[0] if adu.pdu else 0
         try:
             pdu = bytes((function,)) + self._function(function, adu.pdu, now)
@@ -167,7 +172,11 @@ class LabJack:
         if address < 28:
             return b"".join(self._volts(a, now) for a in range(address, address + n_registers, 2))
         if address == reg.CORE_TIMER:
-            return int(now * reg.CORE_HZ % (1 << 32)).to_bytes(4, "big")[: 2 * n_registers]
+            ticks = (int(now * reg.CORE_HZ) - self._core_began) % (1 << 32)
+            return ticks.to_bytes(4, "big")[: 2 * n_registers]
+        if address == reg.SYSTEM_TIMER_20HZ:
+            seconds = now - (self._system_began or 0.0)
+            return int(seconds * reg.SYSTEM_HZ).to_bytes(4, "big")[: 2 * n_registers]
         words = [self._memory.get(a) for a in range(address, address + n_registers)]
         if None in words:
             raise RefusedError(reg.ILLEGAL_ADDRESS)
@@ -223,7 +232,13 @@ class LabJack:
         overlap = rate * n_columns > MAX_SAMPLE_RATE
         as_is = overlap or rate == self._source.sampling_rate
         source = self._source if as_is else self._source.at_rate(rate)
-        columns = Columns(addresses, self._inputs, rate)
+        columns = Columns(
+            addresses,
+            self._inputs,
+            rate,
+            core_began=self._core_began,
+            system_began=self._system_began or 0.0,
+        )
         capacity = (self._value(reg.STREAM_BUFFER_SIZE_BYTES) or 4096) // 2
         stream = Stream(
             Samples(source, self._sensors),
@@ -248,6 +263,9 @@ class LabJack:
         """Suffer a power failure, or an overflow that lasts."""
         if kind == "reset":
             self.stop()
+            first = self._source.first_sample_after(self._sensors[0], now)
+            self._core_began = first * round(reg.CORE_HZ / self._source.sampling_rate)
+            self._system_began = now
         elif self.stream is not None:
             self.stream.advance(now)
             self.stream.overflow(now + duration)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from sim_devices.sampling import Samples
 
-SYSTEM_TIMER_20HZ = 61522
 CENTER = 33523
 
 
@@ -122,16 +121,26 @@ class Stream:
 class Columns:
     """What the addresses of a scan list read."""
 
-    def __init__(self, addresses: Sequence[int], inputs: Mapping[int, int], rate: float) -> None:
+    def __init__(
+        self,
+        addresses: Sequence[int],
+        inputs: Mapping[int, int],
+        rate: float,
+        *,
+        core_began: int = 0,
+        system_began: float = 0.0,
+    ) -> None:
         self.n = len(addresses)
         self._addresses = addresses
         self._inputs = inputs  # address of an analog input: column of the samples
         self._ticks = round(reg.CORE_HZ / rate)
         self._rate = rate
+        self._core_began = core_began
+        self._system_began = system_began
 
     def timer(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """CORE_TIMER at each scan."""
-        return index * self._ticks % (1 << 32)
+        return (index * self._ticks - self._core_began) % (1 << 32)
 
     def scans(self, samples: Samples, first: int, n: int) -> NDArray[np.uint16]:
         """Return ``n`` scans, shape (n, n_columns)."""
@@ -145,8 +154,9 @@ class Columns:
                 continue
             if address == reg.CORE_TIMER:
                 wide = self.timer(index)
-            elif address == SYSTEM_TIMER_20HZ:
-                wide = (index * 20 / self._rate).astype(np.int64) % (1 << 32)
+            elif address == reg.SYSTEM_TIMER_20HZ:
+                seconds = index / self._rate - self._system_began
+                wide = (seconds * reg.SYSTEM_HZ).astype(np.int64) % (1 << 32)
             elif address in self._inputs:
                 wide = counts[:, self._inputs[address]]
             else:

@@ -3,333 +3,87 @@
 The device is put into configuration mode (it may be found streaming from before), identified, set
 up completely and read back, and streams by itself (UART_AUTO) until the session ends; then it is
 left in configuration mode, quiet. Nothing is written to its flash.
+
+A device that was lost is left as it is: with the cable out it goes on streaming, and its COUNT goes
+on. Once it is heard again, in the same format and with COUNT where host time says it should be, it
+is taken on as it is, so that what is missing is known exactly. It cannot be asked for its serial
+number while it streams; a stream that goes on like this is taken for its own.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveFloat, field_validator
 
 from daq.bench import Channel, Sensor
-from daq.drivers.base import DeviceInformation
-from daq.errors import BenchFileError, DeviceError, NoAnswerError, WrongDeviceError
+from daq.drivers.epson_setup import Configuration, Device, EpsonSettings
+from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols import epson
-from daq.protocols.epson import BurstFormat, Register
-from daq.protocols.epson_burst import BurstDecoder
 from daq.transport import open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
+    from collections.abc import AsyncIterator, Sequence
 
     from daq.clock import HostClock
-    from daq.protocols.block import Block, Event
+    from daq.drivers.base import DeviceInformation, Session
+    from daq.protocols.block import Block, Event, HostTime
+    from daq.protocols.epson_burst import BurstDecoder
     from daq.transport import ByteStream
 
-REPLY_TIMEOUT = 0.3
-QUIET = 0.03
-"""Without a byte for so long, in s, the device has stopped streaming: six frames at 200 Hz."""
-ATTEMPTS, READ_ATTEMPTS = 5, 3
-SETTLE_TIMEOUT = 3.0
-"""For the device to get ready (flash, reset) or change its mode or filter, s."""
 STALLED = 1.0
 """Without a frame for so long, in s, the device has stopped sending."""
 GATHER = 0.05
 """Frames of so many seconds are decoded together."""
-WRITE_INTERVAL = 0.001
-"""Between two commands, s; the data sheet asks for 350 µs."""
-
-Field = Literal["x", "y", "z", "temperature"]
-EXTERNAL = {
-    "off": 0,
-    "trigger-rising": 2,
-    "trigger-falling": 3,
-    "pps-rising": 4,
-    "pps-falling": 5,
-}
-
-
-class EpsonSettings(BaseModel):
-    """``[sensors.settings]`` of an Epson accelerometer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    baud_rate: Literal[460800, 230400, 115200] = 460800
-    """As the device is set (it leaves the factory at 460800)."""
-    filter: str | None = None
-    """Name of the filter; the usual one for the sampling rate if not given."""
-    fields: tuple[Field, ...] | None = None
-    """What each channel is, in order; x, y, z, and temperature for an auxiliary channel."""
-    flags: bool = True
-    """Whether bursts carry the error flag."""
-    tilt: bool = False
-    """Whether x, y, z are tilt angles instead of accelerations."""
-    reduced_noise: bool = False
-    """The reduced-noise-floor condition of the M-A352."""
-    temperature_stabilisation: bool = True
-    """Bias stabilisation against thermal shock of the M-A352."""
-    external: Literal["off", "trigger-rising", "trigger-falling", "pps-rising", "pps-falling"] = (
-        "off"
-    )
-    """What the EXT pin does; 1PPS on the M-A370 only."""
-    full_scale: PositiveFloat = 15.0
-    """In g, peak; samples beyond are marked as clipped."""
-
-    @field_validator("filter")
-    @classmethod
-    def _known(cls, value: str | None) -> str | None:
-        if value is not None and value not in epson.FILTERS:
-            raise ValueError(f"expected one of {', '.join(epson.FILTERS)}")
-        return value
-
-
-@dataclass(frozen=True, slots=True)
-class _Configuration:
-    """What a sensor's settings come to in the device's registers."""
-
-    sampling_rate: int
-    filter: str
-    fields: tuple[Field, ...]
-    burst: BurstFormat
-    settings: EpsonSettings
-
-    @classmethod
-    def of(cls, sensor: Sensor) -> _Configuration:
-        """Raise BenchFileError for what the device cannot do."""
-        settings = EpsonSettings.model_validate(sensor.settings)
-        who = f"sensor {sensor.name!r}"
-        rate = round(sensor.sampling_rate)
-        if rate not in epson.RATES or rate != sensor.sampling_rate:
-            rates = ", ".join(map(str, epson.RATES))
-            raise BenchFileError(
-                f"{who}: sampling_rate = {sensor.sampling_rate:g}; the device has {rates} Hz"
-            )
-        axes: Iterator[Field] = iter(("x", "y", "z"))
-        fields = settings.fields or tuple(
-            "temperature" if channel.auxiliary else next(axes, "temperature")
-            for channel in sensor.channels
-        )
-        if len(fields) != len(sensor.channels) or len(set(fields)) < len(fields):
-            raise BenchFileError(
-                f"{who}: {len(sensor.channels)} channels, but settings.fields = {list(fields)};"
-                " expected a different one of x, y, z, temperature for each channel"
-            )
-        flags = ("flag",) if settings.flags else ()
-        burst = BurstFormat.of(*flags, *fields, "count", "checksum")
-        if (needed := rate * burst.size * 10) > settings.baud_rate:
-            raise BenchFileError(
-                f"{who}: {rate} Hz of {burst.size} bytes need {needed} baud;"
-                f" settings.baud_rate = {settings.baud_rate} (fewer fields, or a lower rate)"
-            )
-        usual = settings.filter or epson.USUAL_FILTER[rate]
-        return cls(rate, usual, fields, burst, settings)
-
-    def writes(self) -> list[tuple[Register, bool, int]]:
-        """Return what to set: which register, whether its high byte, and to what."""
-        s, burst_ctrl = self.settings, self.burst.burst_ctrl
-        sig_low = 0xE0 * s.tilt | 0x10 * s.reduced_noise | 0x04 * s.temperature_stabilisation
-        sig_high = (burst_ctrl >> 8 & 0x07) << 1 | 0x80 * ("temperature" in self.burst)
-        return [
-            (epson.MSC_CTRL, False, EXTERNAL[s.external] << 5 | 0x06),
-            (epson.SIG_CTRL, True, sig_high),
-            (epson.SIG_CTRL, False, sig_low),
-            (epson.SMPL_CTRL, True, epson.RATES[self.sampling_rate]),
-            (epson.FILTER_CTRL, False, epson.FILTERS[self.filter]),
-            (epson.UART_CTRL, False, epson.UART_AUTO),
-            (epson.BURST_CTRL, True, burst_ctrl >> 8),
-            (epson.BURST_CTRL, False, burst_ctrl & 0xFF),
-        ]
-
-
-class _Device:
-    """Registers of one device in configuration mode."""
-
-    def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
-        self._sensor = sensor
-        self._stream = stream
-
-    async def write(self, register: Register, value: int, *, high: bool = False) -> None:
-        await self._stream.write(epson.write(register, value, high=high))
-        await asyncio.sleep(WRITE_INTERVAL)
-
-    async def read(self, register: Register) -> int:
-        """Read a register; an answer that was lost on the way is asked for again."""
-        for _ in range(READ_ATTEMPTS - 1):
-            with contextlib.suppress(NoAnswerError, WrongDeviceError):
-                return await self._read(register)
-        return await self._read(register)
-
-    async def _read(self, register: Register) -> int:
-        self._stream.discard()
-        await self._stream.write(epson.read(register))
-        received = b""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(REPLY_TIMEOUT):
-                while True:
-                    received += (await self._stream.read())[0]
-                    value = epson.find_reply(received, register.address)
-                    if value is not None:
-                        return value
-        expected = f"expected {register.address:02X} xx xx 0D for register {register.address:02X}"
-        if received:
-            raise WrongDeviceError(
-                f"{self._stream.label}: no Epson accelerometer: {expected} of window"
-                f" {register.window}, got {received[-16:].hex(' ')}"
-            )
-        raise NoAnswerError(
-            f"{self._stream.label}: no answer: {expected} of window {register.window}, got nothing;"
-            " check cable, power and settings.baud_rate"
-        )
-
-    async def wait_clear(self, register: Register, bits: int, doing: str) -> int:
-        try:
-            async with asyncio.timeout(SETTLE_TIMEOUT):
-                while (value := await self.read(register)) & bits:
-                    pass
-        except TimeoutError as error:
-            raise NoAnswerError(
-                f"{self._stream.label}: the device is still {doing} after {SETTLE_TIMEOUT:g} s"
-            ) from error
-        return value
-
-    async def stop(self) -> None:
-        """Enter configuration mode and let what was on its way pass."""
-        await self.write(epson.MODE_CTRL, epson.CONFIGURATION, high=True)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SETTLE_TIMEOUT):
-                while True:
-                    async with asyncio.timeout(QUIET):
-                        await self._stream.read()
-
-    async def identify(self, attempts: int = ATTEMPTS) -> None:
-        """Find the device, streaming or not, in the middle of a command or not."""
-        failure: DeviceError | None = None
-        for _ in range(attempts):
-            await self.stop()
-            try:
-                found = await self._read(epson.ID)
-            except (NoAnswerError, WrongDeviceError) as error:
-                failure = error
-                await self._stream.write(bytes([epson.DELIMITER]))
-                continue
-            if found == epson.DEVICE_ID:
-                return
-            failure = WrongDeviceError(
-                f"{self._stream.label}: expected ID {epson.DEVICE_ID:04X}, got {found:04X}"
-            )
-        if failure is not None:
-            raise failure
-
-    async def information(self) -> DeviceInformation:
-        """Read what the device says about itself; refuse it if it is not the one expected."""
-        await self.wait_clear(epson.GLOB_CMD, epson.NOT_READY, "starting")
-        model, serial_number = await self._identity()
-        if refusal := self._refusal(model, serial_number):
-            raise WrongDeviceError(f"{self._stream.label}: {refusal}")
-        version = await self.read(epson.VERSION)
-        high = await self.read(epson.TEMP_HIGH)
-        low = await self.read(Register(epson.TEMP_HIGH.window, epson.TEMP_HIGH.address + 2))
-        count = (high << 16 | low) - (1 << 32) * (high >> 15)
-        diagnosis = await self.read(epson.DIAG_STAT)
-        return DeviceInformation(
-            sensor=self._sensor.name,
-            model=model,
-            serial_number=serial_number,
-            firmware=f"{version >> 8:X}.{version & 0xFF:X}",
-            temperature=round(epson.temperature(count), 2) if count else None,
-            details={"DIAG_STAT": f"{diagnosis:04X}"} if diagnosis else {},
-        )
-
-    async def _identity(self) -> tuple[str, str]:
-        """Return model and serial number, read twice alike: replies bear no checksum.
-
-        A wrong one would be taken for the device's own, and the device refused ever after.
-        """
-        before: tuple[str, str] | None = None
-        for _ in range(ATTEMPTS):
-            model = epson.text(tuple([await self.read(r) for r in epson.PROD_ID]))
-            found = model, epson.text(tuple([await self.read(r) for r in epson.SERIAL_NUM]))
-            if found == before:
-                return found
-            before = found
-        raise WrongDeviceError(
-            f"{self._stream.label}: model and serial number differ each time they are read,"
-            f" last {' '.join(before or ())!r}; check the cable"
-        )
-
-    def _refusal(self, model: str, serial_number: str) -> str:
-        """Say why this is not the device the bench file names; nothing if it is."""
-        wanted = self._sensor.model
-        named = re.search(r"A\d{3}", wanted.upper())
-        if named and named[0] not in model:
-            return f"expected model {wanted!r}, got {model!r}"
-        if self._sensor.serial_number not in {"", serial_number}:
-            return f"expected serial number {self._sensor.serial_number!r}, got {serial_number!r}"
-        return ""
-
-    async def sampling_rate(self) -> float | None:
-        code = await self.read(epson.SMPL_CTRL) >> 8
-        return next((float(rate) for rate, c in epson.RATES.items() if c == code), None)
-
-    async def configure(self, configuration: _Configuration) -> None:
-        """Set every register that matters, and read each back."""
-        for register, high, value in configuration.writes():
-            await self._set(register, value, high=high)
-        for register, high, value in configuration.writes():
-            for _ in range(READ_ATTEMPTS):
-                found = await self.read(register) >> (8 if high else 0) & 0xFF
-                if found == value:
-                    break
-                await self._set(register, value, high=high)
-            else:
-                raise WrongDeviceError(
-                    f"{self._stream.label}: register {register.address + high:02X} of window"
-                    f" {register.window} was set to {value:02X} and reads {found:02X}:"
-                    " this model does not have that setting"
-                )
-
-    async def _set(self, register: Register, value: int, *, high: bool) -> None:
-        await self.write(register, value, high=high)
-        if register is epson.FILTER_CTRL:
-            await self.wait_clear(register, epson.FILTER_BUSY, "changing its filter")
+LISTEN = 0.5
+"""How long a device that was lost is listened to before it is set up anew, s."""
 
 
 class EpsonSession:
-    """An accelerometer, set up and quiet until :meth:`read`."""
+    """An accelerometer, set up and quiet until :meth:`read`, or heard streaming as before.
+
+    Parameters
+    ----------
+    heard : bytes and host time
+        What came already of a stream that goes on, and when the last of it did.
+    """
 
     def __init__(
         self,
-        sensor: Sensor,
         stream: ByteStream,
-        configuration: _Configuration,
+        configuration: Configuration,
         information: DeviceInformation,
+        decoder: BurstDecoder,
+        *,
+        heard: tuple[bytes, HostTime] | None = None,
     ) -> None:
         self.information = (information,)
-        self._sensor = sensor
+        self.decoder = decoder
         self._stream = stream
         self._configuration = configuration
+        self._heard = heard
+
+    @property
+    def resumed(self) -> bool:
+        """Whether blocks go on in the index of the session before."""
+        return self._heard is not None
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Start sampling and yield blocks and events."""
         configuration = self._configuration
-        full_scale = configuration.settings.full_scale * epson.COUNTS_PER_G
-        decoder = BurstDecoder(
-            self._sensor.name,
-            configuration.burst,
-            fields=configuration.fields,
-            sampling_rate=configuration.sampling_rate,
-            full_scale_counts=min(round(full_scale), 2**31 - 1),
-        )
-        self._stream.discard()
-        await self._stream.write(epson.write(epson.MODE_CTRL, epson.SAMPLING, high=True))
-        self._stream.expect(round(GATHER * configuration.sampling_rate) * configuration.burst.size)
         # filters settle before the first frame
         patience = STALLED + 1.0
+        if self._heard is None:
+            self._stream.discard()
+            await self._stream.write(epson.write(epson.MODE_CTRL, epson.SAMPLING, high=True))
+        else:
+            self.decoder.resume()
+            for item in self.decoder.receive(*self._heard):
+                yield item
+        self._stream.expect(round(GATHER * configuration.sampling_rate) * configuration.burst.size)
         while True:
             try:
                 async with asyncio.timeout(patience):
@@ -340,7 +94,7 @@ class EpsonSession:
                     f" expected {configuration.sampling_rate} frames a second"
                 ) from error
             patience = STALLED
-            for item in decoder.receive(received, at):
+            for item in self.decoder.receive(received, at):
                 yield item
 
 
@@ -361,7 +115,7 @@ async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInfo
     )
     label = f"port {port} at {baud_rate} baud"
     async with open_port(port, clock, label=label, baud_rate=baud_rate) as stream:
-        device = _Device(anyone, stream)
+        device = Device(anyone, stream)
         await device.identify(attempts=2)
         information = await device.information()
         return replace(information, sampling_rate=await device.sampling_rate())
@@ -384,29 +138,90 @@ class EpsonDriver:
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[EpsonSession]:
         """Open the port, identify the accelerometer and set it up."""
-        sensor = sensors[0]
-        if len(sensors) > 1:
-            names = ", ".join(repr(other.name) for other in sensors)
-            raise BenchFileError(f"port {sensor.port} is given to {names}; an Epson has its own")
-        configuration = _Configuration.of(sensor)
-        async with open_port(
-            sensor.port,
-            clock,
-            label=f"sensor {sensor.name!r} on {sensor.port}",
-            baud_rate=configuration.settings.baud_rate,
-        ) as stream:
-            device = _Device(sensor, stream)
-            await device.identify()
-            try:
-                information = await device.information()
-                await device.configure(configuration)  # reads back what it sets
-                actual = float(configuration.sampling_rate)
-                information = replace(information, sampling_rate=actual)
-                yield EpsonSession(sensor, stream, configuration, information)
-            finally:
-                stream.expect(1)
-                with contextlib.suppress(DeviceError):
-                    await device.stop()
+        sensor, configuration = _configured(sensors)
+        async with (
+            _port(sensor, configuration, clock) as stream,
+            _set_up(sensor, configuration, stream) as session,
+        ):
+            yield session
+
+    @contextlib.asynccontextmanager
+    async def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AsyncIterator[EpsonSession]:
+        """Open the port and take on a device that streams on; set it up if it does not."""
+        sensor, configuration = _configured(sensors)
+        async with _port(sensor, configuration, clock) as stream:
+            heard = None
+            if isinstance(before, EpsonSession):
+                heard = await _listen(stream, before.decoder)
+            if heard is None or not isinstance(before, EpsonSession):
+                async with _set_up(sensor, configuration, stream) as session:
+                    yield session
+                return
+            async with _left_quiet(Device(sensor, stream), stream):
+                yield EpsonSession(
+                    stream, configuration, before.information[0], before.decoder, heard=heard
+                )
+
+
+def _configured(sensors: Sequence[Sensor]) -> tuple[Sensor, Configuration]:
+    sensor = sensors[0]
+    if len(sensors) > 1:
+        names = ", ".join(repr(other.name) for other in sensors)
+        raise BenchFileError(f"port {sensor.port} is given to {names}; an Epson has its own")
+    return sensor, Configuration.of(sensor)
+
+
+def _port(
+    sensor: Sensor, configuration: Configuration, clock: HostClock
+) -> contextlib.AbstractAsyncContextManager[ByteStream]:
+    label = f"sensor {sensor.name!r} on {sensor.port}"
+    return open_port(sensor.port, clock, label=label, baud_rate=configuration.settings.baud_rate)
+
+
+@contextlib.asynccontextmanager
+async def _set_up(
+    sensor: Sensor, configuration: Configuration, stream: ByteStream
+) -> AsyncIterator[EpsonSession]:
+    device = Device(sensor, stream)
+    await device.identify()
+    async with _left_quiet(device, stream):
+        information = await device.information()
+        await device.configure(configuration)  # reads back what it sets
+        actual = float(configuration.sampling_rate)
+        information = replace(information, sampling_rate=actual)
+        decoder = configuration.decoder(sensor.name)
+        yield EpsonSession(stream, configuration, information, decoder)
+
+
+@contextlib.asynccontextmanager
+async def _left_quiet(device: Device, stream: ByteStream) -> AsyncIterator[None]:
+    """Stop the device at the end; one that was lost is left to go on counting."""
+    is_lost = False
+    try:
+        yield
+    except (NotConnectedError, NoAnswerError):
+        is_lost = True
+        raise
+    finally:
+        if not is_lost:
+            stream.expect(1)
+            with contextlib.suppress(DeviceError):
+                await device.stop()
+
+
+async def _listen(stream: ByteStream, decoder: BurstDecoder) -> tuple[bytes, HostTime] | None:
+    """Return what comes if it is the stream that ``decoder`` knows, and it goes on."""
+    heard = b""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LISTEN):
+            while True:
+                received, at = await stream.read()
+                heard += received
+                if decoder.follows(heard, at):
+                    return heard, at
+    return None
 
 
 DRIVER = EpsonDriver()

@@ -12,7 +12,9 @@ counts) is an offset like any other. The T8 does not show its calibration.
 
 The device has few sockets: one on port 502 does everything but spontaneous streams, by function 76.
 With ``core_timer`` the scan list leads with the device's 40 MHz clock, so that gaps are counted
-exactly. A stream that breaks off (2942, 2943, 2945) is started anew.
+exactly. A stream that breaks off (2942, 2943, 2945) is started anew. So is that of a device that
+was lost; what went missing is counted by the same clock, unless the device was restarted meanwhile,
+which its slower timer tells (SYSTEM_TIMER_20HZ).
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.drivers import labjack_setup as setup
-from daq.drivers.labjack_setup import LabJackSettings, Registers
+from daq.drivers.labjack_setup import LabJackSettings, Registers, Uptime
 from daq.errors import DeviceError, NoAnswerError
 from daq.protocols import labjack
 from daq.protocols import labjack_registers as reg
@@ -36,10 +38,11 @@ from daq.transport import open_port
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+    from contextlib import AbstractAsyncContextManager
 
     from daq.bench import Sensor
     from daq.clock import HostClock
-    from daq.drivers.base import DeviceInformation
+    from daq.drivers.base import DeviceInformation, Session
     from daq.protocols.block import Block, Event
 
 STALLED = 3.0
@@ -63,11 +66,16 @@ class LabJackSession:
         clock: HostClock,
         stream_address: str,
         packet_seconds: float,
+        uptime: Uptime | None,
+        resumed: bool,
     ) -> None:
         self.information = information
+        self.decoder = decoder
+        self.uptime = uptime
+        self.resumed = resumed
+        """Whether blocks go on in the index of the session before."""
         self._registers = registers
         self._settings = settings
-        self._decoder = decoder
         self._clock = clock
         self._stream_address = stream_address
         self._patience = STALLED + 2 * packet_seconds
@@ -83,15 +91,15 @@ class LabJackSession:
             async for items in received:
                 for item in items:
                     yield item
-                if self._decoder.fatal is None:
+                if self.decoder.fatal is None:
                     fruitless = 0 if items else fruitless
                     continue
                 fruitless += 1
                 if fruitless > MOST_RESTARTS:
-                    why = labjack.FATAL[self._decoder.fatal]
+                    why = labjack.FATAL[self.decoder.fatal]
                     raise DeviceError(f"{self._registers.label}: the stream does not go on: {why}")
                 await self._registers.stop_stream()
-                self._decoder.restart()
+                self.decoder.restart()
                 await self._start()
 
     async def _start(self) -> None:
@@ -109,7 +117,7 @@ class LabJackSession:
                     raise NoAnswerError(
                         f"{label}: no samples for {self._patience:g} s from {self._stream_address}"
                     ) from error
-                yield self._decoder.receive(received, at)
+                yield self.decoder.receive(received, at)
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
@@ -125,7 +133,7 @@ class LabJackSession:
                     f"{self._registers.label}: no samples for {self._patience:g} s in register"
                     f" {reg.STREAM_DATA_CR}"
                 )
-            yield self._decoder.receive_response(packet, at)
+            yield self.decoder.receive_response(packet, at)
             if len(packet.samples) < labjack.MAX_CR_SAMPLES:
                 await asyncio.sleep(POLL_INTERVAL)
 
@@ -142,54 +150,86 @@ class LabJackDriver:
         """Return uint16."""
         return np.dtype(np.uint16)
 
-    @contextlib.asynccontextmanager
-    async def open(
+    def open(
         self, sensors: Sequence[Sensor], clock: HostClock
-    ) -> AsyncIterator[LabJackSession]:
+    ) -> AbstractAsyncContextManager[LabJackSession]:
         """Connect, identify, read the calibration and set the stream up."""
-        first = sensors[0]
-        settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
-        common = settings[first.name]
-        inputs = setup.inputs_of(sensors, settings)
-        stream_plan = setup.plan(common, inputs, first.sampling_rate)
-        names = ", ".join(repr(sensor.name) for sensor in sensors)
-        label = f"sensor {names} on {first.port}"
-        host, _, number = (first.port.partition("://")[2] or first.port).partition(":")
-        async with open_port(f"socket://{host}:{number or 502}", clock, label=label) as stream:
-            registers = Registers(stream)
-            product, identity = await setup.identify(registers, sensors)
-            await registers.stop_stream()
-            try:
-                for name, numbers in inputs.items():
-                    await setup.set_inputs(registers, numbers, settings[name], product)
-                rate = await setup.set_stream(registers, common, stream_plan, product)
-                calibrations = await setup.read_calibrations(registers, product)
-                information = tuple(
-                    replace(
-                        identity,
-                        sensor=name,
-                        sampling_rate=rate,
-                        details=setup.details_of(settings[name], numbers, calibrations),
-                    )
-                    for name, numbers in inputs.items()
+        return _opened(sensors, clock, None)
+
+    def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AbstractAsyncContextManager[LabJackSession]:
+        """Do the same; count on where the session before ended, if the device went on meanwhile."""
+        return _opened(sensors, clock, before if isinstance(before, LabJackSession) else None)
+
+
+@contextlib.asynccontextmanager
+async def _opened(
+    sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
+) -> AsyncIterator[LabJackSession]:
+    first = sensors[0]
+    settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
+    common = settings[first.name]
+    inputs = setup.inputs_of(sensors, settings)
+    stream_plan = setup.plan(common, inputs, first.sampling_rate)
+    names = ", ".join(repr(sensor.name) for sensor in sensors)
+    label = f"sensor {names} on {first.port}"
+    host, _, number = (first.port.partition("://")[2] or first.port).partition(":")
+    async with open_port(f"socket://{host}:{number or 502}", clock, label=label) as stream:
+        registers = Registers(stream)
+        product, identity = await setup.identify(registers, sensors)
+        uptime = await setup.read_uptime(registers)
+        await registers.stop_stream()
+        try:
+            for name, numbers in inputs.items():
+                await setup.set_inputs(registers, numbers, settings[name], product)
+            rate = await setup.set_stream(registers, common, stream_plan, product)
+            calibrations = await setup.read_calibrations(registers, product)
+            information = tuple(
+                replace(
+                    identity,
+                    sensor=name,
+                    sampling_rate=rate,
+                    details=setup.details_of(settings[name], numbers, calibrations),
                 )
-                decoder = StreamDecoder(
-                    {name: [reg.ain(n) for n in numbers] for name, numbers in inputs.items()},
-                    scan_list=stream_plan.scan_list,
-                    scan_rate=rate,
-                )
-                yield LabJackSession(
-                    registers,
-                    common,
-                    decoder,
-                    information=information,
-                    clock=clock,
-                    stream_address=f"socket://{host}:{common.stream_port}",
-                    packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
-                )
-            finally:
-                with contextlib.suppress(DeviceError, RemoteProtocolError):
-                    await registers.stop_stream()
+                for name, numbers in inputs.items()
+            )
+            decoder = StreamDecoder(
+                {name: [reg.ain(n) for n in numbers] for name, numbers in inputs.items()},
+                scan_list=stream_plan.scan_list,
+                scan_rate=rate,
+            )
+            resumed = before is not None and _goes_on(before, uptime, information)
+            if before is not None and resumed:
+                decoder = before.decoder
+                decoder.restart()
+            yield LabJackSession(
+                registers,
+                common,
+                decoder,
+                information=information,
+                clock=clock,
+                stream_address=f"socket://{host}:{common.stream_port}",
+                packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
+                uptime=uptime,
+                resumed=resumed,
+            )
+        finally:
+            with contextlib.suppress(DeviceError, RemoteProtocolError):
+                await registers.stop_stream()
+
+
+def _goes_on(
+    before: LabJackSession, uptime: Uptime | None, now: tuple[DeviceInformation, ...]
+) -> bool:
+    """Whether it is the same device at the same rate, and its clock ran on meanwhile."""
+    then = before.information
+    is_same = [(i.serial_number, i.sampling_rate) for i in then] == [
+        (i.serial_number, i.sampling_rate) for i in now
+    ]
+    if not is_same or before.uptime is None or uptime is None:
+        return False
+    return before.decoder.can_go_on and before.uptime.went_on_until(uptime)
 
 
 DRIVER = LabJackDriver()

@@ -22,6 +22,7 @@ from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import labjack
 from daq.protocols import labjack_registers as reg
+from daq.protocols.counting import CLOCK_TOLERANCE, SLACK
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack_registers import Adu, AduFinder, Calibration, Read, Write
 
@@ -218,6 +219,31 @@ async def identify(
         firmware=f"{firmware:.4f}",
         temperature=round(kelvin - 273.15, 2),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Uptime:
+    """What the device's 32-bit timer of 20 Hz stood at, and when.
+
+    It wraps in 6.8 years only. (LabJack does not say where it begins; here it need not be known.)
+    """
+
+    ticks: int
+    at: HostTime
+
+    def went_on_until(self, later: Uptime) -> bool:
+        """Whether the device was not restarted until ``later``: its timer went on meanwhile."""
+        elapsed = (later.at.monotonic_ns - self.at.monotonic_ns) * 1e-9
+        went_on = (later.ticks - self.ticks) % (1 << 32) / reg.SYSTEM_HZ
+        return abs(went_on - elapsed) <= SLACK + CLOCK_TOLERANCE * elapsed
+
+
+async def read_uptime(registers: Registers) -> Uptime | None:
+    """Read the timer that tells a restart; None of a device that has none."""
+    with contextlib.suppress(RemoteProtocolError):
+        values, at = await registers.exchange(Read(reg.SYSTEM_TIMER_20HZ, 2))
+        return Uptime(int.from_bytes(values, "big"), at)
+    return None
 
 
 async def set_inputs(

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     Indices = NDArray[np.int64]
 
 GCF_EPOCH = 627264000
+LOST = {b"disconnected", b"stalled", b"refused"}
+"""Reasons of gaps between two sessions."""
 MARGIN = 30.0
 """How much of the world beyond the last unit sent is computed, s."""
 
@@ -106,8 +108,15 @@ def sent_by_epson(log: Log, sensor: str, truth: Counts, rate: float) -> Indices:
 
 
 def sent_by_labjack(log: Log, sensor: str, truth: Counts, rate: float) -> Indices:
-    """Return the world's index of each scan, by the 40 MHz timer that leads it."""
+    """Return the world's index of each scan, by the 40 MHz timer that leads it.
+
+    The timer stands at 0 at world time 0, and again at a sample after each power failure: which one
+    shows by the first scans after it.
+    """
     ticks, n_columns = round(40e6 / rate), truth.shape[1] + 2
+    failures = [told["at"] for told in log.struck if told["sensors"] == [sensor]
+                and told["kind"] == "reset"]  # fmt: skip
+    begins = {0: 0}
     found = []
     for at, unit in log.sent[sensor]:
         if len(unit) < 16 or unit[6:9] != b"\x01\x4c\x10":
@@ -115,8 +124,13 @@ def sent_by_labjack(log: Log, sensor: str, truth: Counts, rate: float) -> Indice
         scans = np.frombuffer(unit, ">u2", offset=16).astype(np.int64).reshape(-1, n_columns)
         scans = scans[(scans != 0xFFFF).any(axis=1)]
         timer = scans[:, 0] | scans[:, 1] << 16
-        wraps = np.rint((at * 40e6 - timer) / 2**32).astype(np.int64)
-        found.append((timer + wraps * 2**32) // ticks)
+        n_failures = sum(failure <= at for failure in failures)
+        since = at - (failures[n_failures - 1] if n_failures else 0.0)
+        wraps = np.rint((since * 40e6 - timer) / 2**32).astype(np.int64)
+        index = (timer + wraps * 2**32) // ticks
+        if n_failures not in begins:
+            begins[n_failures] = _place(truth, scans[:, 2:]) - int(index[0])
+        found.append(index + begins[n_failures])
     return np.unique(np.concatenate(found))
 
 
@@ -204,7 +218,7 @@ def account(spec: Mapping[str, Any], log: Log, recording: SensorRecord) -> Accou
         row = starts[following]
         errors.append(int(gap["missing"]) - int(world[row] - world[row - 1] - 1))
         in_sessions.append(not gap["estimated"])
-        if following in fresh:
+        if following in fresh or gap["reason"] in LOST:
             between.append(np.arange(world[row - 1] + 1, world[row]))
     error, exact = np.array(errors, int), np.array(in_sessions, bool)
 

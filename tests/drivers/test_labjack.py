@@ -189,7 +189,7 @@ async def test_a_stream_that_breaks_off_is_started_anew(running: tuple[RunningDe
     blocks = found["F"]
     assert [e.text for e in events] == ["the buffer is full (2945)"]
     again = next(b for b in blocks if b.reason)
-    assert again.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    assert again.flags == BlockFlag.CLOCK_RESTART
     assert again.reason == "the buffer is full"
     before = blocks[blocks.index(again) - 1]
     assert before.end_sample == 400

@@ -1,0 +1,102 @@
+"""What is missing across a reconnection: exact where the device counted on, else estimated.
+
+Against what the world made the devices feel and what they sent: every gap has its true length.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from daq.bench import Bench
+from daq.clock import SystemClock
+from daq.protocols import epson
+from daq.protocols.block import BlockFlag
+from daq.recorder import Status, record
+from daq.recording.healing import verify
+from daq.recording.reader import Recording
+from tests.acceptance.account import Log, accounts
+from tests.sim_devices.bench import device, sensors, spec
+from tests.test_recorder_devices import started
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SPEED = 8.0
+EPSON = [{"name": axis, "sensitivity": epson.COUNTS_PER_UNIT} for axis in "xyz"]
+LABJACK = [{"name": axis, "sensitivity": 3e5} for axis in "xyz"]
+EVERY = {"at": 30.0, "every": 60.0}  # for a busy machine, which starts devices slowly
+CABLE = {"kind": "disconnect", "duration": 9.0, **EVERY}
+POWER = {"kind": "reset", "every": 60.0, "at": 34.0}
+STALL = {"kind": "stall", "duration": 9.0, **EVERY}
+CASES: dict[str, tuple[str, list[dict[str, Any]]]] = {
+    # driver, what happens; E: the epson driver, L: the labjack driver
+    "E cable": ("epson", [CABLE]),
+    "E power": ("epson", [CABLE, POWER]),
+    "L cable": ("labjack", [CABLE]),
+    "L stall": ("labjack", [STALL]),
+    "L power": ("labjack", [CABLE, POWER]),
+}
+
+
+def table(name: str, driver: str) -> dict[str, Any]:
+    if driver == "epson":
+        return device(name, channels={name: EPSON})
+    return device(name, driver, port="tcp", channels={name: LABJACK})
+
+
+@pytest.mark.timeout(120)
+async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> None:
+    tables = [table(name, driver) for name, (driver, _) in CASES.items()]
+    told = spec(*tables, speed=SPEED, age=0.0)
+    told["faults"] = [
+        {**fault, "sensors": [name]} for name, (_, faults) in CASES.items() for fault in faults
+    ]
+    told["fault_log"] = told["sent_log"] = str(tmp_path / "log.jsonl")
+    stop = asyncio.Event()
+    wanted = dict.fromkeys(CASES, 0)
+
+    def acknowledged(status: Status) -> None:
+        for name, sensor in status.sensors.items():
+            if sensor.gaps and not wanted[name]:
+                wanted[name] = sensor.samples + 800
+        if all(0 < wanted[n] <= s.samples for n, s in status.sensors.items()):
+            stop.set()
+
+    async with started(told) as running:
+        bench = Bench(
+            name="simulated",
+            sampling_rate=200.0,
+            sensors=tuple(
+                sensor
+                for one, its_table in zip(running, tables, strict=True)
+                for sensor in sensors(one, its_table)
+            ),
+        )
+        path = tmp_path / "r.h5"
+        clock = SystemClock(SPEED)
+        while not stop.is_set():  # a cable may just be out
+            with contextlib.suppress(ExceptionGroup):
+                await record(bench, path, clock=clock, stop=stop, acknowledged=acknowledged)
+    assert verify(path).intact
+    found = {one.sensor: one for one in accounts(told, Log.read(tmp_path / "log.jsonl"), path)}
+    with Recording.open(path) as recording:
+        for name in CASES:
+            sensor, one = recording.sensor(name), found[name]
+            events = [(e.kind, e.text) for e in recording.events if e.sensor == name]
+            assert (one.wrong, one.lost) == (0, 0), (name, one, events)
+            for gap in sensor.gaps:
+                assert gap["reason"] == (b"stalled" if "stall" in name else b"disconnected")
+                assert gap["missing"] > 200, (name, gap)
+            restarts = sensor.blocks["flags"] & BlockFlag.CLOCK_RESTART != 0
+            if "power" in name:
+                assert one.exact_gaps == 0, (name, events)
+                assert one.worst_estimate < 0.25 * SPEED * 200, (name, one)
+                assert sensor.blocks["flags"][restarts][-1] & BlockFlag.MISSING_ESTIMATED
+            else:
+                assert (one.exact_gaps, one.exact_gaps_off) == (one.gaps, 0), (name, one, events)
+            # An Epson that streams on keeps its sampling; a stream that is started anew does not.
+            assert restarts.sum() == (1 if name == "E cable" else 1 + one.gaps), name
