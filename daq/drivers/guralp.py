@@ -21,34 +21,26 @@ import asyncio
 import contextlib
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from daq.datagrams import open_datagrams
 from daq.drivers.base import DeviceInformation
-from daq.errors import BenchFileError, DeviceError, NoAnswerError, WrongDeviceError
-from daq.protocols import scream
+from daq.drivers.guralp_links import Connector
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event
-from daq.protocols.gcf import BLOCK_SIZE
-from daq.protocols.guralp import ScreamDecoder, SerialDecoder, Streams
-from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Callable, Sequence
 
     from daq.bench import Sensor
     from daq.clock import HostClock
-    from daq.datagrams import DatagramStream
-    from daq.protocols.block import HostTime
-    from daq.transport import ByteStream
+    from daq.drivers.guralp_links import Link
+    from daq.protocols.guralp import Streams
 
-SEND_INTERVAL = 10.0
-"""Between two requests to go on sending, s."""
 MARGIN = 3.0
 """Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""
-RECOVERY_TIMEOUT = 2.0
 COMPONENTS = "ZNEX1234"
 
 StreamId = Annotated[str, Field(pattern="^[0-9A-Z]{1,6}$")]
@@ -75,132 +67,39 @@ class GuralpSettings(BaseModel):
     """Expected system ID; any, if empty."""
 
 
-class _Link(Protocol):
-    """One way to blocks."""
-
-    @property
-    def streams(self) -> Streams: ...
-    async def receive(self) -> list[Block | Event]: ...
-
-
-class _SerialLink:
-    def __init__(
-        self, stream: ByteStream, ids: dict[str, tuple[str, ...]], *, replies: bool
-    ) -> None:
-        self._stream = stream
-        self._decoder = SerialDecoder(ids, replies=replies)
-
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
-
-    async def receive(self) -> list[Block | Event]:
-        received, at = await self._stream.read()
-        found = self._decoder.receive(received, at)
-        replies = self._decoder.take_replies()
-        if replies:
-            await self._stream.write(replies)
-        return found
-
-
-class _TcpLink:
-    def __init__(self, stream: ByteStream, ids: dict[str, tuple[str, ...]]) -> None:
-        self._stream = stream
-        self._decoder = ScreamDecoder(ids)
-
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
-
-    async def receive(self) -> list[Block | Event]:
-        received, at = await self._stream.read()
-        return self._decoder.receive(received, at)
-
-
-class _UdpLink:
-    def __init__(
-        self,
-        stream: DatagramStream,
-        ids: dict[str, tuple[str, ...]],
-        clock: HostClock,
-        recovery: tuple[str, int] | None,
-    ) -> None:
-        self._stream = stream
-        self._clock = clock
-        self._recovery = recovery
-        self._name = next(iter(ids)) if len(ids) == 1 else ""
-        self._decoder = ScreamDecoder(ids)
-
-    @property
-    def streams(self) -> Streams:
-        return self._decoder.streams
-
-    async def receive(self) -> list[Block | Event]:
-        received, at = await self._stream.read()
-        found = self._decoder.receive_datagram(received, at)
-        if self._decoder.missing and self._recovery is not None:
-            found += await self._recover(self._recovery, at)
-        return found
-
-    async def _recover(self, where: tuple[str, int], at: HostTime) -> list[Block | Event]:
-        """Ask for missing packets over TCP."""
-        found: list[Block | Event] = []
-        try:
-            async with asyncio.timeout(RECOVERY_TIMEOUT):
-                reader, writer = await asyncio.open_connection(*where)
-                try:
-                    for number in self._decoder.missing:
-                        writer.write(scream.TCP_AGAIN + number.to_bytes(2, "big"))
-                        data = await _packet(reader)
-                        if data is None:
-                            self._decoder.not_available(number)
-                        else:
-                            found += self._decoder.receive_datagram(data, self._clock.now())
-                finally:
-                    writer.close()
-                    await writer.wait_closed()
-        except (OSError, TimeoutError, asyncio.IncompleteReadError) as error:
-            self._recovery = None
-            text = f"no recovery of lost packets over TCP ({str(error) or 'no answer'})"
-            found.append(Event(self._name, "status", text[:200], at))
-        return found
-
-
-async def _packet(reader: asyncio.StreamReader) -> bytes | None:
-    """Read one packet of a Scream server over TCP, None where it no longer has it."""
-    start = await reader.readexactly(4)
-    if start == scream.NOT_AVAILABLE:
-        return None
-    data = start + await reader.readexactly(BLOCK_SIZE + 1 - len(start))
-    size = scream.SIZES.get(data[-1], len(data))
-    return data + await reader.readexactly(size - len(data))
-
-
 class GuralpSession:
     """Streams that have all been heard."""
 
     def __init__(
         self,
-        link: _Link,
+        link: Link,
         *,
         label: str,
         information: tuple[DeviceInformation, ...],
         heard: list[Block | Event],
+        identify: Callable[[str], DeviceInformation],
     ) -> None:
         self.information = information
         self._link = link
         self._label = label
         self._heard = heard
+        self._identify = identify
+        self._absent = {one.sensor for one in information if one.trouble}
+        self._refused: set[str] = set()
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        rates = {i.sensor: i.sampling_rate or 1.0 for i in self.information}
         longest = 1.0  # of a block, s
         found, self._heard = self._heard, []
         while True:
             for item in found:
                 if isinstance(item, Block):
-                    longest = max(longest, item.n_samples / rates[item.sensor])
+                    if item.sensor in self._absent:
+                        yield self._identified(item)
+                    if item.sensor in self._refused:
+                        continue
+                    rate = self._link.streams.sampling_rate(item.sensor)
+                    longest = max(longest, item.n_samples / (rate or 1.0))
                 yield item
             patience = 2 * longest + MARGIN
             try:
@@ -211,6 +110,16 @@ class GuralpSession:
                     f"{self._label}: nothing came for {patience:g} s;"
                     f" expected a block at least every {longest:g} s"
                 ) from error
+
+    def _identified(self, first: Block) -> Event:
+        """See who it is that was not there at the beginning: another device is left out."""
+        self._absent.discard(first.sensor)
+        try:
+            self._identify(first.sensor)
+        except WrongDeviceError as error:
+            self._refused.add(first.sensor)
+            return Event(first.sensor, "refused", str(error)[:200], first.received)
+        return Event(first.sensor, "connected", "its streams come now", first.received)
 
 
 class GuralpDriver:
@@ -236,72 +145,20 @@ class GuralpDriver:
         label = f"sensor {names} on {first.port}"
         ids = _configured(sensors)
         async with contextlib.AsyncExitStack() as stack:
-            connect = _Connector(first.port, settings, clock, label)
+            connect = Connector(first.port, settings, clock, label)
             link = await connect(stack, ids or {})
             heard: list[Block | Event] = []
             if ids is None:
                 ids = {first.name: await _discover(link, first, settings, label, heard)}
                 link = connect.again(ids)
-            information = await _listen(link, sensors, settings, label, heard)
-            yield GuralpSession(link, label=label, information=information, heard=heard)
-
-
-class _Connector:
-    """Opens the port once, and makes links on it."""
-
-    def __init__(self, port: str, settings: GuralpSettings, clock: HostClock, label: str) -> None:
-        self._port = port
-        self._settings = settings
-        self._clock = clock
-        self._label = label
-        self._bytes: ByteStream | None = None
-        self._datagrams: DatagramStream | None = None
-
-    async def __call__(
-        self, stack: contextlib.AsyncExitStack, ids: dict[str, tuple[str, ...]]
-    ) -> _Link:
-        if self._port.startswith("udp://"):
-            self._datagrams = await stack.enter_async_context(
-                open_datagrams(self._port, self._clock, listen=False, label=self._label)
+            by_name = {sensor.name: sensor for sensor in sensors}
+            yield GuralpSession(
+                link,
+                label=label,
+                information=await _listen(link, sensors, settings, label, heard),
+                heard=heard,
+                identify=lambda name: _identity(link.streams, by_name[name], label),
             )
-            asking = asyncio.create_task(_keep_asking(self._datagrams), name=self._label)
-            stack.push_async_callback(_stop_asking, asking, self._datagrams)
-        else:
-            self._bytes = await stack.enter_async_context(
-                open_port(
-                    self._port, self._clock, label=self._label, baud_rate=self._settings.baud_rate
-                )
-            )
-            if self._settings.link == "scream":
-                await self._bytes.write(scream.TCP_SEND)
-        return self.again(ids)
-
-    def again(self, ids: dict[str, tuple[str, ...]]) -> _Link:
-        """Return a link that joins other streams on the same port."""
-        if self._datagrams is not None:
-            host, number = host_and_port(self._port)
-            recovery = self._settings.recovery_port
-            recovery = number if recovery is None else recovery
-            where = (host, recovery) if recovery else None
-            return _UdpLink(self._datagrams, ids, self._clock, where)
-        if self._bytes is None:
-            raise DeviceError(f"{self._label}: the port is not open")
-        if self._settings.link == "scream":
-            return _TcpLink(self._bytes, ids)
-        return _SerialLink(self._bytes, ids, replies=self._settings.acknowledge)
-
-
-async def _keep_asking(stream: DatagramStream) -> None:
-    while True:
-        stream.send(scream.SEND)
-        await asyncio.sleep(SEND_INTERVAL)
-
-
-async def _stop_asking(asking: asyncio.Task[None], stream: DatagramStream) -> None:
-    asking.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await asking
-    stream.send(scream.STOP)
 
 
 def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]] | None:
@@ -324,7 +181,7 @@ def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]] | None:
 
 
 async def _discover(
-    link: _Link,
+    link: Link,
     sensor: Sensor,
     settings: GuralpSettings,
     label: str,
@@ -361,24 +218,35 @@ def _component(stream: str) -> tuple[int, str]:
 
 
 async def _listen(
-    link: _Link,
+    link: Link,
     sensors: Sequence[Sensor],
     settings: GuralpSettings,
     label: str,
     heard: list[Block | Event],
 ) -> tuple[DeviceInformation, ...]:
-    """Listen until every stream has come; return what the blocks say."""
-    try:
+    """Listen until every stream has come; return what the blocks say.
+
+    Where one sensor of several does not come, the others go on without it: it may come later.
+    """
+    with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(settings.patience):
             while link.streams.silent:
                 heard += await link.receive()
-    except TimeoutError as error:
+    information = []
+    for sensor in sensors:
+        silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)
+        if not silent:
+            information.append(_identity(link.streams, sensor, label))
+            continue
         others = ", ".join(sorted(link.streams.unknown)) or "no other"
-        raise NoAnswerError(
-            f"{label}: streams {', '.join(link.streams.silent)} did not come within"
+        trouble = (
+            f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} did not come within"
             f" {settings.patience:g} s; heard {others}"
-        ) from error
-    return tuple(_identity(link.streams, sensor, label) for sensor in sensors)
+        )
+        information.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
+    if all(one.trouble for one in information):
+        raise NoAnswerError(information[0].trouble)
+    return tuple(information)
 
 
 def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation:
