@@ -86,8 +86,7 @@ class Connection:
                     resumed = self._before is not None and getattr(session, "resumed", False)
                     await queue.put(Connected(self.names, reason, resumed))
                     for name in self.names:
-                        text = self._describe(session, name)
-                        await queue.put(Event(name, "connected", text, self._clock.now()))
+                        await queue.put(self._introduced(session, name))
                     self.alive = True
                     self._before = session
                     try:
@@ -210,6 +209,8 @@ class Connection:
             now = next((i for i in found if i.sensor == sensor.name), None)
             if now is None:
                 continue
+            if now.trouble and not known:
+                raise NoAnswerError(now.trouble)
             before = known.get(sensor.name)
             wanted = sensor.serial_number or (before.serial_number if before else "")
             if wanted and now.serial_number and now.serial_number != wanted:
@@ -225,10 +226,15 @@ class Connection:
                 )
         self.information = self.information or found
 
-    def _describe(self, session: Session, name: str) -> str:
+    def _introduced(self, session: Session, name: str) -> Event | Trouble:
+        """Return who is there; one of several on a port may not be, and the others go on."""
+        now = self._clock.now()
         found = next((i for i in session.information if i.sensor == name), None)
+        if found is not None and found.trouble:
+            return Trouble("lost", Event(name, "stalled", found.trouble, now))
         parts = (found.model, found.serial_number, found.firmware) if found else ()
-        return " ".join(("on", self.port, *(part for part in parts if part)))
+        text = " ".join(("on", self.port, *(part for part in parts if part)))
+        return Event(name, "connected", text, now)
 
 
 async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:

@@ -164,6 +164,10 @@ class Source:
         """World time of each sample in s, shape (n,)."""
         return self._sampled.sample_times(sensor, first_sample, n)
 
+    def is_silent(self, sensor: str, now: float) -> bool:
+        """Whether the fault script has this one of several on a line off at world time ``now``."""
+        return self._faults is not None and self._faults.is_silent(sensor, now)
+
     def first_sample_after(self, sensor: str, now: float) -> int:
         """Index of the first sample taken at or after world time ``now``."""
         guess = max(0, math.floor((now - float(self.times(sensor, 0, 1)[0])) * self.sampling_rate))

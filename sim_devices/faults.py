@@ -30,6 +30,7 @@ latency    each unit is kept back for an exponential time with mean ``level`` s
 batching   units leave only every ``level`` s, as through a polled USB adapter
 stall      the device sends nothing; what it would have sent is lost
 disconnect the cable is pulled; the port comes back
+silent     one of several on a line, a slave on a bus, is off; it comes back as if new
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
 dead       samples are 0 (of ``channel``, or of all)
 ========== ==========================================================================
@@ -76,7 +77,7 @@ if TYPE_CHECKING:
 
 Kind: TypeAlias = Literal[
     "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
-    "jitter", "latency", "batching", "stall", "disconnect",
+    "jitter", "latency", "batching", "stall", "disconnect", "silent",
     "clip", "dead", "spike",
     "reset", "wrap", "overflow",
 ]  # fmt: skip
@@ -154,6 +155,16 @@ class SampleFaults:
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._faults = [fault for fault in faults if fault.kind in SAMPLE_KINDS]
+        self._silences = [fault for fault in faults if fault.kind == "silent"]
+
+    def is_silent(self, sensor: str, now: float) -> bool:
+        """Whether the device of a sensor is off at world time ``now``."""
+        return any(
+            (fault.sensors is None or sensor in fault.sensors)
+            and now >= fault.at
+            and math.fmod(now - fault.at, fault.every or math.inf) < fault.duration
+            for fault in self._silences
+        )
 
     def apply(
         self, sensor: str, counts: NDArray[np.float64], times: FloatArray
@@ -196,7 +207,7 @@ class LineFaults:
         )
         self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
         for index, fault in enumerate(faults):
-            if fault.kind not in (*SAMPLE_KINDS, "wrap"):
+            if fault.kind not in (*SAMPLE_KINDS, "silent", "wrap"):
                 times = fault.times(begin)
                 first = next(times, None)
                 if first is not None:

@@ -26,6 +26,10 @@ LONGEST_FRAME = 300
 class Slave(Protocol):
     """One device on the bus."""
 
+    def is_off(self, now: float) -> bool:
+        """Whether it answers nothing now."""
+        ...
+
     def read(self, function: int, address: int, count: int, now: float) -> Sequence[int] | ExcCodes:
         """Return ``count`` registers, or why not."""
         ...
@@ -93,7 +97,8 @@ class ModbusEndpoint:
         return answers
 
     def _answer(self, request: ModbusPDU) -> ModbusPDU | None:
-        if request.dev_id not in self._slaves:
+        slave = self._slaves.get(request.dev_id)
+        if slave is None or slave.is_off(self._now):
             if self._is_rtu:
                 return None
             answer: ModbusPDU = ExceptionResponse(

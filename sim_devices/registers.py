@@ -35,12 +35,20 @@ class RegisterDevice:
         n_channels = len(source.device.channels[sensor])
         self._map = RegisterMap.of(settings, n_channels)
         self._main = [not channel.auxiliary for channel in source.device.channels[sensor]]
-        self._written: dict[int, int] = {}
+        self._at_first: dict[int, int] = {}
         if settings.get("preset") == "witmotion":
-            self._written = {WITMOTION_RATE: 6, WITMOTION_UNLOCK[0]: 0}
+            self._at_first = {WITMOTION_RATE: 6, WITMOTION_UNLOCK[0]: 0}
+        self._written = dict(self._at_first)
         self._first = 0
         self._times = np.empty(0)
         self._counts = np.empty((0, 0))
+
+    def is_off(self, now: float) -> bool:
+        """Whether the fault script has it off; what was set is then lost."""
+        off = self._source.is_silent(self._sensor, now)
+        if off:
+            self._written = dict(self._at_first)
+        return off
 
     def read(self, function: int, address: int, count: int, now: float) -> Sequence[int] | ExcCodes:
         """Return registers of the latest reading."""

@@ -17,10 +17,12 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
 
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.protocols import rtu
+from daq.protocols.rtu import MAX_FRAME
 from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 
     from pymodbus.pdu import ModbusPDU
 
@@ -31,6 +33,10 @@ if TYPE_CHECKING:
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 TCP = "modbus-tcp://"
+LEAST_PATIENCE = 0.05
+"""For a reply, s: an adapter that is polled takes 16 ms each way."""
+_UNIT = 6
+"""Where the unit stands in a frame over TCP."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -75,7 +81,23 @@ class ModbusBus:
         self._client = client
         self._clock = clock
         self._timeout = timeout
+        self._patience = timeout
+        self._longest = 0.0  # time a reply took, s
         self._serial = isinstance(client, AsyncModbusSerialClient)
+        self._heard = b""
+        client.ctx.trace_packet = self._trace  # what pymodbus would tell its log
+
+    @contextlib.contextmanager
+    def hurrying(self) -> Iterator[None]:
+        """Wait for replies only as long as others here may take: for who may not be there."""
+        self._wait_for(min(self._timeout, max(LEAST_PATIENCE, 4 * self._longest)))
+        try:
+            yield
+        finally:
+            self._wait_for(self._timeout)
+
+    def _wait_for(self, seconds: float) -> None:
+        self._patience = self._client.ctx.comm_params.timeout_connect = seconds
 
     async def read(self, function: int, device_id: int, address: int, count: int) -> Reply:
         """Read registers by function 3 or 4.
@@ -93,30 +115,46 @@ class ModbusBus:
         ask = client.read_holding_registers if function == 3 else client.read_input_registers
         sent = self._clock.now()
         reply = await self._reply(
+            device_id,
             lambda: ask(address, count=count, device_id=device_id),
             f"device {device_id}, function {function}, registers {address} to"
             f" {address + count - 1}",
         )
-        return Reply(reply.registers, sent, self._clock.now())
+        received = self._clock.now()
+        took = (received.monotonic_ns - sent.monotonic_ns) * 1e-9 / self._clock.speed
+        self._longest = max(0.99 * self._longest, took)
+        return Reply(reply.registers, sent, received)
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raises as :meth:`read` does."""
         await self._reply(
+            device_id,
             lambda: self._client.write_register(address, value, device_id=device_id),
             f"device {device_id}, function 6, register {address} ← {value}",
         )
 
-    async def _reply(self, ask: Callable[[], Awaitable[ModbusPDU]], asked: str) -> ModbusPDU:
+    async def _reply(
+        self, device_id: int, ask: Callable[[], Awaitable[ModbusPDU]], asked: str
+    ) -> ModbusPDU:
+        self._heard = b""
+        task = asyncio.current_task()
+        n_cancelled = task.cancelling() if task else 0
         try:
             reply = await ask()
+            if task and task.cancelling() > n_cancelled:
+                # pymodbus waits by wait_for, which until Python 3.12 returns a reply that came in
+                # the same turn of the event loop as a cancellation, and forgets the cancellation
+                raise asyncio.CancelledError
         except ConnectionException as error:
             raise NotConnectedError(f"{self.label}: the port closed") from error
         except ModbusIOException as error:
             if not self._client.connected:
                 raise NotConnectedError(f"{self.label}: the port closed") from error
             await self.settle()
+            instead = self._instead(device_id)
             raise NoAnswerError(
-                f"{self.label}: no answer in {self._timeout:g} s to {asked}"
+                f"{self.label}: no answer in {self._patience:.2g} s to {asked}"
+                f"{'; ' if instead else ''}{instead}"
             ) from error
         if reply.isError():
             code = int(getattr(reply, "exception_code", 0))
@@ -127,7 +165,21 @@ class ModbusBus:
     async def settle(self) -> None:
         """Let a late reply come and go."""
         if self._serial:
-            await asyncio.sleep(self._timeout)
+            await asyncio.sleep(self._patience)
+
+    def _trace(self, sending: bool, packet: bytes) -> bytes:
+        if not sending:
+            whole = packet if packet.startswith(self._heard) else self._heard + packet
+            self._heard = whole[:MAX_FRAME]
+        return packet
+
+    def _instead(self, device_id: int) -> str:
+        """Say what came instead of a reply of this device."""
+        if self._serial:
+            return rtu.describe(self._heard, device_id)
+        if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
+            return f"a reply of unit {self._heard[_UNIT]} came, of unit {device_id} was asked"
+        return f"{len(self._heard)} bytes came that are no reply" if self._heard else ""
 
 
 @contextlib.asynccontextmanager

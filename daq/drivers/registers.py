@@ -3,13 +3,15 @@
 The device's own sampling is not ours: each poll is one sample at its own instant, recorded with
 it. That serves tilt, slow channels and checks; for noise work use devices that stream.
 
-Several sensors on one port are slaves on one bus, polled in turn.
+Several sensors on one port are slaves on one bus, polled in turn. One that is silent is asked again
+for as long as the others go on, with back-off and little patience, and set up anew when it answers.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -39,8 +41,11 @@ if TYPE_CHECKING:
 
 FAILURES = 3
 """Polls without a reply after which a device counts as gone."""
-RETRY_INTERVAL = 5.0
-"""How often a device that is gone is asked while others on its bus answer, s."""
+FIRST_RETRY, LONGEST_RETRY = 1.0, 30.0
+"""When a device that is gone is asked again while others on its bus answer, s; each time twice as
+late, since the others have to wait for it."""
+GATEWAY_CODES = {10, 11}
+"""Modbus exceptions by which a gateway says that there is no answer behind it."""
 
 Address = Annotated[int, Field(ge=0, le=65535)]
 
@@ -114,6 +119,8 @@ class _Polled:
                 f"{wanted}; {error}; check cable, power, device_id and baud_rate"
             ) from error
         except (RefusedError, RemoteProtocolError) as error:
+            if isinstance(error, RefusedError) and error.code in GATEWAY_CODES:
+                raise NoAnswerError(f"{wanted}; {error}") from error
             raise WrongDeviceError(f"{wanted}; {error}") from error
         return DeviceInformation(
             sensor=self.sensor.name,
@@ -130,48 +137,88 @@ class _Polled:
 
 
 class _Poller:
-    """Polls one sensor and counts what goes wrong."""
+    """Polls one sensor, counts what goes wrong, and sets it up again when it comes back."""
 
-    def __init__(self, polled: _Polled) -> None:
-        self.polled = polled
+    def __init__(self, polled: _Polled, clock: HostClock, *, is_gone: bool) -> None:
         self.sensor = polled.sensor.name
-        self.period_ns = 1e9 / polled.sensor.sampling_rate
-        self.due_ns = 0.0
-        self.failures = 0
+        self.due_ns = float(clock.now().monotonic_ns)
+        self.is_gone = False
+        self._polled = polled
+        self._clock = clock
+        self._period_ns = 1e9 / polled.sensor.sampling_rate
+        self._failures = 0  # one after the other
+        self._n_wrong: Counter[str] = Counter()
+        self._delay = FIRST_RETRY
         self._decoder = RegisterDecoder(
             self.sensor, polled.registers, sampling_rate=polled.sensor.sampling_rate
         )
+        if is_gone:
+            self._give_up()
 
-    async def poll(self, bus: ModbusBus, clock: HostClock) -> list[Block | Event]:
+    async def poll(self, bus: ModbusBus) -> list[Block | Event]:
         """Ask once; what goes wrong becomes an event."""
-        r = self.polled.registers
+        if self.is_gone:
+            return await self._retry(bus)
+        r = self._polled.registers
+        found: list[Block | Event] = []
         try:
-            reply = await bus.read(r.function, self.polled.device_id, r.first, r.count)
+            reply = await bus.read(r.function, self._polled.device_id, r.first, r.count)
             found = self._decoder.receive(reply.registers, reply.sent, reply.received)
         except NoAnswerError as error:
-            self.failures += 1
-            found = self._event("stalled", str(error), clock) if self.failures == 1 else []
+            found = self._unanswered(str(error))
         except RefusedError as error:
-            found = self._event("refused", str(error), clock)
+            if error.code in GATEWAY_CODES:
+                found = self._unanswered(str(error))
+            else:
+                found = self._event("refused", str(error))
         except RemoteProtocolError as error:
             await bus.settle()
-            found = self._event("resynchronised", str(error), clock)
+            found = self._event("resynchronised", str(error))
         else:
-            self.failures = 0
-        self._schedule(clock.now().monotonic_ns)
+            self._failures = 0
+        self._schedule()
         return found
 
-    def _event(self, kind: str, text: str, clock: HostClock) -> list[Block | Event]:
-        now = clock.now()
-        return [*self._decoder.flush(now), Event(self.sensor, kind, text, now)]
+    async def _retry(self, bus: ModbusBus) -> list[Block | Event]:
+        """Set up a device that was gone, if it answers; it may have lost its settings."""
+        try:
+            with bus.hurrying():
+                await self._polled.prepare(bus)
+        except NoAnswerError:
+            self._failures += 1
+            self._give_up()
+            return []
+        except WrongDeviceError as error:
+            self._failures += 1
+            self._give_up()
+            return self._event("refused", str(error))
+        text = f"answers again, after {self._failures} requests without a reply"
+        self.is_gone, self._failures, self._delay = False, 0, FIRST_RETRY
+        self.due_ns = float(self._clock.now().monotonic_ns)
+        return [Event(self.sensor, "connected", text, self._clock.now())]
 
-    def _schedule(self, now_ns: int) -> None:
+    def _give_up(self) -> None:
+        self.is_gone = True
+        self.due_ns = self._clock.now().monotonic_ns + self._delay * 1e9
+        self._delay = min(2 * self._delay, LONGEST_RETRY)
+
+    def _unanswered(self, text: str) -> list[Block | Event]:
+        self._failures += 1
+        return self._event("stalled", text)
+
+    def _event(self, kind: str, text: str) -> list[Block | Event]:
+        now = self._clock.now()
+        self._n_wrong[kind] += 1
+        counted = f"{text.encode()[:180].decode(errors='ignore')} ({self._n_wrong[kind]} so far)"
+        return [*self._decoder.flush(now), Event(self.sensor, kind, counted, now)]
+
+    def _schedule(self) -> None:
         """Next poll at an absolute instant; those whose time has gone by are left out."""
-        if self.failures >= FAILURES:
-            self.due_ns = now_ns + RETRY_INTERVAL * 1e9
+        if self._failures >= FAILURES:
+            self._give_up()
             return
-        late = max(0, int((now_ns - self.due_ns) // self.period_ns))
-        self.due_ns += (late + 1) * self.period_ns
+        late = max(0, int((self._clock.now().monotonic_ns - self.due_ns) // self._period_ns))
+        self.due_ns += (late + 1) * self._period_ns
 
 
 class RegisterSession:
@@ -191,18 +238,18 @@ class RegisterSession:
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Poll all sensors of the bus, each at its rate."""
-        pollers = [_Poller(one) for one in self._polled]
-        begin = self._clock.now().monotonic_ns
-        for poller in pollers:
-            poller.due_ns = float(begin)
+        troubled = {one.sensor for one in self.information if one.trouble}
+        pollers = [
+            _Poller(one, self._clock, is_gone=one.sensor.name in troubled) for one in self._polled
+        ]
         while True:
             poller = min(pollers, key=lambda one: one.due_ns)
             wait = (poller.due_ns - self._clock.now().monotonic_ns) * 1e-9 / self._clock.speed
             if wait > 0:
                 await asyncio.sleep(wait)
-            for item in await poller.poll(self._bus, self._clock):
+            for item in await poller.poll(self._bus):
                 yield item
-            if all(one.failures >= FAILURES for one in pollers):
+            if all(one.is_gone for one in pollers):
                 names = ", ".join(repr(one.sensor) for one in pollers)
                 raise NoAnswerError(
                     f"{self._bus.label}: {names} did not answer {FAILURES} polls in a row"
@@ -225,7 +272,7 @@ class RegisterDriver:
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[RegisterSession]:
-        """Open the bus and see that every sensor on it answers."""
+        """Open the bus and see who of its sensors answers."""
         polled = [_Polled.of(sensor) for sensor in sensors]
         first, port = polled[0].settings, sensors[0].port
         names = ", ".join(repr(sensor.name) for sensor in sensors)
@@ -238,8 +285,17 @@ class RegisterDriver:
             parity=first.parity,
             stop_bits=first.stop_bits,
         ) as bus:
-            information = tuple([await one.prepare(bus) for one in polled])
-            yield RegisterSession(bus, clock, polled, information)
+            information, errors = [], []
+            for one in polled:
+                try:
+                    information.append(await one.prepare(bus))
+                except (NoAnswerError, WrongDeviceError) as error:
+                    errors.append(error)
+                    name = one.sensor.name
+                    information.append(DeviceInformation(sensor=name, trouble=str(error)))
+            if len(errors) == len(polled):
+                raise errors[0]
+            yield RegisterSession(bus, clock, polled, tuple(information))
 
 
 DRIVER = RegisterDriver()

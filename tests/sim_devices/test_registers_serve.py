@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from daq.clock import SystemClock
+from daq.drivers.modbus import open_bus
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.protocols import rtu
 from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices import launch
 from tests.sim_devices.bench import device, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from daq.bench import Sensor
     from sim_devices.launch import RunningDevice
@@ -120,24 +125,124 @@ async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> 
         await read(sensors(running[1], TABLES[1], settings={}), 1, SystemClock(SPEED))
 
 
-async def test_one_slave_gone_leaves_the_other_undisturbed(
+async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path) -> None:
+    """The other on the bus is polled on; who comes back is set to its rate again."""
+    off = {"kind": "silent", "sensors": ["B"], "at": 10.0, "every": 40.0, "duration": 8.0}
+    log = tmp_path / "sent"
+    world = spec(TABLES[0], speed=SPEED, sampling_rate=50.0)
+    with launch.start(world | {"faults": [off], "sent_log": str(log)}) as (one,):
+        clock = SystemClock(SPEED)
+        blocks: dict[str, list[Block]] = {"A": [], "B": []}
+        events: list[Event] = []
+        back_at = 0
+        async with asyncio.timeout(60), DRIVER.open(on_bus(one, timeout=0.1), clock) as session:
+            n_set = _n_set(log)
+            async for item in session.read():
+                if isinstance(item, Block):
+                    blocks[item.sensor].append(item)
+                    if back_at and len(blocks["B"]) > back_at + 5:
+                        break
+                    continue
+                events.append(item)
+                if item.kind == "connected" and events[0].kind == "stalled":
+                    back_at = len(blocks["B"])
+    n_lost = sum(e.kind == "stalled" and e.sensor == "B" for e in events)
+    assert n_lost >= 3
+    assert "no answer in 0.1 s to device 81, function 3" in events[0].text
+    assert f"({n_lost} so far)" in [e.text for e in events if e.sensor == "B"][n_lost - 1]
+    assert "answers again, after" in events[-1].text
+    gap = blocks["B"][back_at]
+    assert 7.0 * 50 < gap.first_sample - blocks["B"][back_at - 1].end_sample < 24.0 * 50
+    # the other was polled on meanwhile, but for the time it had to wait
+    meanwhile = [
+        block.n_samples
+        for block in blocks["A"]
+        if block.received.monotonic_ns < gap.received.monotonic_ns
+        and block.received.monotonic_ns > blocks["B"][back_at - 1].received.monotonic_ns
+    ]
+    assert sum(meanwhile) > 0.5 * (gap.first_sample - blocks["B"][back_at - 1].end_sample)
+    assert _n_set(log) == n_set + 1, "its rate is set again"
+
+
+def _n_set(log: Path) -> int:
+    """Return how often the second slave has had its rate set."""
+    sent = [json.loads(line).get("unit", "") for line in log.read_text().splitlines()]
+    return sum(unit.startswith("51060003") for unit in sent)
+
+
+async def test_a_cancellation_is_not_lost_to_a_reply_that_comes_with_it(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    async with open_bus(running[1].port, SystemClock(), label="bus", reply_timeout=1.0) as bus:
+        loop = asyncio.get_running_loop()
+        reading = asyncio.create_task(bus.read(4, 1, 0, 2))
+
+        def cancel_with_the_reply() -> None:
+            if bus._client.ctx.response_future.done():  # noqa: SLF001 -- the very turn it comes in
+                reading.cancel()
+            else:
+                loop.call_soon(cancel_with_the_reply)
+
+        await asyncio.sleep(0)
+        cancel_with_the_reply()
+        with pytest.raises(asyncio.CancelledError):
+            await reading
+
+
+async def test_a_bus_is_taken_up_again_without_the_one_who_is_silent(
     running: tuple[RunningDevice, ...],
 ) -> None:
     both = on_bus(running[0], timeout=0.05)
+    settings = {**both[1].settings, "device_id": 9}
+    both[1] = both[1].model_copy(update={"settings": settings})
     async with DRIVER.open(both, SystemClock(SPEED)) as session:
-        # the second goes away once the session is open: nobody has that address
-        gone = both[1].model_copy(update={"settings": {**both[1].settings, "device_id": 9}})
-        polled = type(session._polled[1]).of(gone)  # type: ignore[attr-defined]  # noqa: SLF001 -- a slave cannot be unplugged from one process
-        session._polled = [session._polled[0], polled]  # type: ignore[attr-defined]  # noqa: SLF001
-        events, samples = [], 0
-        async for item in session.read():
-            if isinstance(item, Event):
-                events.append(item)
-            else:
-                samples += item.n_samples
-            if samples >= 100:
-                break
-    assert [(e.sensor, e.kind) for e in events] == [("B", "stalled")]
+        there, absent = session.information
+        assert not there.trouble
+        assert "registers 48 to 54 of device 9" in absent.trouble
+        first = await anext(session.read())
+    assert isinstance(first, Block)
+    assert first.sensor == "A"
+
+
+async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
+    """A slave that answers in turn as it should, as another unit, too shortly, and not at all."""
+    tasks: list[asyncio.Task[None] | None] = []
+
+    async def slave(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        tasks.append(asyncio.current_task())
+        n = 0
+        while len(await reader.read(64)) >= 8:
+            values = np.arange(1 if n % 5 == 3 else 3, dtype=np.uint16) + n
+            answers = [
+                rtu.encode_registers(7 if n % 5 == 2 else 1, 3, values),
+                rtu.encode_exception(1, 3, 4),
+                rtu.encode(1, bytes([3, 255]) + bytes(9)),
+            ]
+            writer.write(answers[{4: 1, 5: 2}.get(n % 6, 0)])
+            n += 1
+        writer.close()
+
+    async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
+        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS})
+        here = launch.RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
+        (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
+        events: list[str] = []
+        async with DRIVER.open([sensor], SystemClock()) as session:
+            async for item in session.read():
+                if isinstance(item, Event):
+                    events.append(f"{item.kind}: {item.text}")
+                if len(events) >= 12:
+                    break
+    await asyncio.gather(*filter(None, tasks))
+    for said in (
+        "stalled: .*; a reply of unit 7 came, of unit 1 was asked (1 so far)",
+        "stalled: .*; 14 bytes came that are no reply (",
+        "resynchronised: 3 registers asked for, 1 came (2 so far)",
+        "refused: .* Modbus exception 4 (device failure) .*(2 so far)",
+    ):
+        pattern = re.escape(said).replace(r"\.\*", ".*")
+        assert any(re.match(pattern, event) for event in events), (said, events)
 
 
 async def test_a_bus_that_vanishes_ends_the_session() -> None:
