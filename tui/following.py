@@ -1,15 +1,16 @@
-"""Follows a recording in a thread and hands over snapshots."""
+"""Follows a recording in a thread: how it is at each look, the estimate when there is news."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from daq.control import ask
 from daq.errors import HuddleError, RecordingError
 from daq.estimation import Estimation
 from daq.recording.reader import Recording
-from estimator.errors import EstimatorError
+from estimator.errors import EstimatorError, InsufficientDataError
+from tui.state import Lookout
 
 if TYPE_CHECKING:
     import threading
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation import Settings, Snapshot
+    from tui.state import Now
 
-LEAST_INTERVAL = 0.5
+LEAST_INTERVAL = 1.0
 LONGEST_INTERVAL = 5.0
 SHARE = 0.05
 """Of one core, at most, that following may take."""
@@ -26,42 +28,93 @@ SILENCE = 10.0
 """Seconds without a sample after which the recorder is asked whether it still lives."""
 
 
+class _EndedError(Exception):
+    """Nobody wants the result any more."""
+
+
+class Onlooker(Protocol):
+    """Whoever wants to know; called from the thread that follows."""
+
+    def look(self, now: Now) -> None:
+        """Take how the sensors are doing: often, and cheap."""
+        ...
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Take the estimate: when a segment has come, and once more when the recording is closed.
+
+        That last one is the result, from the whole recording.
+        """
+        ...
+
+    def progress(self, done: int, total: int) -> None:
+        """Take how far the result is, in segments."""
+        ...
+
+    def trouble(self, text: str) -> None:
+        """Take what went wrong, in words."""
+        ...
+
+
 def follow(
     path: Path,
     settings: Settings | None,
     *,
-    on_snapshot: Callable[[Snapshot, Settings], None],
-    on_trouble: Callable[[str], None],
+    onlooker: Onlooker,
     ended: threading.Event,
+    growth: float = 0.0,
     silence: float = SILENCE,
 ) -> None:
-    """Hand over the estimate whenever there is news, until the recording is closed or ``ended``.
+    """Follow a recording until it is closed or ``ended``; a recorder that was killed is trouble.
 
-    The last snapshot of a closed recording is its result. A recorder that was killed is trouble.
+    The estimate is made anew when the number of segments has grown, and by this share at least.
     """
-    n_samples, heard = -1, time.monotonic()
     try:
         with Estimation([path], settings) as estimation:
-            while not ended.is_set():
+            (recording,) = estimation.recordings
+            lookout = Lookout(recording)
+            onlooker.look(lookout.look())
+            wanted, n_samples, heard = 0.0, -1, time.monotonic()
+            while not recording.closed:
                 began = time.thread_time()
                 estimation.update()
-                snapshot = estimation.snapshot()
-                if snapshot.closed:
-                    if snapshot.results:
-                        snapshot = estimation.finish()
-                    on_snapshot(snapshot, estimation.settings)
-                    return
-                on_snapshot(snapshot, estimation.settings)
-                total = sum(sensor.n_samples for sensor in snapshot.sensors)
+                if estimation.n_seen >= wanted:
+                    wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
+                    onlooker.look(lookout.look_closely())
+                    onlooker.snapshot(estimation.snapshot(), estimation.settings)
+                else:
+                    onlooker.look(lookout.look())
+                total = sum(sensor.n_samples for sensor in recording.sensors)
                 if total != n_samples:
                     n_samples, heard = total, time.monotonic()
                 elif time.monotonic() - heard >= silence:
                     _check_recorder(path)
                     heard = time.monotonic()
                 pause = (time.thread_time() - began) / SHARE
-                ended.wait(min(max(LEAST_INTERVAL, pause), LONGEST_INTERVAL))
+                if ended.wait(min(max(LEAST_INTERVAL, pause), LONGEST_INTERVAL)):
+                    return
+            onlooker.look(lookout.look_closely())
+            try:
+                snapshot = estimation.finish(_progress(onlooker, ended))
+            except InsufficientDataError as error:
+                onlooker.snapshot(estimation.snapshot(), estimation.settings)
+                onlooker.trouble(str(error))
+            else:
+                onlooker.snapshot(snapshot, estimation.settings)
+    except _EndedError:
+        return
     except (HuddleError, EstimatorError, OSError) as error:
-        on_trouble(str(error))
+        onlooker.trouble(str(error))
+
+
+def _progress(onlooker: Onlooker, ended: threading.Event) -> Callable[[int, int], None]:
+    """Return who tells the progress, and ends the work when nobody wants its result."""
+
+    def tell(done: int, total: int) -> None:
+        if ended.is_set():
+            raise _EndedError
+        onlooker.progress(done, total)
+
+    return tell
 
 
 def _check_recorder(path: Path) -> None:

@@ -20,6 +20,7 @@ from tui.text import clock_time, time_left
 
 if TYPE_CHECKING:
     from daq.estimation import Snapshot
+    from tui.state import Now
 
 
 def watch_recording(file: Path, *, method: str | None, json: str | None) -> None:
@@ -37,23 +38,62 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
         return
     with Recording.open(file) as recording:
         settings = chosen(Settings.of(recording.bench), method=method)
-    last: list[Snapshot] = []
-    trouble: list[str] = []
+    onlooker = _Lines(json)
+    follow(file, settings, onlooker=onlooker, ended=threading.Event())
+    if onlooker.last is not None and onlooker.last.results and json is None:
+        show_result(onlooker.last, settings, json=None, csv=None, bench=None)
+    if onlooker.troubles:
+        raise RecordingError(onlooker.troubles[0])
 
-    def tell(snapshot: Snapshot, settings: Settings) -> None:
-        if last and not snapshot.closed and snapshot.n_segments == last[0].n_segments:
+
+class _Lines:
+    """Writes a line when a segment or an event has come: for people, or as JSON."""
+
+    def __init__(self, json: str | None) -> None:
+        self._json = json
+        self._now: Now | None = None
+        self._n_events = 0
+        self.last: Snapshot | None = None
+        self.troubles: list[str] = []
+
+    def look(self, now: Now) -> None:
+        before, self._now = self._now, now
+        events = now.events[self._n_events :]
+        self._n_events = len(now.events)
+        if before is None:  # what was before we came
             return
-        if json is None:
+        for event in events:
+            at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
+            if self._json is None:
+                said = " ".join(part for part in (event.sensor, event.kind, event.text) if part)
+                console().print(f"{clock_time(at)}  {said}", markup=False, soft_wrap=True)
+            else:
+                document = {
+                    "at": at,
+                    "sensor": event.sensor,
+                    "kind": event.kind,
+                    "text": event.text,
+                }
+                self._write({"event": document})
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        before, self.last = self.last, snapshot
+        if before is not None and not snapshot.closed and snapshot.n_segments == before.n_segments:
+            return
+        if self._json is None:
             console().print(_line(snapshot, settings))
         else:
-            _append(json, json_text.dumps(finite(_update(snapshot, settings))) + "\n")
-        last[:] = [snapshot]
+            self._write(_update(snapshot, settings, self._now))
 
-    follow(file, settings, on_snapshot=tell, on_trouble=trouble.append, ended=threading.Event())
-    if trouble:
-        raise RecordingError(trouble[0])
-    if json is None and last and last[0].results:
-        show_result(last[0], settings, json=None, csv=None, bench=None)
+    def progress(self, done: int, total: int) -> None:
+        pass
+
+    def trouble(self, text: str) -> None:
+        self.troubles.append(text)
+
+    def _write(self, document: dict[str, Any]) -> None:
+        if self._json is not None:
+            _append(self._json, json_text.dumps(finite(document), ensure_ascii=False) + "\n")
 
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:
@@ -63,7 +103,7 @@ def _line(snapshot: Snapshot, settings: Settings) -> str:
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 
-def _update(snapshot: Snapshot, settings: Settings) -> dict[str, Any]:
+def _update(snapshot: Snapshot, settings: Settings, now: Now | None) -> dict[str, Any]:
     """Return what has changed, for a program: states, and the noise of each channel in the band."""
     document: dict[str, Any] = {
         "elapsed": snapshot.elapsed,
@@ -73,9 +113,17 @@ def _update(snapshot: Snapshot, settings: Settings) -> dict[str, Any]:
         "time_left": snapshot.time_left,
         "closed": snapshot.closed,
         "sensors": {
-            sensor.name: {"samples": sensor.n_samples, "gaps": sensor.n_gaps}
-            for sensor in snapshot.sensors
+            sensor.name: {
+                "state": sensor.state,
+                "samples": sensor.n_samples,
+                "gaps": sensor.n_gaps,
+                "missing": sensor.n_missing,
+                "clipped_blocks": sensor.n_clipped,
+                "standing_still": sensor.stuck,
+            }
+            for sensor in (() if now is None else now.sensors)
         },
+        "left_out": snapshot.left_out,
     }
     if snapshot.results:
         band = band_of(settings, snapshot.frequency)

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench import parse
+from daq.clock import SystemClock
+from daq.clock_model import ClockState
 from daq.estimation import ChannelLabel, SensorState, Settings, Snapshot
+from daq.protocols.block import Event, HostTime
+from daq.recording.layout import SensorLayout
+from daq.recording.writer import RecordingWriter
 from estimator.methods import self_noise
+from tui.state import Now, SensorNow
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
+
+    from daq.bench import Bench
 
 SETTINGS = Settings(
     segment=2.0, methods=("three-sensor", "three-channel"), band=(1.0, 20.0), target_cov=0.05
@@ -19,6 +31,7 @@ SETTINGS = Settings(
 SENSORS = ("A", "B", "C")
 CHANNELS = ("X", "Y", "Z")
 RATE = 200.0
+PPM, RESIDUALS = (5.9, -9.1, 4.0), (0.0, 0.4e-6, 0.6e-6)
 
 
 def rotation(degrees: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -27,7 +40,9 @@ def rotation(degrees: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def made_snapshot(*, n_effective: float = 100.0, closed: bool = False) -> Snapshot:
+def made_snapshot(
+    *, n_effective: float = 100.0, closed: bool = False, clock_share: float = 0.0004
+) -> Snapshot:
     """Three sensors at 0, 5 and 9° in a motion of 1/f, each channel's noise at −120 dB and up."""
     frequency: np.ndarray[tuple[int], np.dtype[np.float64]] = np.arange(201) * np.float64(0.5)
     motion = 1e-9 / np.maximum(frequency, 0.5)
@@ -57,9 +72,58 @@ def made_snapshot(*, n_effective: float = 100.0, closed: bool = False) -> Snapsh
             SensorState(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
             for name, n_gaps, last_seen in (("A", 0, 1000.0), ("B", 2, 1000.0), ("C", 0, 988.0))
         ),
-        clocks=(),
-        drift=np.zeros((0, 4)),
+        clocks=tuple(
+            ClockState(name, "arrival times", 0.0, ppm, 0.02, 0.1, residual, 1, refined=True)
+            for name, ppm, residual in zip(SENSORS, PPM, RESIDUALS, strict=True)
+        ),
+        drift=made_drift(),
         closed=closed,
+        diagnostics={
+            "synchronisation": {
+                "residual": dict(zip(SENSORS, RESIDUALS, strict=True)),
+                "noise_bias": np.full((len(frequency), 9), clock_share),
+            }
+        },
+    )
+
+
+def made_drift() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Three clocks at constant rates, the second with a bend of 20 µs in the middle."""
+    at = np.arange(60.0)
+    bend = 20e-6 * np.sin(np.pi * at / 59)
+    drift: np.ndarray[tuple[int, int], np.dtype[np.float64]] = np.zeros((60, 4))
+    drift[:, 0] = at
+    drift[:, 1:] = -1e-6 * np.outer(at, PPM)
+    drift[:, 2] += bend
+    return drift
+
+
+def made_now(*, elapsed: float = 100.0, closed: bool = False) -> Now:
+    """Three sensors: one live, one with two gaps, one silent for 12 s."""
+    begun = 1_795_230_000_000_000_000
+    return Now(
+        elapsed=elapsed,
+        started_utc_ns=begun,
+        closed=closed,
+        sensors=(
+            SensorNow("A", "/dev/ttyUSB0", RATE, 20000, 0, 0, "ended" if closed else "live"),
+            SensorNow("B", "/dev/ttyUSB1", RATE, 20000, 2, 14, "ended" if closed else "live"),
+            SensorNow("C", "/dev/ttyUSB2", RATE, 20000, 0, 0, "ended")
+            if closed
+            else SensorNow("C", "/dev/ttyUSB2", RATE, 17600, 0, 0, "silent", since=12.0),
+        ),
+        events=(
+            Event("", "started", "3 sensors", HostTime(0, begun)),
+            Event("", "mark", "door slammed", HostTime(0, begun + 42_000_000_000)),
+        ),
+    )
+
+
+def waiting_now() -> Now:
+    """Return the same bench before its first sample."""
+    now = made_now(elapsed=0.0)
+    return replace(
+        now, sensors=tuple(replace(s, n_samples=0, state="waiting") for s in now.sensors)
     )
 
 
@@ -78,6 +142,23 @@ def empty_snapshot() -> Snapshot:
     )
 
 
+@contextmanager
+def growing(path: Path) -> Iterator[RecordingWriter]:
+    """Yield the writer of a recording of the demo's bench that nobody has closed."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    bench = parse(text)
+    sensors = [
+        SensorLayout(s.name, s.channels, bench.sampling_rate, dtype=np.dtype("<i4"), clock=s.name)
+        for s in bench.sensors
+    ]
+    writer = RecordingWriter.create(path, bench, sensors=sensors, created=SystemClock().now())
+    writer.commit()
+    try:
+        yield writer
+    finally:
+        writer.abandon()
+
+
 @dataclass
 class Told:
     """Controls that write down what they are told."""
@@ -86,6 +167,7 @@ class Told:
     settings: Settings | None = SETTINGS
     name: str = "lab"
     can_start: bool = True
+    bench: Bench | None = None
     running: Path | None = None
     told: list[str] = field(default_factory=list)
 
@@ -97,6 +179,10 @@ class Told:
         """Note it."""
         self.told.append("start")
         return self.path
+
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Note it."""
+        self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
 
     def find_running(self) -> Path | None:
         """Return what was prepared."""

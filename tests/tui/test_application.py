@@ -9,23 +9,45 @@ import numpy as np
 import pytest
 from textual.widgets import Static
 
-from tests.tui.made import SETTINGS, Told, empty_snapshot, made_snapshot
+from tests.tui.made import (
+    SETTINGS,
+    Told,
+    empty_snapshot,
+    growing,
+    made_now,
+    made_snapshot,
+    waiting_now,
+)
 from tests.tui.screen_text import assert_looks_as_before, screen_text
-from tui.application.app import Following, Fresh, HuddleApp, Trouble
+from tui.application.app import HuddleApp
+from tui.application.messages import Following, Fresh, Looked, Trouble
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from textual.message import Message
     from textual.pilot import Pilot
 
 NARROW, WIDE = (80, 24), (160, 45)
 
 
-async def shown(pilot: Pilot[None], app: HuddleApp, message: object) -> None:
-    """Post a message and wait until it has been drawn."""
-    app.post_message(message)  # type: ignore[arg-type]  # any of the application's
-    for _ in range(3):
+async def shown(pilot: Pilot[None], app: HuddleApp, *messages: Message) -> None:
+    """Post messages and wait until they have been drawn."""
+    for message in messages:
+        app.post_message(message)
+    for _ in range(4):
         await pilot.pause()
+
+
+def running(*, n_effective: float = 100.0) -> tuple[Message, Message]:
+    """Return what comes from a recording that grows."""
+    return Looked(made_now()), Fresh(made_snapshot(n_effective=n_effective), SETTINGS)
+
+
+def ended() -> tuple[Message, Message]:
+    """Return what comes when it has ended."""
+    result = made_snapshot(n_effective=2000, closed=True)
+    return Looked(made_now(elapsed=2000.0, closed=True)), Fresh(result, SETTINGS)
 
 
 @pytest.fixture
@@ -37,18 +59,19 @@ def told(tmp_path: Path) -> Told:
 
 
 async def test_keys_tell_the_recorder(told: Told, tmp_path: Path) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
-        await pilot.press("x", "m")
-        assert told.told == []  # nothing runs: nothing to stop or mark
-        app.post_message(Following(tmp_path / "missing.h5"))
-        await app.workers.wait_for_complete()
-        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
-        await pilot.press("s")  # one runs already
-        await pilot.press("m", *"door", "enter")
-        await pilot.press("x")
-        await app.workers.wait_for_complete()
-    assert told.told == ["mark missing.h5 door", "stop missing.h5"]
+    app, path = HuddleApp(told), tmp_path / "grows.h5"
+    with growing(path):
+        async with app.run_test(size=NARROW) as pilot:
+            await pilot.press("x", "m")
+            assert told.told == []  # nothing runs: nothing to stop or mark
+            await shown(pilot, app, Following(path), *running())
+            await pilot.press("s")  # one runs already
+            await pilot.press("m", *"door", "enter")
+            await pilot.press("x", "escape")  # asked, and thought better of it
+            await pilot.press("x", "x")
+            for worker in [worker for worker in app.workers if worker.group == "control"]:
+                await worker.wait()
+    assert told.told == ["mark grows.h5 door", "stop grows.h5"]
 
 
 async def test_start_follows_the_file_and_says_what_is_wrong_with_it(told: Told) -> None:
@@ -76,7 +99,7 @@ async def test_a_running_recording_is_found_again(told: Told, tmp_path: Path) ->
 async def test_channels_sensors_and_methods_by_keys(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await shown(pilot, app, *running())
         both = ("three-sensor", "three-channel")
         assert app.choice.methods == both
         for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
@@ -99,7 +122,7 @@ async def test_trouble_is_told(told: Told) -> None:
 async def test_quitting_tells_the_recorder_nothing(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await shown(pilot, app, *running())
         await pilot.press("q")
     assert told.told == []
     assert app.return_code == 0
@@ -115,13 +138,23 @@ async def test_pictures(told: Told, name: str, size: tuple[int, int]) -> None:
         await app.workers.wait_for_complete()
         await pilot.pause()
         assert_looks_as_before(app, f"{name}-idle")
-        await shown(pilot, app, Fresh(empty_snapshot(), SETTINGS))
+        await shown(pilot, app, Looked(waiting_now()), Fresh(empty_snapshot(), SETTINGS))
         assert_looks_as_before(app, f"{name}-waiting")
-        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await shown(pilot, app, *running())
         await pilot.press("down")
         await pilot.pause()
         assert_looks_as_before(app, f"{name}-running")
-        await shown(pilot, app, Fresh(made_snapshot(n_effective=2000, closed=True), SETTINGS))
+        await pilot.press("c")
+        await shown(pilot, app)
+        assert_looks_as_before(app, f"{name}-clocks")
+        await pilot.press("c", "d")
+        await shown(pilot, app)
+        assert_looks_as_before(app, f"{name}-details")
+        await pilot.press("escape")
+        await shown(pilot, app, *ended())
+        assert_looks_as_before(app, f"{name}-result")
+        await pilot.press("escape")
+        await shown(pilot, app)
         assert_looks_as_before(app, f"{name}-ended")
         await pilot.press("question_mark")
         await pilot.pause()
@@ -137,7 +170,7 @@ async def test_negative_estimates_are_marked_not_hidden(told: Told) -> None:
     snapshot = replace(snapshot, results={"three-sensor": changed})
     app = HuddleApp(told)
     async with app.run_test(size=WIDE) as pilot:
-        await shown(pilot, app, Fresh(snapshot, SETTINGS))
+        await shown(pilot, app, Looked(made_now()), Fresh(snapshot, SETTINGS))
         text = screen_text(app)
     assert "40 of 199 values at or below zero" in text
     assert "▾" in text.replace("(▾ marks", "")
@@ -146,9 +179,9 @@ async def test_negative_estimates_are_marked_not_hidden(told: Told) -> None:
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        await shown(pilot, app, Fresh(made_snapshot(), SETTINGS))
+        await shown(pilot, app, *running())
         await pilot.press("question_mark")
-        await shown(pilot, app, Fresh(made_snapshot(n_effective=500), SETTINGS))
+        await shown(pilot, app, *running(n_effective=500))
         await pilot.resize_terminal(100, 40)
         await pilot.pause()
         await pilot.press("escape")

@@ -63,13 +63,17 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
         await until(pilot, lambda: second.snapshot is not None)
         await pilot.press("m", *"here", "enter")
         await until(pilot, lambda: all(w.group != "control" for w in second.workers))
-        await pilot.press("x")
+        await pilot.press("x", "x")
         await until(pilot, lambda: second.snapshot is not None and second.snapshot.closed)
         snapshot = second.snapshot
         assert snapshot is not None
         assert {"three-sensor", "three-channel"} <= set(snapshot.results)
+        assert "No limits in the bench file" in screen_text(second)
+        await until(pilot, lambda: all(w.group != "follow" for w in second.workers))
     recorder.wait()
     controls.release()
     with Recording.open(recorder.out) as recording:
         assert recording.closed
-        assert ("mark", "here") in [(event.kind, event.text) for event in recording.events]
+        marks = [event.text for event in recording.events if event.kind == "mark"]
+        assert [mark.split(" (")[0] for mark in marks] == ["here"]
+        assert {"three-sensor", "three-channel"} == set(recording.results())

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from rich.text import Text
 from textual import on, work
 from textual.app import App
 from textual.binding import Binding, BindingType
-from textual.containers import VerticalScroll
-from textual.message import Message
 from textual.reactive import reactive
-from textual.widgets import Footer, Static
+from textual.widgets import Footer
 
 from daq.errors import HuddleError
 from tui.application import view
-from tui.application.plot import PsdPlot
-from tui.application.screens import HelpScreen, MarkScreen
+from tui.application.board import Board, Shown
+from tui.application.messages import Following, Fresh, Looked, Messenger, Progress, Trouble
+from tui.application.result import details, result
+from tui.application.screens import MarkScreen, ResultScreen, StopScreen, TextScreen, help_text
 from tui.following import follow
 from tui.text import clock_time
 
@@ -26,35 +26,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from rich.console import RenderableType
     from textual.app import ComposeResult
-    from textual.events import Resize
 
     from daq.estimation import Settings, Snapshot
     from tui.application.controls import Controls
+    from tui.state import Now
 
-TALL = 34  # rows from which there is room for remarks and air
-
-
-@dataclass
-class Fresh(Message):
-    """A snapshot came, made with these settings."""
-
-    snapshot: Snapshot
-    settings: Settings
-
-
-@dataclass
-class Following(Message):
-    """A recording is there, and is followed from now on."""
-
-    path: Path
-
-
-@dataclass
-class Trouble(Message):
-    """Something failed; the text says what, and what to do."""
-
-    text: str
+GROWTH = 0.01  # of the segments, from which on curves change to the eye
+SLOW_REMARK = 2.0  # seconds that writing a remark may take before the mark says so
 
 
 class HuddleApp(App[None]):
@@ -77,17 +57,24 @@ class HuddleApp(App[None]):
         Binding("s", "start", "Start"),
         Binding("x", "stop", "Stop"),
         Binding("m", "mark", "Mark"),
-        Binding("right", "channel(1)", "Channel", key_display="←→"),
-        Binding("left", "channel(-1)", "Channel", show=False),
-        Binding("down", "sensor(1)", "Sensor", key_display="↑↓"),
-        Binding("up", "sensor(-1)", "Sensor", show=False),
+        Binding("r", "result", "Result"),
+        Binding("c", "clocks", "Clocks"),
+        Binding("d", "details", "Details"),
         Binding("e", "method", "Estimate"),
         Binding("question_mark", "help", "Help", key_display="?"),
         Binding("q", "quit", "Quit"),
+        Binding("ctrl+c", "quit", "Quit", show=False),
+        Binding("right", "channel(1)", "Channel", key_display="←→↑↓"),
+        Binding("left", "channel(-1)", "Channel", show=False),
+        Binding("down", "sensor(1)", "Sensor", show=False),
+        Binding("up", "sensor(-1)", "Sensor", show=False),
     ]
 
     snapshot: reactive[Snapshot | None] = reactive(None, always_update=True)
+    now: reactive[Now | None] = reactive(None, always_update=True)
     choice: reactive[view.Choice] = reactive(view.Choice)
+    note: reactive[str] = reactive("")
+    trouble: reactive[str] = reactive("")
 
     def __init__(
         self, controls: Controls, *, path: Path | None = None, start: bool = False
@@ -97,17 +84,14 @@ class HuddleApp(App[None]):
         self._controls = controls
         self._path = path
         self._settings: Settings | None = None
+        self._snapshot_at = 0.0
+        self._starting = False
         self._ended = threading.Event()
+        self._offered: tuple[bool, ...] = ()
 
     def compose(self) -> ComposeResult:
         """Lay out the screen."""
-        yield Static(id="status")
-        yield Static(id="title")
-        yield PsdPlot(id="plot")
-        with VerticalScroll(id="sensors", can_focus=False):
-            yield Static(id="table")
-        yield Static(id="progress")
-        yield Static(id="advice")
+        yield Board()
         yield Footer(show_command_palette=False)
 
     def on_mount(self) -> None:
@@ -129,37 +113,45 @@ class HuddleApp(App[None]):
     @on(Following)
     def _on_following(self, message: Following) -> None:
         self._path = message.path
+        self._starting, self.trouble, self.note = False, "", ""
+        self.now = self.snapshot = None
         self._ended.set()
         self._ended = threading.Event()
         self._follow(message.path, self._ended)
 
     @work(thread=True, group="follow")
     def _follow(self, path: Path, ended: threading.Event) -> None:
-        follow(
-            path,
-            self._controls.settings,
-            on_snapshot=lambda snapshot, settings: self._post(ended, Fresh(snapshot, settings)),
-            on_trouble=lambda text: self._post(ended, Trouble(text)),
-            ended=ended,
-        )
+        messenger = Messenger(self, self._controls, path=path, ended=ended)
+        follow(path, self._controls.settings, onlooker=messenger, ended=ended, growth=GROWTH)
 
-    def _post(self, ended: threading.Event, message: Message) -> None:
-        if not ended.is_set():
-            self.post_message(message)
+    @on(Looked)
+    def _on_looked(self, message: Looked) -> None:
+        self.now = message.now
+
+    @on(Progress)
+    def _on_progress(self, message: Progress) -> None:
+        self.note = f"the result is being computed: {message.done / message.total:.0%}"
 
     @on(Fresh)
     def _on_fresh(self, message: Fresh) -> None:
         self._settings = message.settings
+        before, self.note = self.snapshot, ""
         if not self.choice.methods:
             names = tuple(name for name in message.settings.methods if name != "all")
             names = names or tuple(message.snapshot.results)
             self.choice = replace(self.choice, methods=names if len(names) < 3 else names[:1])
+        self._snapshot_at = 0.0 if self.now is None else self.now.elapsed
         self.snapshot = message.snapshot
+        if message.snapshot.closed and before is not None and not before.closed:
+            self.action_result()
 
     @on(Trouble)
     def _on_trouble(self, message: Trouble) -> None:
-        self.notify(message.text, title="Trouble", severity="error", timeout=30)
-        self._show()
+        self._starting, self.note = False, ""
+        if message.ended:
+            self.trouble = message.text
+        else:
+            self.notify(message.text, title="Trouble", severity="error", timeout=30, markup=False)
 
     # -------------------------------------------------------------------- showing
 
@@ -167,56 +159,45 @@ class HuddleApp(App[None]):
         """Draw a new snapshot."""
         self._show()
 
-    def watch_choice(self) -> None:
-        """Draw another channel or method."""
+    def watch_now(self) -> None:
+        """Write what has changed between segments."""
         self._show()
 
-    def on_resize(self, event: Resize) -> None:
-        """Fit the screen's size."""
-        self.set_class(event.size.height >= TALL, "-tall")
-        self.call_after_refresh(self._show)
+    def watch_choice(self) -> None:
+        """Draw another channel, method or picture."""
+        self._show()
+
+    def watch_note(self) -> None:
+        """Say what goes on."""
+        self._show()
+
+    def watch_trouble(self) -> None:
+        """Say what is wrong."""
+        self._show()
 
     def _show(self) -> None:
         if not self.is_running:
             return
-        self.query_one("#status", Static).update(self._status())
-        snapshot, settings = self.snapshot, self._settings
-        self.set_class(snapshot is None, "-idle")
-        if snapshot is None or settings is None:
-            self.query_one("#table", Static).update(self._controls.description())
-            self.query_one("#progress", Static).update(
-                Text("s starts a recording · ? helps", "#9aa5b8") if self._path is None else ""
+        since = 0.0 if self.now is None else max(0.0, self.now.elapsed - self._snapshot_at)
+        board = self.screen_stack[0].query_one(Board)
+        board.show(
+            Shown(
+                name=self._controls.name,
+                description=self._controls.description(),
+                choice=self.choice,
+                path=self._path,
+                now=self.now,
+                snapshot=self.snapshot,
+                settings=self._settings,
+                since=since,
+                trouble=self.trouble,
+                note=self.note,
             )
-            return
-        plot = self.query_one(PsdPlot)
-        plot.visible = snapshot.n_segments > 0
-        self.query_one("#title", Static).update(view.plot_title(snapshot, self.choice))
-        plot.show(view.curves(snapshot, settings, self.choice, n_points=plot.n_points))
-        self.query_one("#table", Static).update(view.sensor_table(snapshot, settings, self.choice))
-        self.query_one("#progress", Static).update(
-            view.progress_line(snapshot, settings, self.choice, width=self.size.width - 2)
         )
-        self.query_one("#advice", Static).update(view.advice(snapshot, self.choice))
-
-    def _status(self) -> Text:
-        snapshot = self.snapshot
-        line = Text()
-        line.append("huddle ", "bold #4cc9f0")
-        line.append(f" {self._controls.name}  ", "bold")
-        if snapshot is None:
-            line.append("○ no recording" if self._path is None else "○ opening", "#9aa5b8")
-        elif snapshot.closed:
-            line.append("■ ended", "#9aa5b8")
-        else:
-            line.append("● recording", "bold #ff6b6b")
-        if snapshot is not None:
-            line.append(f"  {clock_time(snapshot.elapsed)}")
-        if self._path is not None:
-            room = self.size.width - line.cell_len - 4
-            name = self._path.name
-            if len(name) <= room:
-                line.append(f"  {name}", "#9aa5b8")
-        return line
+        offered = self.recording, self._starting, self._has_result, self.snapshot is None
+        if offered != self._offered:
+            self._offered = offered
+            self.refresh_bindings()
 
     # -------------------------------------------------------------------- choosing
 
@@ -248,26 +229,71 @@ class HuddleApp(App[None]):
         place = turns.index(self.choice.methods) if self.choice.methods in turns else -1
         self.choice = replace(self.choice, methods=turns[(place + 1) % len(turns)])
 
+    def action_clocks(self) -> None:
+        """Show clocks in place of noise, or noise again."""
+        if self.snapshot is not None:
+            self.choice = replace(self.choice, clocks=not self.choice.clocks)
+
     def action_help(self) -> None:
-        """Show the keys."""
-        self.push_screen(HelpScreen())
+        """Say what keys and words mean."""
+        self.push_screen(TextScreen("huddle", help_text))
+
+    def action_details(self) -> None:
+        """Show all that is known of the test."""
+        self.push_screen(TextScreen("details", self._details, refresh_every=2.0))
+
+    def _details(self) -> RenderableType:
+        if self.now is None:
+            return self._controls.description()
+        return details(self.now, self.snapshot, self._settings, trouble=self.trouble)
+
+    def action_result(self) -> None:
+        """Show the end of the test."""
+        if isinstance(self.screen, ResultScreen) or not self._has_result:
+            return
+        self.push_screen(ResultScreen("result", self._result))
+
+    @property
+    def _has_result(self) -> bool:
+        return self.snapshot is not None and self.snapshot.closed
+
+    def _result(self) -> RenderableType:
+        if self.snapshot is None or self._settings is None:
+            return ""
+        return result(self.snapshot, self._settings, bench=self._controls.bench, path=self._path)
 
     # ------------------------------------------------------------------ controlling
 
     @property
+    def path(self) -> Path | None:
+        """The recording that is, or was, followed."""
+        return self._path
+
+    @property
     def recording(self) -> bool:
         """Whether a recording is running that is followed here."""
-        return self._path is not None and not (self.snapshot is not None and self.snapshot.closed)
+        if self.trouble or self._has_result:
+            return False
+        return self._path is not None if self.now is None else not self.now.closed
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Offer only what can be done now."""
+        del parameters
+        if action == "start":
+            return self._controls.can_start and not self.recording and not self._starting
+        if action in {"stop", "mark"}:
+            return self.recording and self.now is not None
+        if action == "result":
+            return self._has_result
+        if action in {"channel", "sensor", "method", "clocks"}:
+            return self.snapshot is not None
+        return True
 
     def action_start(self) -> None:
         """Start a recorder."""
-        if not self._controls.can_start:
-            self.notify("This is a recording; open a bench file to start one: huddle tui BENCH")
-        elif self.recording:
-            self.notify("A recording is running; x stops it.")
-        else:
-            self.notify("Connecting to the sensors …")
-            self._start()
+        self._starting = True
+        self.note = "connecting to the sensors …"
+        self._start()
 
     @work(thread=True, group="control", exclusive=True)
     def _start(self) -> None:
@@ -287,23 +313,28 @@ class HuddleApp(App[None]):
                 self.post_message(Following(path))
 
     def action_stop(self) -> None:
-        """Stop the recorder."""
-        if self._path is None or not self.recording:
-            self.notify("No recording is running.")
-            return
-        self.notify("Stopping; the result will be computed from the whole recording.")
-        self._tell(self._path, "stop")
-
-    def action_mark(self) -> None:
-        """Ask for a remark and mark the moment."""
-        if self._path is None or not self.recording:
-            self.notify("No recording is running.")
+        """Stop the recorder, once that has been confirmed."""
+        if self._path is None or self.now is None:
             return
         path = self._path
 
+        def stop(really: bool | None) -> None:
+            if really:
+                self.note = "stopping …"
+                self._tell(path, "stop")
+
+        self.push_screen(StopScreen(clock_time(self.now.elapsed)), stop)
+
+    def action_mark(self) -> None:
+        """Ask for a remark and mark the moment."""
+        if self._path is None:
+            return
+        path, began = self._path, time.monotonic()
+
         def mark(text: str | None) -> None:
             if text is not None:
-                self._tell(path, "mark", text)
+                ago = time.monotonic() - began
+                self._tell(path, "mark", text + (f" ({ago:.0f} s ago)" * (ago >= SLOW_REMARK)))
 
         self.push_screen(MarkScreen(), mark)
 
@@ -314,5 +345,6 @@ class HuddleApp(App[None]):
                 self._controls.stop(path)
             else:
                 self._controls.mark(path, text)
+                self.call_from_thread(self.notify, f"marked: {text}", timeout=3, markup=False)
         except (HuddleError, OSError) as error:
             self.post_message(Trouble(str(error)))

@@ -9,7 +9,8 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.estimation import Settings
+    from daq.bench import Bench
+    from daq.estimation import Settings, Snapshot
 
 
 class Controls(Protocol):
@@ -23,6 +24,11 @@ class Controls(Protocol):
     @property
     def settings(self) -> Settings | None:
         """How to estimate; None for what the recording says."""
+        ...
+
+    @property
+    def bench(self) -> Bench | None:
+        """The bench, for its limits."""
         ...
 
     @property
@@ -48,4 +54,8 @@ class Controls(Protocol):
 
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
+        ...
+
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Write the result into a recording whose end has been seen here. Blocks."""
         ...

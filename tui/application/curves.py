@@ -36,6 +36,16 @@ class Curve:
     negative: NDArray[np.bool_]
 
 
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of a plot that is straight both ways; shape (n_points,)."""
+
+    label: str
+    style: str
+    x: FloatArray
+    y: FloatArray
+
+
 def decibels(psd: FloatArray) -> FloatArray:
     """Return 10 log10 of what is positive, NaN elsewhere."""
     with np.errstate(invalid="ignore", divide="ignore"):

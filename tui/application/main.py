@@ -10,22 +10,27 @@ from rich.table import Table
 from daq.bench import load
 from daq.clock import SystemClock
 from daq.control import ask
-from daq.errors import HuddleError
+from daq.errors import BenchFileError, HuddleError
 from daq.estimation import Settings
 from daq.recorder import recording_path
 from daq.recording.reader import Recording
 from tui.application.app import HuddleApp
 from tui.estimating import chosen
 from tui.finding import running_recording
+from tui.output import notices
 from tui.recorder_process import RecorderProcess
+from tui.running import finish_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench import Bench
+    from daq.estimation import Snapshot
 
 ALWAYS = ("three-sensor", "three-channel")
 """Estimates that cost little: shown beside the bench's own, for comparison."""
+FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
+"""Endings of files that are to be imported first."""
 
 
 @dataclass
@@ -73,6 +78,13 @@ class BenchControls:
         """Ask the recorder of a file to record a remark."""
         ask(path, "mark", text)
 
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Write the result into the recording, unless somebody has done so."""
+        with Recording.open(path) as recording:
+            if recording.results():
+                return
+        finish_recording(path, snapshot)
+
     def release(self) -> None:
         """Forget the recorders; they go on."""
         for recorder in self.started:
@@ -85,6 +97,7 @@ class RecordingControls:
 
     path: Path
     settings: Settings
+    bench: Bench | None = None
     can_start: bool = False
 
     @property
@@ -112,11 +125,30 @@ class RecordingControls:
         """Ask the recorder to record a remark."""
         ask(path, "mark", text)
 
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Leave that to who records."""
+
 
 def open_application(source: Path, *, method: str | None) -> None:
-    """Open the application on a bench file, or on a recording (``.h5``)."""
-    if source.suffix == ".h5":
+    """Open the application on a bench file, or on a recording (``.h5``).
+
+    Raises
+    ------
+    BenchFileError
+        It is neither, or a bench file with faults.
+    """
+    if source.suffix.lower() in {".h5", ".hdf5"}:
         open_recording(source, method=method)
+    elif source.suffix.lower() in FOREIGN:
+        raise BenchFileError(
+            f"{source}: neither a bench file (.toml) nor a recording (.h5); make a recording of it"
+            f" first: huddle import {source} --out {source.with_suffix('.h5')}"
+        )
+    elif not source.exists():
+        raise BenchFileError(
+            f"{source}: there is no such file; write a bench file with huddle init -o {source}, or"
+            " see one at work with huddle demo"
+        )
     else:
         open_bench(source, methods=None if method is None else (str(method),))
 
@@ -128,9 +160,24 @@ def open_bench(path: Path, *, methods: tuple[str, ...] | None = None) -> None:
     settings = replace(settings, methods=methods or _beside(settings.methods))
     controls = BenchControls(path, bench, settings)
     try:
-        HuddleApp(controls).run()
+        _run(HuddleApp(controls), again=path)
     finally:
         controls.release()
+
+
+def _run(app: HuddleApp, *, again: Path) -> None:
+    """Run it; say afterwards where a recording lies, and that it goes on."""
+    app.run()
+    if app.path is None:
+        return
+    if app.recording:
+        notices().print(
+            f"The recording goes on: {app.path}\nLook at it again, or stop it: huddle tui {again}",
+            soft_wrap=True,
+            markup=False,
+        )
+    else:
+        notices().print(f"recording: {app.path}", soft_wrap=True, markup=False)
 
 
 def show_demo(path: Path, settings: Settings) -> Path | None:
@@ -154,10 +201,11 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
 def open_recording(path: Path, *, method: str | None = None) -> None:
     """Open the application on a recording, growing or closed."""
     with Recording.open(path) as recording:
-        settings = chosen(Settings.of(recording.bench), method=method)
+        bench = recording.bench
+        settings = chosen(Settings.of(bench), method=method)
     if method is None:
         settings = replace(settings, methods=_beside(settings.methods))
-    HuddleApp(RecordingControls(path, settings), path=path).run()
+    _run(HuddleApp(RecordingControls(path, settings, bench), path=path), again=path)
 
 
 def _beside(methods: tuple[str, ...]) -> tuple[str, ...]:

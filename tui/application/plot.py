@@ -1,4 +1,4 @@
-"""The plot: power spectral densities over frequency, logarithmic both ways."""
+"""The plots: power spectral densities over frequency, and the drift of clocks over time."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from textual_plot import HiResMode, LegendLocation, PlotWidget
-from textual_plot.axis_formatter import AxisFormatter
+from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.curves import level_limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tui.application.curves import Curve
+    from tui.application.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
+LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
+SHORT, LONG = 2.0, 300.0  # minutes: below seconds, above hours
+LARGE = 2000.0  # µs: above milliseconds
 
 
 class FrequencyAxis(AxisFormatter):
@@ -50,13 +53,41 @@ class LevelAxis(AxisFormatter):
         return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
 
 
-class PsdPlot(PlotWidget, can_focus=False):
-    """Curves with their 95 % bands, redrawn as a whole when any of them changes."""
+class TimeAxis(NumericAxisFormatter):
+    """Ticks on an axis of minutes."""
 
-    def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
+    def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
+        """Return minutes, or hours where these are many, or seconds where they are few."""
+        if ticks and max(ticks) < SHORT:
+            return [f"{60 * tick:.3g} s" for tick in ticks]
+        if ticks and max(ticks) >= LONG:
+            return [f"{tick / 60:.3g} h" for tick in ticks]
+        return [f"{tick:.3g} min" for tick in ticks]
+
+
+class LagAxis(NumericAxisFormatter):
+    """Ticks on an axis of microseconds."""
+
+    def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
+        """Return microseconds, or milliseconds where these are many."""
+        if ticks and max(abs(tick) for tick in ticks) >= LARGE:
+            return [f"{tick / 1e3:.3g} ms".replace("-", "−") for tick in ticks]
+        return [f"{tick:.3g} µs".replace("-", "−") for tick in ticks]
+
+
+class FullPlot(PlotWidget, can_focus=False):
+    """A plot that leaves room for tick labels only: they carry the units."""
+
+    def __init__(
+        self,
+        x: AxisFormatter,
+        y: AxisFormatter,
+        *,
+        id: str | None = None,  # noqa: A002 - Textual's name
+    ) -> None:
         super().__init__(id=id, allow_pan_and_zoom=False)
-        self.set_x_formatter(FrequencyAxis())
-        self.set_y_formatter(LevelAxis())
+        self.set_x_formatter(x)
+        self.set_y_formatter(y)
 
     @property
     def n_points(self) -> int:
@@ -64,11 +95,46 @@ class PsdPlot(PlotWidget, can_focus=False):
         return max(8, self.size.width - self.margin_left - 2)
 
     def on_mount(self) -> None:
-        """Leave room for tick labels only: they carry the units."""
+        """Leave room for tick labels."""
         super().on_mount()
         self.margin_left = 9
         self.margin_top = 0
         self.margin_bottom = 1
+
+
+class DriftPlot(FullPlot):
+    """What each clock does over time."""
+
+    def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
+        super().__init__(TimeAxis(), LagAxis(), id=id)
+
+    def show(self, lines: Sequence[Line]) -> None:
+        """Draw these lines and no others; the last one on top."""
+        self.clear()
+        if not lines:
+            return
+        x, y = (np.concatenate([getattr(line, axis) for line in lines]) for axis in "xy")
+        most = max(LEAST_LAG, 1.1 * float(np.abs(y).max()))
+        self.set_xlimits(float(x.min()), float(x.max()))
+        self.set_ylimits(-most, most)
+        for line in lines:
+            self.plot(
+                line.x,
+                line.y,
+                line_style=line.style,
+                hires_mode=HiResMode.BRAILLE,
+            )
+
+
+class PsdPlot(FullPlot):
+    """Curves with their 95 % bands, redrawn as a whole when any of them changes."""
+
+    def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
+        super().__init__(FrequencyAxis(), LevelAxis(), id=id)
+
+    def on_mount(self) -> None:
+        """Say which curve is which."""
+        super().on_mount()
         self.show_legend(LegendLocation.TOPRIGHT)
 
     def show(self, curves: Sequence[Curve]) -> None:

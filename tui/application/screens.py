@@ -1,64 +1,163 @@
-"""Small screens over the application: help, and what to write beside a mark."""
+"""Screens over the application: help, questions, and texts to read."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import RenderableType
     from textual.app import ComposeResult
 
 KEYS = (
     ("s", "start a recording of this bench"),
-    ("x", "stop it; the result is then computed from the whole file"),
+    ("x", "stop it; the result is then computed from the whole recording"),
     ("m", "mark this moment in the recording, with a remark"),
-    ("← →", "channel"),
-    ("↑ ↓", "sensor"),
+    ("← → ↑ ↓", "channel, and sensor"),
     ("e", "estimate shown: each method in turn, then all"),
-    ("q", "quit; a recording goes on, and is found again"),
+    ("c", "clocks: how they drift, and whether that matters; c again: noise"),
+    ("d", "details: states, segments, diagnosis, events"),
+    ("r", "result, when the recording has ended"),
+    ("q", "quit, as Ctrl-C does; a recording goes on, and is found again"),
 )
-READING = (
-    "Grey is what the channel recorded, in colour what is its own noise; the shade around it is "
-    "the 95 % interval and closes in as segments come. ▾ marks frequencies where the estimate "
-    "came out negative: its upper bound, or the floor. c.o.v. is the relative scatter of the "
-    "estimate at one frequency, in the worst channel."
+WORDS = (
+    ("data", "what the channel recorded: motion and noise (grey)"),
+    ("noise", "the channel's own noise (colour), ± its 95 % interval (shade)"),
+    ("▾", "the estimate came out below zero there: its upper bound, or floor"),
+    ("c.o.v.", "relative scatter of the noise at one frequency, worst channel"),
+    ("→ 0.05", "the scatter wanted: the bench file's target_cov"),
+    ("segment", "a piece of the recording that is averaged; more make noise surer"),
+    ("left out", "segments with a gap, clipped, or disturbed"),
+    ("gaps", "how often samples are missing, and (how many)"),
+    ("live", "samples come; ended: the recording is over"),
+    ("waiting", "connected, but no sample yet"),
+    ("late", "no block for twice as long as one takes"),
+    ("stalled", "connected but sends nothing; it is connected anew by itself"),
+    ("lost", "disconnected; tried again for as long as the recording lasts"),
+    ("refused", "another device than the bench file names, or before"),
+    ("silent", "no samples, while other sensors go on"),
+    ("clips", "at the end of its range: more motion than it can measure"),
+    ("still", "a channel that does not change at all: no signal"),
+    ("no signal", "nothing but zero in its spectrum; a copy: equals another channel"),
+    ("clocks", "each sensor counts time by its own; aligned by when samples"),
+    ("", "arrive, then by the motion that the sensors share"),
+    ("ppm", "how fast a clock runs: +10 ppm gains 36 ms an hour"),
+    ("within", "what is left between the clocks after alignment"),
+    ("of noise", "share of the noise shown that this makes up; matters above 5 %"),
 )
 
 
-class HelpScreen(ModalScreen[None]):
-    """The keys, and how to read the picture."""
+def _pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(style=style, no_wrap=True, min_width=9)
+    table.add_column()
+    for name, meaning in pairs:
+        table.add_row(name, meaning)
+    return table
 
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,question_mark,q", "dismiss", "Close")]
+
+def help_text() -> RenderableType:
+    """Return what each key does and what each word on the screen means."""
+    return Group(_pairs(KEYS, "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
+
+
+class TextScreen(ModalScreen[None]):
+    """Something to read: it scrolls, and is written anew while it is open.
+
+    Parameters
+    ----------
+    title : str
+    content : callable
+        Returns what to show.
+    refresh_every : float, optional
+        Seconds; never, if not given.
+    """
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,q,question_mark,d,r,ctrl+c", "dismiss", "Close"),
+    ]
+
+    def __init__(
+        self,
+        title: str,
+        content: Callable[[], RenderableType],
+        *,
+        refresh_every: float | None = None,
+    ) -> None:
+        super().__init__()
+        self._title, self._content, self._refresh_every = title, content, refresh_every
 
     def compose(self) -> ComposeResult:
-        """Lay out the help."""
-        table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-        table.add_column(style="bold #4cc9f0", no_wrap=True)
-        table.add_column()
-        for key, does in KEYS:
-            table.add_row(key, does)
-        table.add_row("", "")
-        table.add_row("", READING)
-        help_text = Static(table)
-        help_text.border_title = "huddle"
-        yield help_text
+        """Lay out the text."""
+        with VerticalScroll() as scroll:
+            yield Static(self._content())
+        scroll.border_title = self._title
+        scroll.border_subtitle = "↑ ↓ scroll · esc closes"
+
+    def on_mount(self) -> None:
+        """Keep it up to date."""
+        self.query_one(VerticalScroll).focus()
+        if self._refresh_every is not None:
+            self.set_interval(self._refresh_every, self.rewrite)
+
+    def rewrite(self) -> None:
+        """Write it anew."""
+        self.query_one(Static).update(self._content())
+
+
+class ResultScreen(TextScreen):
+    """The end of a test; its report can be written from here."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("w", "app.report", "Report")]
+
+    def on_mount(self) -> None:
+        """Say what can be done here."""
+        super().on_mount()
+        scroll = self.query_one(VerticalScroll)
+        scroll.border_subtitle = "↑ ↓ scroll · w writes the report · esc closes, r reopens"
 
 
 class MarkScreen(ModalScreen[str | None]):
     """Asks what to write beside a mark."""
 
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "Cancel")]
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,ctrl+c", "dismiss(None)", "Cancel")]
 
     def compose(self) -> ComposeResult:
         """Lay out the question."""
         entry = Input(placeholder="what happened, such as: door slammed", max_length=200)
         entry.border_title = "mark"
+        entry.border_subtitle = "enter marks · esc cancels"
         yield entry
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """Hand over the remark."""
         self.dismiss(event.value.strip() or "mark")
+
+
+class StopScreen(ModalScreen[bool]):
+    """Asks whether the recording is really to be stopped: it cannot be taken up again."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("x,enter,y", "dismiss(True)", "Stop"),
+        Binding("escape,n,q,ctrl+c", "dismiss(False)", "Go on"),
+    ]
+
+    def __init__(self, so_far: str) -> None:
+        super().__init__()
+        self._so_far = so_far
+
+    def compose(self) -> ComposeResult:
+        """Lay out the question."""
+        question = Static(Text(f"Stop the recording after {self._so_far}?"))
+        question.border_title = "stop"
+        question.border_subtitle = "x or enter stops · esc goes on"
+        yield question

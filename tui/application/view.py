@@ -10,6 +10,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from estimator.self_noise import Flag
 from tui.application.curves import data_curve, noise_curve
 from tui.results import band_of, channel_means, correlation_of, reached_cov
 from tui.text import clock_time, decibels, time_left
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from daq.estimation import Settings, Snapshot
     from tui.application.curves import Curve
     from tui.bands import BandMeans
+    from tui.state import Now, SensorNow
 
 DATA_STYLE = "#7d8799"
 STYLES = {
@@ -29,16 +31,15 @@ STYLES = {
     "two-channel": ("#e9d86b", "#7f7638"),
 }
 """Colours of each method: of its curve and of its 95 % band."""
-SILENT = 3.0
-"""Seconds without a sample after which a sensor is called silent, while others go on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What the technician has chosen to look at: a channel, and methods by name."""
+    """What the technician looks at: a channel, methods by name, or clocks in place of noise."""
 
     channel: int = 0
     methods: tuple[str, ...] = ()
+    clocks: bool = False
 
 
 def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: int) -> list[Curve]:
@@ -76,38 +77,57 @@ def plot_title(snapshot: Snapshot, choice: Choice) -> str:
     return f"{label.sensor} {label.channel}   power spectral density re 1 ({snapshot.unit})²/Hz"
 
 
-def sensor_table(snapshot: Snapshot, settings: Settings, choice: Choice) -> Table:
-    """Return a row per sensor: how it is, and the noise of each of its channels in the band."""
+def sensor_table(
+    now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int
+) -> Table:
+    """Return a row per sensor: how it is, and the noise of each of its channels in the band.
+
+    What there is no room for is left out: rates first, then numbers of samples, then of gaps.
+    """
     method = next((m for m in choice.methods if m in snapshot.results), None)
     means: tuple[BandMeans, ...] = ()
     band = band_of(settings, snapshot.frequency)
     if method is not None:
         means = channel_means(snapshot.results[method], snapshot.frequency, settings, band)
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
-    table.add_column("sensor", no_wrap=True)
-    table.add_column("state", no_wrap=True)
-    for title in ("Hz", "samples", "gaps"):
-        table.add_column(title, justify="right", no_wrap=True)
-    titles = ("noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz")
-    for number in range(max(snapshot.dims)):
-        table.add_column(titles[number] if number < len(titles) else "", no_wrap=True)
-    latest = max((sensor.last_seen for sensor in snapshot.sensors), default=math.nan)
     of_sensor = _columns_of(snapshot)
-    for sensor in snapshot.sensors:
-        cells = [
-            _channel_noise(snapshot, column, means, chosen=column == choice.channel)
-            for column in of_sensor.get(sensor.name, ())
+    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz"]
+    columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
+    columns["state"] = [state(sensor) for sensor in now.sensors]
+    columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
+    columns["samples"] = [Text(f"{s.n_samples:,}".replace(",", " ")) for s in now.sensors]
+    columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
+    for number in range(max(snapshot.dims)):
+        title = titles[number] if number < len(titles) else " " * number
+        columns[title] = [
+            _channel_noise(snapshot, mine[number], means, chosen=mine[number] == choice.channel)
+            if number < len(mine := of_sensor.get(sensor.name, []))
+            else Text("")
+            for sensor in now.sensors
         ]
-        gaps = f"{sensor.n_gaps} ({sensor.n_missing})" if sensor.n_gaps else "0"
-        table.add_row(
-            Text(sensor.name, "bold"),
-            _state(sensor.last_seen, latest, closed=snapshot.closed),
-            f"{sensor.sampling_rate:g}",
-            f"{sensor.n_samples:,}".replace(",", " "),
-            Text(gaps, "yellow" if sensor.n_gaps else ""),
-            *cells,
-        )
+    for unneeded in ("Hz", "samples", "gaps"):
+        if _width(columns) > width:
+            del columns[unneeded]
+    if _width(columns) > width:
+        for title in list(columns)[2:]:
+            columns[title] = [cell.split("±")[0] for cell in columns[title]]
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
+    for title in columns:
+        right = title in {"Hz", "samples", "gaps"}
+        table.add_column(title, justify="right" if right else "left", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
     return table
+
+
+def _width(columns: dict[str, list[Text]]) -> int:
+    widest = (max(len(title), *map(len, cells)) for title, cells in columns.items())
+    return sum(widest) + len(columns)
+
+
+def _gaps(sensor: SensorNow) -> Text:
+    if not sensor.n_gaps:
+        return Text("0")
+    return Text(f"{sensor.n_gaps} ({sensor.n_missing})", "yellow")
 
 
 def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
@@ -117,58 +137,123 @@ def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
     return columns
 
 
-def _state(last_seen: float, latest: float, *, closed: bool) -> Text:
-    if math.isnan(last_seen):
+def state(sensor: SensorNow) -> Text:
+    """Return how a sensor is, in a word or two."""
+    word = {"disconnected": "lost"}.get(sensor.state, sensor.state)
+    if sensor.is_lost:
+        late = sensor.state == "late"
+        return Text(f"○ {word} {clock_time(sensor.since)}", "yellow" if late else "bold #ff6b6b")
+    if sensor.state == "waiting":
         return Text("○ waiting", "yellow")
-    if closed:
-        return Text("■ ended", "#9aa5b8")
-    silent = latest - last_seen
-    if silent > SILENT:
-        return Text(f"○ silent {clock_time(silent)}", "bold red")
-    return Text("● live", "green")
+    if sensor.stuck:
+        return Text(f"▲ {' '.join(sensor.stuck)} still", "bold #ff6b6b")
+    if sensor.clips:
+        return Text("▲ clips", "bold #ff6b6b")
+    return Text("■ ended", "#9aa5b8") if word == "ended" else Text("● live", "green")
 
 
 def _channel_noise(
     snapshot: Snapshot, column: int, means: Sequence[BandMeans], *, chosen: bool
 ) -> Text:
     name = snapshot.channels[column].channel
-    value = "…"
-    if means:
+    value, style = "…", ""
+    if said := _flagged(snapshot, column):
+        value, style = said, "bold #ff6b6b"
+    elif means:
         mean, high = float(means[column].mean[0]), float(means[column].high[0])
         if mean > 0:
             value = f"{decibels(mean):.1f}±{decibels(high) - decibels(mean):.1f}"
         elif not math.isnan(mean):
             value = "below 0"
-    return Text(f"{name} {value}".replace("-", "−"), "reverse" if chosen else "")
+    text = Text(f"{name} {value}".replace("-", "−"), style)
+    if chosen:
+        text.stylize("reverse")
+    return text
 
 
-def progress_line(snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int) -> Text:
-    """Return how far the test is: a bar where there is a target, segments, c.o.v., time left."""
+def _flagged(snapshot: Snapshot, column: int) -> str:
+    """Say why most frequencies of a channel have no noise; nothing where they do."""
+    words = {Flag.DEAD_CHANNEL: "no signal", Flag.DUPLICATE: "a copy", Flag.NOT_FINITE: "no number"}
+    for noise in snapshot.results.values():
+        flags = noise.flags[1:-1, column]
+        for flag, word in words.items():
+            if 2 * np.count_nonzero(flags & flag) > flags.size:
+                return word
+    return ""
+
+
+def progress_line(
+    now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, since: float, width: int
+) -> Text:
+    """Return how far the test is: a bar where there is a target, segments, c.o.v., time left.
+
+    ``since`` is how many seconds ago the snapshot was made.
+    """
     method = next((m for m in choice.methods if m in snapshot.results), None)
     cov, target = reached_cov(snapshot, settings, method), settings.target_cov
+    waits = [sensor.name for sensor in now.sensors if sensor.is_lost] if not now.closed else []
     if snapshot.n_segments == 0:
-        return Text(f"waiting for the first {settings.segment:g} s segment", "#9aa5b8")
+        text = f"waits for the first {settings.segment:g} s segment"
+        if snapshot.n_dropped:
+            text += f" without gaps; {snapshot.n_dropped} left out"
+        return Text(text, "#9aa5b8")
     parts = [f"{snapshot.n_segments} segments"]
     if snapshot.n_dropped:
-        parts.append(f"{snapshot.n_dropped} dropped")
+        parts.append(f"{snapshot.n_dropped} left out")
     if not math.isnan(cov):
         parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
-    if target is not None:
-        reached = "target reached" if cov <= target else "target not reached"
-        parts.append(reached if snapshot.closed else time_left(snapshot.time_left))
+    left = None if snapshot.time_left is None else max(0.0, snapshot.time_left - since)
+    if snapshot.closed:
+        if target is not None:
+            parts.append("target reached" if cov <= target else "target not reached")
+    elif waits:
+        parts.append(f"waits for {', '.join(waits)}")
+    elif target is not None:
+        parts.append("target reached" if cov <= target else time_left(left))
     text = " · ".join(parts)
     line = Text()
     room = width - len(text) - 3
-    running = snapshot.time_left is not None and not snapshot.closed
-    if target is not None and running and room >= 8:
-        left = snapshot.time_left or 0.0
+    if target is not None and left is not None and not snapshot.closed and room >= 8:
         done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
         filled = round(done * room)
         line.append("━" * filled, "#4cc9f0")
-        line.append("━" * (room - filled), "#2b3345")
+        line.append("╌" * (room - filled), "#4a556b")
         line.append("  ")
     line.append(text)
     return line
+
+
+def alerts(now: Now) -> list[Text]:
+    """Return what is wrong with which sensor, and what to do; the worst first."""
+    found: list[tuple[int, str]] = []
+    for sensor in now.sensors:
+        if sensor.is_lost:
+            found.append((2 if sensor.state == "late" else 1, _what_to_do(sensor, now)))
+        elif sensor.stuck:
+            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.stuck)
+            found.append((3, f"{channels} stands still: no signal; check the cable to it"))
+        elif sensor.clips:
+            text = f"{sensor.name} is at the end of its range: segments with that are left out"
+            found.append((4, text))
+        if sensor.was_stuck:
+            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
+            found.append((5, f"{channels} stood still for a while: do not trust its noise"))
+    styles = {2: "yellow", 4: "yellow", 5: "yellow"}
+    return [Text(f"▲ {text}", styles.get(rank, "bold #ff6b6b")) for rank, text in sorted(found)]
+
+
+def _what_to_do(sensor: SensorNow, now: Now) -> str:
+    name, ago = sensor.name, clock_time(sensor.since)
+    if now.closed:
+        return f"{name} was lost {ago} before the end: {sensor.why}"
+    again = "retried by itself"
+    return {
+        "late": f"{name} is late: no block for {ago}",
+        "stalled": f"{name} sends nothing for {ago}: check power and cable; {again}",
+        "disconnected": f"{name} is disconnected for {ago}: check cable and power; {again}",
+        "refused": f"{name} is refused: {sensor.why}",
+        "silent": f"{name} is silent for {ago}: check power and cable",
+    }[sensor.state]
 
 
 def advice(snapshot: Snapshot, choice: Choice) -> Text:

@@ -1,0 +1,69 @@
+"""What the application says of clocks: what is left, whether it matters, how they drift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.tui.made import SETTINGS, empty_snapshot, made_snapshot
+from tui.application.clocks import clock_line, drift_lines, effect
+
+
+def test_effect_is_the_share_of_the_band_s_noise() -> None:
+    snapshot = made_snapshot()
+    share = np.zeros_like(snapshot.data_psd)
+    share[2:41, 3] = 0.2  # the band is 1 to 20 Hz, in steps of 0.5 Hz
+    share[41:, 4] = 0.9  # above it
+    snapshot = replace(
+        snapshot, diagnostics={"synchronisation": {"noise_bias": share, "residual": {}}}
+    )
+    shares = effect(snapshot, SETTINGS)
+    np.testing.assert_allclose(shares, [0, 0, 0, 0.2, 0, 0, 0, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("share", "said", "style"),
+    [
+        (0.0004, "no effect on noise (<0.1 %)", "green"),
+        (0.004, "negligible, 0.4 % of the noise", "green"),
+        (0.03, "small, 3.0 % of the noise", "yellow"),
+        (0.22, "they matter here, 22 % of the noise", "bold #ff6b6b"),
+    ],
+)
+def test_words_and_colour_say_whether_clocks_matter(share: float, said: str, style: str) -> None:
+    line = clock_line(made_snapshot(clock_share=share), SETTINGS, width=100)
+    assert line.plain.endswith(f": {said}")
+    assert line.spans[-1].style == style
+
+
+def test_line_says_most_where_there_is_room() -> None:
+    snapshot = made_snapshot()
+    wide, narrow = (clock_line(snapshot, SETTINGS, width=w).plain for w in (120, 60))
+    assert "A +5.9, B −9.1, C +4.0 ppm, within 0.6 µs, by motion" in wide
+    assert "A" not in narrow
+    assert "within 0.6 µs" in narrow
+    assert len(clock_line(snapshot, SETTINGS, width=78).plain) <= 78
+
+
+def test_clocks_that_are_one_or_unknown() -> None:
+    snapshot = made_snapshot()
+    shared = tuple(replace(clock, source="clock of lab") for clock in snapshot.clocks)
+    one = clock_line(replace(snapshot, clocks=shared), SETTINGS, width=78)
+    assert one.plain == "clocks: all sensors share one"
+    unknown = clock_line(replace(snapshot, clocks=()), SETTINGS, width=78)
+    assert unknown.plain == "clocks: not known yet"
+    early = clock_line(replace(empty_snapshot(), diagnostics={}), SETTINGS, width=100)
+    assert early.plain.endswith("effect not known yet")
+
+
+def test_drift_is_what_a_constant_rate_leaves() -> None:
+    lines = drift_lines(made_snapshot(), chosen="B", n_points=200)
+    assert [line.label for line in lines] == ["A", "C", "B"]  # the chosen one on top
+    *straight, bent = lines
+    for line in straight:
+        assert np.abs(line.y).max() < 1e-6
+    assert bent.x[-1] == pytest.approx(59 / 60)
+    assert np.ptp(bent.y) == pytest.approx(20, rel=0.01)  # µs
+    assert len(drift_lines(made_snapshot(), chosen="B", n_points=20)[0].x) <= 30

@@ -1,0 +1,176 @@
+"""What the application says of clocks: one line, a table, and how they drift; no Textual here."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from tui.application.curves import Line
+from tui.results import band_of
+
+if TYPE_CHECKING:
+    from daq.clock_model import ClockState
+    from daq.estimation import Settings, Snapshot
+    from tui.bands import FloatArray
+
+MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
+NOTHING, HARMLESS, MATTERS = 0.001, 0.01, 0.05
+"""Share of the noise that comes from the clocks: below it nothing, negligible, small."""
+COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
+_FEWEST_POINTS = 3
+
+
+def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
+    """Return which share of each channel's noise in the band is expected to come from clocks.
+
+    Shape (n_channels,); NaN where it is not known (yet).
+    """
+    share = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
+    if share is None or not snapshot.results:
+        return np.full(len(snapshot.channels), np.nan)
+    low, high = band_of(settings, snapshot.frequency)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    noise = next(iter(snapshot.results.values())).noise_psd[inside]
+    added = np.where(np.isfinite(share[inside] * noise), share[inside] * np.abs(noise), 0.0)
+    total = np.nansum(noise, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
+
+
+def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
+    """Return one line on the clocks: rates, what is left between them, and whether it matters."""
+    clocks = snapshot.clocks
+    free = [clock for clock in clocks if clock.source in {"arrival times", "device UTC"}]
+    if settings.clocks == "nominal":
+        return Text("clocks: samples taken at face value", DOUBTFUL)
+    if not clocks:
+        return Text("clocks: not known yet", MUTED)
+    if not free:
+        shared = all(clock.source.startswith("clock of") for clock in clocks)
+        said = "all sensors share one" if shared else "the time of every sample is known"
+        return Text(f"clocks: {said}", MUTED)
+    words, style = _verdict(snapshot, settings)
+    left = f"within {microseconds(max(residuals(snapshot).values()))}"
+    by = "by motion" if any(clock.refined for clock in free) else "by arrival times"
+    rates = ", ".join(f"{clock.sensor} {_ppm(clock.ppm)}" for clock in free) + " ppm"
+    span = f"{_ppm(min(c.ppm for c in free))} … {_ppm(max(c.ppm for c in free))} ppm"
+    start = "clocks "
+    for parts in ((rates, left, by), (rates, left), (span, left), (left,)):
+        text = start + ", ".join(part for part in parts if part) + ": "
+        if len(text) + len(words) <= width:
+            break
+    return Text.assemble((text, MUTED), (words, style))
+
+
+def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
+    shares = effect(snapshot, settings)
+    if not np.isfinite(shares).any():
+        return "effect not known yet", MUTED
+    worst = float(np.nanmax(shares))
+    if worst < NOTHING:
+        return f"no effect on noise ({percent(worst)})", GOOD
+    if worst < HARMLESS:
+        return f"negligible, {percent(worst)} of the noise", GOOD
+    if worst < MATTERS:
+        return f"small, {percent(worst)} of the noise", DOUBTFUL
+    return f"they matter here, {percent(worst)} of the noise", BAD
+
+
+def residuals(snapshot: Snapshot) -> dict[str, float]:
+    """Return what is left between the clocks in seconds rms, by sensor.
+
+    Where the motion measures it, it is against the reference sensor, which has none itself.
+    """
+    known = snapshot.diagnostics.get("synchronisation", {}).get("residual")
+    return {clock.sensor: clock.residual for clock in snapshot.clocks} if known is None else known
+
+
+def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:
+    """Return a row per sensor: rate, wander, what is left, by what it is known, what it does."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
+    table.add_column("clock", no_wrap=True)
+    wide = width >= 76
+    for title in ("rate, ppm", *(("wander",) if wide else ()), "left", "of noise"):
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("known by", no_wrap=True)
+    shares, left = effect(snapshot, settings), residuals(snapshot)
+    by_motion = any(clock.refined for clock in snapshot.clocks)
+    names = [label.sensor for label in snapshot.channels]
+    for number, clock in enumerate(snapshot.clocks):
+        mine = [share for share, name in zip(shares, names, strict=True) if name == clock.sensor]
+        known = [share for share in mine if math.isfinite(share)]
+        share = max(known, default=math.nan)
+        name = Text(f"━ {clock.sensor}", _colour(number))
+        if clock.sensor == chosen:
+            name.stylize("reverse", 2)
+        rate = _ppm(clock.ppm) + (f" ±{clock.ppm_std:.2g}" if clock.ppm_std > 0 else "")
+        wander = f"{clock.wander_ppm:.2g} ppm" if clock.wander_ppm > 0 else "–"
+        style = GOOD if share < HARMLESS else DOUBTFUL if share < MATTERS else BAD
+        table.add_row(
+            name,
+            rate,
+            *((wander,) if wide else ()),
+            microseconds(left[clock.sensor]) if left.get(clock.sensor, 0.0) > 0 else "–",
+            Text(percent(share), style) if known else Text("?", MUTED),
+            _source(clock, by_motion=by_motion),
+        )
+    return table
+
+
+def _source(clock: ClockState, *, by_motion: bool) -> str:
+    restarts = f", {clock.n_epochs - 1} restarts" if clock.n_epochs > 1 else ""
+    motion = " and motion" if clock.refined else ", the reference" if by_motion else ""
+    return f"{clock.source}{motion}{restarts}"
+
+
+def drift_title(snapshot: Snapshot) -> str:
+    """Return what the plot of the drift shows."""
+    if len(snapshot.drift) < _FEWEST_POINTS:
+        return "clock drift: seen from the third segment on"
+    return "clock drift: lag of each clock, its constant rate taken out"
+
+
+def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]:
+    """Return each clock's lag over time, a straight line taken out; the chosen sensor's on top.
+
+    Minutes and microseconds; at most one point per column.
+    """
+    drift = snapshot.drift
+    if len(drift) < _FEWEST_POINTS:
+        return []
+    step = max(1, len(drift) // n_points)
+    minutes = drift[::step, 0] / 60
+    lines = []
+    for number, clock in enumerate(snapshot.clocks):
+        lag = drift[:, 1 + number]
+        straight = np.polynomial.Polynomial.fit(drift[:, 0], lag, 1)
+        left = (lag - straight(drift[:, 0]))[::step] * 1e6
+        lines.append(Line(clock.sensor, _colour(number), minutes, left))
+    return sorted(lines, key=lambda line: line.label == chosen)
+
+
+def _colour(number: int) -> str:
+    return COLOURS[number % len(COLOURS)]
+
+
+def _ppm(value: float) -> str:
+    return "?" if math.isnan(value) else f"{value:+.1f}".replace("-", "−")
+
+
+def microseconds(seconds: float) -> str:
+    """Return a short time as people say it."""
+    if math.isnan(seconds):
+        return "?"
+    value, unit = (seconds * 1e6, "µs") if seconds < 1e-3 else (seconds * 1e3, "ms")
+    return f"{value:.0f} {unit}" if value >= 10 else f"{value:.1f} {unit}"
+
+
+def percent(share: float) -> str:
+    """Return a share as percent, to what makes sense."""
+    if share < NOTHING:
+        return "<0.1 %"
+    return f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"

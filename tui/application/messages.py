@@ -1,0 +1,107 @@
+"""What the application's threads tell it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from textual.message import Message
+
+from daq.errors import HuddleError
+
+if TYPE_CHECKING:
+    import threading
+    from pathlib import Path
+
+    from textual.app import App
+
+    from daq.estimation import Settings, Snapshot
+    from tui.application.controls import Controls
+    from tui.state import Now
+
+
+@dataclass
+class Following(Message):
+    """A recording is there, and is followed from now on."""
+
+    path: Path
+
+
+@dataclass
+class Looked(Message):
+    """How the recording and its sensors are doing."""
+
+    now: Now
+
+
+@dataclass
+class Fresh(Message):
+    """A snapshot came, made with these settings."""
+
+    snapshot: Snapshot
+    settings: Settings
+
+
+@dataclass
+class Progress(Message):
+    """How far the result of the whole recording is, in segments."""
+
+    done: int
+    total: int
+
+
+@dataclass
+class Trouble(Message):
+    """Something failed; the text says what, and what to do."""
+
+    text: str
+    ended: bool = False
+    """Whether the recording is not followed any more."""
+
+
+class Messenger:
+    """Makes messages of what the following thread sees, as long as that recording is followed.
+
+    Parameters
+    ----------
+    app : App
+        Is posted the messages.
+    controls : Controls
+        Keeps the result of a recording whose end is seen.
+    path : Path
+        The recording.
+    ended : threading.Event
+        Set when nobody wants to know any more.
+    """
+
+    def __init__(
+        self, app: App[None], controls: Controls, *, path: Path, ended: threading.Event
+    ) -> None:
+        self._app, self._controls, self._path, self._ended = app, controls, path, ended
+        self._was_open = False
+
+    def look(self, now: Now) -> None:
+        """Tell how the sensors are doing."""
+        self._was_open |= not now.closed
+        self._post(Looked(now))
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Show an estimate, and keep it if it is the result."""
+        self._post(Fresh(snapshot, settings))
+        if snapshot.closed and self._was_open:
+            try:
+                self._controls.keep(self._path, snapshot)
+            except (HuddleError, OSError) as error:
+                self._post(Trouble(str(error)))
+
+    def progress(self, done: int, total: int) -> None:
+        """Tell how far the result is."""
+        self._post(Progress(done, total))
+
+    def trouble(self, text: str) -> None:
+        """Tell that it is not followed any more, and why."""
+        self._post(Trouble(text, ended=True))
+
+    def _post(self, message: Message) -> None:
+        if not self._ended.is_set():
+            self._app.post_message(message)
