@@ -100,6 +100,14 @@ class AlignedRecording:
         return tuple(source.clock.state for source in self._sources if source.clock)
 
     @property
+    def of_reference(self) -> tuple[bool, ...]:
+        """Which sensors run by the clock that the others are measured against."""
+        if not self._sources:
+            return ()
+        name = self._sources[self._reference].clock_name
+        return tuple(source.clock_name == name for source in self._sources)
+
+    @property
     def n_available(self) -> int:
         """Grid samples that can be read now."""
         if self._start is None:
@@ -196,6 +204,7 @@ class AlignedRecording:
                     end_sample=source.end_sample,
                     sampling_rate=rate,
                     first=round(source.arrivals.start * rate),
+                    residual=math.nan,
                 )
             return
         together = len({source.clock_name for source in sources}) == 1 and not any(

@@ -27,6 +27,7 @@ its nominal rate.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ import numpy as np
 
 from daq.clock_filter import Observations, smooth
 from daq.clock_model import Clock, ClockState, Epoch
+from daq.polling import Polls
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
@@ -97,6 +99,7 @@ class ArrivalTimes:
     _epoch: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _end_sample: int = 0
     _device_utc: bool = False
+    _polls: Polls = field(default_factory=Polls)
     _lowest: float = np.inf
 
     def add(self, blocks: NDArray[Any]) -> None:
@@ -123,6 +126,8 @@ class ArrivalTimes:
             index = first + length - 1
             elapsed = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
         late = elapsed - index / self.sampling_rate
+        if not self._device_utc:
+            self._polls.add(index, late)
         if self._device_utc:
             step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
             breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
@@ -241,10 +246,15 @@ class ArrivalTimes:
             from_samples=variance > 0,
             restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
         )
-        smoothed = smooth(observations)
-        residual = float(np.sqrt(np.mean(smoothed.std**2)))
+        # Within one step of polled latencies nothing is seen of a clock, for a whole beat.
+        step = self._polls.step(slope)
+        beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
+        hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
+        smoothed = smooth(observations, least_noise=hidden)
+        residual = smoothed.varying
         refined = bool(observations.from_samples.any())
-        if refined and residual > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
+        known_to = float(np.sqrt(np.mean(smoothed.std**2)))
+        if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
             return self._filtered(sensor, slope, anchors, None)
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs = []

@@ -18,6 +18,7 @@ Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -70,7 +71,10 @@ class Smoothed:
     lateness, rate : float64, shape (n,)
         Lateness in s, and its rate in s/s.
     std : float64, shape (n,)
-        Standard deviation in s of the lateness, up to a constant where samples were observed.
+        Standard deviation in s of the lateness; of that with the constant where samples were
+        observed.
+    varying : float
+        The same in s rms, of what is not constant.
     constant : float
         By how much observations from the samples lie above those from arrivals, in s.
     walk, noise : float
@@ -80,33 +84,39 @@ class Smoothed:
     lateness: FloatArray
     rate: FloatArray
     std: FloatArray
+    varying: float
     constant: float
     walk: float
     noise: float
 
 
-def smooth(observations: Observations) -> Smoothed:
+def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     """Return the most likely clock.
 
     Parameters
     ----------
     observations : Observations
         At least one.
+    least_noise : float
+        Standard deviation of arrivals, in s, that they have at least.
     """
     walks, noises = (grid.ravel() for grid in np.meshgrid(_WALKS, _NOISES, indexing="ij"))
+    noises = np.maximum(noises, least_noise)
     likelihood = _filter(observations, walks, noises, None)
     best = int(np.argmax(likelihood))
     walk, noise = float(walks[best]), float(noises[best])
     track = _Track.empty(len(observations.seconds))
     _filter(observations, walks[best : best + 1], noises[best : best + 1], track)
     state, covariance = _backwards(track)
-    variance = covariance[:, 0, 0]
+    variance = alone = covariance[:, 0, 0]
     if observations.from_samples.any():
-        variance = variance + 2 * covariance[:, 0, 2] + covariance[:, 2, 2]
+        variance = alone + 2 * covariance[:, 0, 2] + covariance[:, 2, 2]
     return Smoothed(
         lateness=state[:, 0],
         rate=state[:, 1],
         std=np.sqrt(np.maximum(variance, 0.0)),
+        # Whatever constant is taken out, what varies is no more than is left.
+        varying=math.sqrt(max(min(alone.mean(), variance.mean()), 0.0)),
         constant=float(state[-1, 2]),
         walk=walk,
         noise=noise,

@@ -68,7 +68,8 @@ class ClockState:
     ----------
     sensor : str
     source : str
-        "arrival times", "device UTC", "sample instants", or "clock of …" for a shared one.
+        "arrival times", "device UTC", "sample instants", "nominal rate", or "clock of …" for a
+        shared one.
     offset : float
         Time of the first sample in seconds from the recording's origin.
     ppm, ppm_std : float
@@ -77,7 +78,7 @@ class ClockState:
         Standard deviation of the rate's change over the recording, in ppm.
     residual : float
         What is left between clock and truth, in seconds rms: predicted, or measured where the
-        common motion allows it.
+        common motion allows it; NaN where nobody knows.
     n_epochs : int
         One, plus the number of restarts.
     refined : bool
@@ -185,12 +186,18 @@ def from_instants(
 
 
 def nominal(
-    sensor: str, source: str, *, end_sample: int, sampling_rate: float, first: int = 0
+    sensor: str,
+    source: str,
+    *,
+    end_sample: int,
+    sampling_rate: float,
+    first: int = 0,
+    residual: float = 0.0,
 ) -> Clock:
     """Return the clock that *is* the timeline: sample n is taken at (first + n) / sampling_rate."""
     index = np.array([0.0, max(float(end_sample), 1.0)])
     epoch = Epoch(0, end_sample, index, (first + index) / sampling_rate)
-    state = ClockState(sensor, source, epoch.start, 0.0, 0.0, 0.0, 0.0, 1)
+    state = ClockState(sensor, source, epoch.start, 0.0, 0.0, 0.0, residual, 1)
     return Clock((epoch,), state)
 
 

@@ -11,8 +11,8 @@ that maximises
 
 which is least squares weighted by what the prediction leaves over: frequencies without coherent
 signal do not count. The maximum is searched for on a grid and polished by Newton's method. Its
-variance is ``κ / (2 Σ ω² (P X_0)^H R^-1 P X_0)``, with κ for the correlation of neighbouring
-frequencies under the window.
+variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, with κ for the correlation of neighbouring
+frequencies under the window, and s the share of that sum which P's own noise does not account for.
 
 P is averaged over segments already freed of their delays. The first batch does so by iteration and
 thereby defines a frame; later batches are measured in that frame, which makes the delays of a whole
@@ -184,8 +184,12 @@ class DelayMeter:
         kappa = len(w2) * float(w2 @ w2) / float(w2.sum()) ** 2
         total = energy.sum(axis=0)
         met = (crossed * _turn(omega, tau)).real.sum(axis=0)
-        with np.errstate(divide="ignore"):
-            std = np.sqrt(kappa / (2 * (omega**2 @ energy)))
+        informative = omega**2 @ energy
+        # Of P's own noise, which predicts nothing: the mean of Wishart matrices has d0 dj / n.
+        spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = max(1 - spurious / float(informative.mean()), 0.0)
+            std = np.sqrt(kappa / (2 * informative)) / share
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.clock_model import ClockState
 from daq.estimation import estimate
+from daq.estimation.diagnosis import synchronisation
 from tui.clock_study import Latency, free_running, residuals, study, synthesise
 from tui.command import app
 
@@ -62,6 +64,37 @@ def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> 
     # Coherent power over noise is the SNR, for a channel that sees the weaker direction.
     expected = (2 * np.pi * 80 * told[2]) ** 2 * 1e4
     assert stated["noise_bias"][at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
+
+
+def test_a_clock_that_samples_could_not_refine_is_as_far_off_as_the_arrivals_leave_it() -> None:
+    states = [
+        ClockState(name, "arrival times", 0.0, 0.0, 0.0, 0.0, residual, 1, refined)
+        for name, residual, refined in (("A", 3e-6, False), ("B", 1e-6, True), ("C", 4e-6, False))
+    ]
+    told = synchronisation(
+        states,
+        (True, False, False),
+        dims=(1, 1, 1),
+        frequency=np.empty(0),
+        csm=np.empty((0, 3, 3), complex),
+        results={},
+    )
+    assert told["residual"] == pytest.approx({"A": 0.0, "B": 1e-6, "C": 5e-6})
+
+
+def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None:
+    latency = Latency("batching", 16e-3)
+    left, told = [], []
+    for seed in range(3):
+        scenario = free_running(snr=0.3, duration=200.0, seed=seed)
+        path = synthesise(
+            tmp_path / f"{seed}.h5", scenario, duration=200.0, latency=latency, seed=seed
+        )
+        snapshot = estimate([path])
+        stated = snapshot.diagnostics["synchronisation"]["residual"]
+        left += residuals(snapshot, scenario).tolist()
+        told += [stated[name] for name in scenario.names[1:]]
+    assert np.all(np.array(left) < 2 * np.array(told))
 
 
 def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:

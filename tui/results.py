@@ -85,7 +85,8 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
     width = np.gradient(snapshot.frequency)[inside]
     data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
     for number, label in enumerate(snapshot.channels):
-        row = [label.sensor, label.channel, level(float(data[number]))]
+        power = float(data[number])
+        row = [label.sensor, label.channel, "no signal" if power == 0 else level(power)]
         for means in columns:
             mean = means[number]
             row.append(level_with_error(float(mean.mean[0]), float(mean.high[0])))
@@ -114,7 +115,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
     fitted = [clock for clock in snapshot.clocks if clock.source == "arrival times"]
     if fitted:
         rates = ", ".join(f"{clock.sensor} {clock.ppm:+.1f} ppm" for clock in fitted)
-        worst = max(clock.residual for clock in fitted) * 1e6
+        left = snapshot.diagnostics["synchronisation"]["residual"]  # between them
+        worst = max(left[clock.sensor] for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
     if "two-channel" in snapshot.results:
@@ -122,8 +124,9 @@ def remarks(snapshot: Snapshot) -> list[str]:
             "two-channel: takes like channels to point the same way, and their gains as given "
             "(--gain) or alike"
         )
+    named = any("share of frequencies" in a.numbers for a in snapshot.diagnostics.get("advice", ()))
     for method, noise in snapshot.results.items():
-        lines += flagged(snapshot, method)
+        lines += flagged(snapshot, method, besides=_NAMED if named else 0)
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
@@ -147,17 +150,24 @@ def left_out(snapshot: Snapshot) -> str:
     return ": " + ", ".join(f"{count} {words[reason]}" for reason, count in counts.items())
 
 
-def flagged(snapshot: Snapshot, method: str) -> list[str]:
-    """Return which channels have frequencies at which nothing can be said, and why."""
+_NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # with its advice, once for all methods
+
+
+def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
+    """Return which channels have frequencies at which nothing can be said, and why.
+
+    ``besides`` are flags that have been named already.
+    """
     words = {
         Flag.DEAD_CHANNEL: "no signal",
         Flag.DUPLICATE: "a copy of another channel",
         Flag.NOT_FINITE: "not finite",
-        Flag.SINGULAR: "the matrix is singular",
+        Flag.SINGULAR: "nothing can be said, as other channels are missing or do not move enough "
+        "to compare with (the matrix is singular)",
         Flag.NO_COUNTERPART: "the other sensors have too few channels to compare with",
         Flag.NOT_CONVERGED: "the iteration did not reach the maximum",
     }
-    flags = snapshot.results[method].flags[1:-1]
+    flags = snapshot.results[method].flags[1:-1] & ~besides
     lines = []
     for flag, why in words.items():
         counts = ((flags & flag) != 0).sum(axis=0)
@@ -167,7 +177,9 @@ def flagged(snapshot: Snapshot, method: str) -> list[str]:
                 for label, count in zip(snapshot.channels, counts, strict=True)
                 if count
             )
-            lines.append(f"{method}: {names}: {why}, at {counts.max()} of {len(flags)} frequencies")
+            most = counts.max()
+            at = "all frequencies" if most == len(flags) else f"{most} of {len(flags)} frequencies"
+            lines.append(f"{method}: {names}: {why}, at {at}")
     return lines
 
 

@@ -28,6 +28,8 @@ _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
 def synchronisation(
     clocks: Sequence[ClockState],
+    of_reference: Sequence[bool],
+    *,
     dims: tuple[int, ...],
     frequency: FloatArray,
     csm: ComplexArray,
@@ -35,13 +37,16 @@ def synchronisation(
 ) -> dict[str, Any]:
     """Say what is left between the clocks, and what it does to the noise estimate.
 
-    A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the
-    common motion, and so into its noise.
+    `of_reference` says which sensors run by the clock that others are measured against. A delay
+    that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common motion,
+    and so into its noise.
     """
     residual = np.array([state.residual for state in clocks])
     refined = np.array([state.refined for state in clocks], dtype=bool)
     if refined.any():  # what counts is the delay against the reference, however late all are
-        residual = np.where(refined, residual, 0.0)
+        reference = np.array(of_reference, dtype=bool)
+        residual = np.where(refined, residual, np.hypot(residual, residual[reference].max()))
+        residual[reference] = 0.0
     found: dict[str, Any] = {
         "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
     }

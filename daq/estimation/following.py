@@ -202,7 +202,12 @@ class Estimation:
         estimates = self._estimates(bands, final=final)
         diagnostics: dict[str, Any] = {
             "synchronisation": synchronisation(
-                last.aligned.clocks, dims, frequency, csm, estimates.results
+                last.aligned.clocks,
+                last.aligned.of_reference,
+                dims=dims,
+                frequency=frequency,
+                csm=csm,
+                results=estimates.results,
             )
         }
         if estimates.dimensions is not None and estimates.dimensions.chosen:
@@ -280,9 +285,12 @@ class Estimation:
                 f" takes {self.settings.segment:g} s; record longer or choose a shorter segment"
             )
         if snapshot.results:
+            advice = snapshot.diagnostics.get("advice", ())
+            why = [f"{each.text} {each.remedy}" for each in advice if each.level != "note"]
             return (
-                f"{names}: nothing can be said of any channel at any frequency: they have no signal"
-                " or are copies of each other; look at the samples and the bench file"
+                f"{names}: nothing can be said of any channel at any frequency by "
+                f"{', '.join(snapshot.results)}: "
+                + (" ".join(why) or "look at the samples and the bench file")
             )
         return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
 

@@ -9,6 +9,7 @@ import pytest
 
 from daq.arrival_times import ArrivalTimes, MeasuredDelays, supporting_line
 from daq.clock_filter import Observations, smooth
+from daq.polling import Polls
 from daq.protocols.block import BlockFlag
 from daq.recording.layout import BLOCK_DTYPE
 
@@ -183,3 +184,40 @@ def test_the_smoother_states_its_own_error() -> None:
     # Some 40 independent stretches a run: the mean of 400 squares is 1 ± 0.07; the grid's
     # half decades of walk and noise allow a third more or less.
     assert 0.6 < np.mean(spread) < 1.5
+
+
+@pytest.mark.parametrize("block", [1, 5, 20, 200])
+@pytest.mark.parametrize("ppm", [0.0, 15.0, -20.0])
+def test_polls_show_in_the_latencies(block: int, ppm: float) -> None:
+    rng = np.random.default_rng(10)
+    index = block * np.arange(1.0, 3001.0) - 1
+    taken = index / (RATE * (1 + ppm * 1e-6)) + 0.0421
+
+    def step(arrivals: np.ndarray, pieces: int) -> float:
+        polls = Polls()
+        for rows in np.array_split(np.arange(len(index)), pieces):
+            polls.add(index[rows], arrivals[rows] - index[rows] / RATE)
+        return polls.step(-ppm * 1e-6 / RATE)
+
+    assert step(taken + rng.exponential(1e-3, 3000), 7) == 0.0
+    polled = np.ceil(taken / 16e-3) * 16e-3 + rng.exponential(5e-5, 3000)
+    # Blocks of whole samples of 5 ms meet polls of 16 ms at so many phases.
+    expected = {1: 1e-3, 5: 1e-3, 20: 4e-3, 200: 8e-3}[block]
+    assert step(polled, 1) == pytest.approx(expected, rel=0.2)
+    assert step(polled, 7) == step(polled, 1)
+
+
+@pytest.mark.parametrize("n_blocks", [1800, 6000, 36_000])
+def test_what_polls_hide_of_a_clock_is_not_claimed(n_blocks: int) -> None:
+    covered = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        for ppm in (0.3, 15.0, -20.0):
+            taken = last_samples(n_blocks, ppm)
+            phase = rng.uniform(0.0, 16e-3)
+            arrivals = np.ceil((taken - phase) / 16e-3) * 16e-3 + phase
+            clock = solved(block_rows(arrivals + rng.exponential(5e-5, n_blocks)))
+            index = BLOCK * np.arange(1.0, n_blocks + 1) - 1
+            covered.append(np.std(clock.at(index) - taken) < 2 * clock.state.residual)
+            assert clock.state.residual < 5e-3
+    assert np.mean(covered) >= 0.9
