@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from daq.formats.response import Responses
 
 DELIMITED = frozenset({".csv", ".tsv", ".txt"})
-BLOCK_ROWS = 16384
-"""Samples per block and per chunk: such chunks read fast."""
+BLOCK_ROWS = 4096
+"""Samples per block and per chunk: long enough to read fast, and little is read twice."""
 
 
 @dataclass(frozen=True, slots=True)

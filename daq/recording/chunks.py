@@ -1,8 +1,8 @@
 """Reads many small chunks of a dataset at once, by several threads if there are several.
 
 HDF5 takes one lock for the whole process while it reads, decompression included. Here it only
-fetches the chunks as they are in the file; :mod:`zlib` decompresses them without a lock, and numpy
-puts the bytes of all of them back in their places at once.
+fetches the chunks as they are in the file; ISA-L decompresses them without a lock, in little more
+than half of zlib's time, and numpy puts the bytes of all of them back in their places at once.
 
 That a chunk is whole is told by the Adler-32 in its zlib stream, over the bytes that come out. The
 Fletcher-32 that HDF5 puts behind the stream, over the bytes that went in, says no more.
@@ -10,17 +10,16 @@ Fletcher-32 that HDF5 puts behind the stream, over the bytes that went in, says 
 
 from __future__ import annotations
 
-import zlib
 from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
+from isal import isal_zlib
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
-_FEWEST = 8  # chunks that are worth it: of few long ones HDF5 remembers the last
 
 
 class ChunkedRows:
@@ -50,7 +49,7 @@ class ChunkedRows:
         OSError, RuntimeError
             If the file is damaged there.
         """
-        if self._direct and last_row - first_row >= _FEWEST * self._length:
+        if self._direct and last_row - first_row >= self._length:  # of parts HDF5 keeps the rest
             rows = self._decompressed(first_row, last_row)
             if rows is not None:
                 return rows
@@ -65,8 +64,9 @@ class ChunkedRows:
             if any(skipped for skipped, _ in stored):  # compressed, it would have been longer
                 return None
             # What follows the stream is not looked at.
-            chunks = [zlib.decompress(content, zlib.MAX_WBITS, n_bytes) for _, content in stored]
-        except (OSError, RuntimeError, zlib.error):
+            inflate, bits = isal_zlib.decompress, isal_zlib.MAX_WBITS
+            chunks = [inflate(content, bits, n_bytes) for _, content in stored]
+        except (OSError, RuntimeError, isal_zlib.error):  # type: ignore[misc]  # a class: its stub says instance
             return None
         if any(len(chunk) != n_bytes for chunk in chunks):
             return None
