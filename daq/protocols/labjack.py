@@ -217,6 +217,8 @@ class StreamDecoder:
         self._transactions: SampleCounter | None = None
         self._packet_size = 0
         self._recovering = False
+        self._newest: int | None = None  # timer of the last scan that came
+        self._newest_ns = 0  # when it did
         self.fatal: int | None = None
         """The status that ended the stream, if one did."""
         self.complete = False
@@ -272,6 +274,8 @@ class StreamDecoder:
             found.append(Event(self._name, "overflow", "the device's buffer overflowed (2940)", at))
         self._recovering = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
+        if packet.status != AUTO_RECOVER_END:  # which may begin with a scan of 0xFFFF
+            scans = scans[self._n_repeated(scans, at) :]
         if packet.status == AUTO_RECOVER_END:
             before, scans = self._around_dummy(scans)
             rows.append(before)
@@ -333,7 +337,6 @@ class StreamDecoder:
         """Make the scans gathered so far into a block for each sensor."""
         scans = np.concatenate(rows) if rows else np.empty((0, self._n_columns), np.uint16)
         rows.clear()
-        scans = scans[self._n_repeated(scans) :]
         if not len(scans):
             return []
         counter = self._place(scans, at)
@@ -350,14 +353,22 @@ class StreamDecoder:
             blocks.append(Block(name, first, counts, at, counter, own, reason))
         return blocks
 
-    def _n_repeated(self, scans: NDArray[np.uint16]) -> int:
+    def _n_repeated(self, scans: NDArray[np.uint16], at: HostTime) -> int:
         """Return how many scans lead that the timer says came before, when their packet did."""
-        if not self._timed or self._timer is None or not len(scans):
+        if not self._timed or not len(scans):
             return 0
-        if self._flags & BlockFlag.CLOCK_RESTART:  # nothing of a new stream came before
-            return 0
-        behind = (self._timer - _timer(scans[0])) % _WRAP
-        return behind // self._ticks + 1 if behind < REPEATED * CORE_HZ else 0
+        first, last = _timer(scans[0]), _timer(scans[-1])
+        before, n_repeated = self._newest, 0
+        if (last - first) % _WRAP == (len(scans) - 1) * self._ticks:  # else it is no timer
+            self._newest = last
+        if before is not None and (at.monotonic_ns - self._newest_ns) * 1e-9 < MOST_DOUBT:
+            behind = (before - first) % _WRAP
+            if behind < REPEATED * CORE_HZ:
+                n_repeated = min(behind // self._ticks + 1, len(scans))
+                if n_repeated == len(scans):
+                    self._newest = before
+        self._newest_ns = at.monotonic_ns
+        return n_repeated
 
     def _place(self, scans: NDArray[np.uint16], at: HostTime) -> int | None:
         """Put the scans in their place by timer or host time; return the timer of the first."""

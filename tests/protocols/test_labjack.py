@@ -421,3 +421,17 @@ def test_a_packet_that_comes_again_late_is_known_by_its_timer() -> None:
         found = decoder.receive(labjack.encode_packet(packet), at)
         blocks += [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 20), (20, 20), (40, 20)]
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_packet_that_comes_again_and_again_is_taken_once(together: bool) -> None:
+    """After a pause of the host its number alone could be that of a device restarted."""
+    line = packets(scans(0, 400), 120)
+    receiver = decoder()
+    found = receiver.receive(b"".join(line[:10]), at(0.2))
+    again = [*line[10:12], line[11], line[11], line[12]]
+    for k, packet in enumerate([b"".join(again)] if together else again):
+        found += receiver.receive(packet, at(9 + k / 100))
+    found += receiver.receive(b"".join(line[13:]), at(9.2))
+    _, blocks, _ = of("A", found)
+    assert indices(blocks) == list(range(400))
