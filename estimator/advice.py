@@ -18,7 +18,8 @@ import numpy as np
 
 from estimator.presence import presence
 from estimator.self_noise import Flag
-from estimator.wording import Advice, in_hz, listed, percent, signed
+from estimator.stance import stance
+from estimator.wording import Advice, in_hz, listed, percent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["Advice", "advise"]
 
 REJECT = 0.01
-TURNED_DEG = 0.5
-SKEWED_DEG = 2.0
-GAIN = 0.02
-DELAY_SAMPLES = 0.1
 TYPICAL = 10.0
 CROSSING = 20.0
 CROSSING_THREE = 100.0
@@ -85,7 +82,7 @@ def advise(
         *(
             advice
             for response in responses
-            for advice in _stance(response, names, channels, dims, nyquist)
+            for advice in stance(response, names, channels, dims, nyquist)
         ),
     ]
     order = {"problem": 0, "warning": 1, "note": 2}
@@ -156,14 +153,16 @@ def _absent(
             "problem",
             there.sensors,
             None,
-            f"{who} a signal of their own: motion and noise cannot be told apart without knowing "
-            "how the sensors stand, and neither the common motion nor alignment can be tested. "
-            "What is certain: no channel's noise is above its own spectrum.",
+            f"{who} a signal of their own: whether one motion is common to all cannot be tested, "
+            "and how the sensors stand cannot be measured. What is certain: no channel's noise is "
+            "above its own spectrum.",
             {"sensors": float(len(left))},
-            "Two sensors allow the two-channel method (--method two-channel), if like channels "
-            "point the same way and their gains are known (--gain): a gain wrong by 1 % leaves "
-            "1 % of the motion in the noise, a channel turned by 1° leaves 0.03 % of the motion "
-            "across it. For more than that mend or exchange the third sensor."
+            "Two methods are left. Two-channel (--method two-channel), if like channels point the "
+            "same way and their gains are known (--gain): a gain wrong by 1 % leaves 1 % of the "
+            "motion in the noise, a channel turned by 1° leaves 0.03 % of the motion across it. "
+            "Maximum likelihood (--method maximum-likelihood) needs neither, but says the less the "
+            "better the two are aligned: its interval shows how much. For more mend or exchange "
+            "the third sensor."
             if len(left) == 2
             else "Mend or exchange sensors until three have a signal.",
         )
@@ -308,76 +307,4 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
             "most): the spectra are nearly the noise itself, and neither alignment nor method "
             "matters much.",
             {"SNR": snr},
-        )
-
-
-def _stance(
-    response: RelativeResponse,
-    names: tuple[str, ...],
-    channels: tuple[str, ...],
-    dims: tuple[int, ...],
-    nyquist: float,
-) -> Iterator[Advice]:
-    pair = (response.first, response.second)
-    band = (response.low, response.high)
-    one, two = (names[sensor] for sensor in pair)
-    own = [f"{two}.{name}" for name in channels[sum(dims[: pair[1]]) :][: dims[pair[1]]]]
-    like = [f"{one}.{name}" for name in channels[sum(dims[: pair[0]]) :][: dims[pair[0]]]]
-    error = response.angle_error_deg
-    if response.rotation_deg > max(TURNED_DEG, 3 * error if np.isfinite(error) else 0.0):
-        horizontal = response.horizontal_deg
-        where = f" ({signed(horizontal, '.2f')}° in the horizontal)"
-        yield Advice(
-            "note",
-            pair,
-            band,
-            f"Sensors {one} and {two} are turned by {response.rotation_deg:.1f}°"
-            f"{where if np.isfinite(horizontal) else ''}: no bias in the three-sensor or maximum "
-            "likelihood estimate, but a three-channel or two-channel estimate leaks motion.",
-            {"angle_deg": response.rotation_deg, "horizontal_deg": horizontal, "error_deg": error},
-            "Aligning them can improve precision.",
-        )
-    if response.nonorthogonality_deg > SKEWED_DEG:
-        yield Advice(
-            "warning" if response.nonorthogonality_deg > 20 else "note",
-            pair,
-            band,
-            f"Channels of sensors {one} or {two} are {response.nonorthogonality_deg:.1f}° away "
-            "from a right angle: no bias, but the noise estimate scatters more the more "
-            "collinear they are.",
-            {"nonorthogonality_deg": response.nonorthogonality_deg},
-            "Channels at right angles are best.",
-        )
-    for channel in response.reversed_channels:
-        yield Advice(
-            "warning",
-            pair,
-            band,
-            f"{own[channel]} has the opposite polarity of {like[channel]}: no bias in the "
-            "three-sensor or maximum likelihood estimate, but its sensitivity has the wrong sign.",
-            {"channel": float(channel + 1)},
-            "Give it the opposite sign in the bench file, or swap its wires.",
-        )
-    off = int(np.argmax(np.abs(response.gains - 1)))
-    if abs(response.gains[off] - 1) > GAIN:
-        yield Advice(
-            "note",
-            pair,
-            band,
-            f"{own[off]} reads {response.gains[off]:.3f} times what {like[off]} would: no bias, "
-            "but one of the two sensitivities is wrong, and with it the noise in physical units.",
-            {"gain": float(response.gains[off])},
-            "Look at the sensitivities in the bench file.",
-        )
-    samples = response.delay * 2 * nyquist
-    if abs(samples) > DELAY_SAMPLES:
-        late, early = (two, one) if samples > 0 else (one, two)
-        yield Advice(
-            "warning",
-            pair,
-            band,
-            f"Sensor {late} lags sensor {early} by {abs(response.delay) * 1e3:.3g} ms "
-            f"({abs(samples):.2g} samples): segments then differ at their ends.",
-            {"delay_s": response.delay, "samples": samples},
-            "Align the clocks, and use a tapered window.",
         )

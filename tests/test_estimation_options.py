@@ -204,13 +204,15 @@ def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
 ) -> None:
     sensors = bench()
     sensors["b"].counts[:, 1] = value
-    settings = replace(SETTINGS, methods=("all",))
+    settings = replace(SETTINGS, methods=("all",), target_cov=0.1)
     found = estimate([write(tmp_path / "r.h5", sensors)], settings)
     for noise in found.results.values():
         assert np.all(noise.flags[:, 4] & Flag.DEAD_CHANNEL)
         assert np.isnan(noise.noise_psd[:, 4]).all()
     others = np.delete(found.results["maximum-likelihood"].noise_psd[1:-1], 4, axis=1)
     assert np.isfinite(others).all()
+    assert found.diagnostics["advice"][0].text.startswith("b.c1 has no signal")
+    assert np.isfinite([band.test.p_value for band in found.diagnostics["bands"]]).all()
 
 
 def test_duplicates_are_flagged_and_nothing_alive_is_an_error(tmp_path: Path) -> None:
@@ -221,6 +223,9 @@ def test_duplicates_are_flagged_and_nothing_alive_is_an_error(tmp_path: Path) ->
     flags = found.results["maximum-likelihood"].flags
     copies = (flags[1:-1] & Flag.DUPLICATE).any(axis=0)
     assert np.flatnonzero(copies).tolist() == [1, 4]
+    # by three-sensor nothing is left, and the message says why, and what is
+    with pytest.raises(InsufficientDataError, match=r"b\.c1 repeats a\.c1.*maximum-likelihood"):
+        estimate([tmp_path / "r.h5"], SETTINGS)
     for sensor in sensors.values():
         sensor.counts[:] = 0
     with pytest.raises(InsufficientDataError, match="no signal"):

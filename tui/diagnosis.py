@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from estimator.advice import Advice
 
 FAILS = "statistic over expectation"
+_LEGEND = (
+    "Coherence: the least between like channels. Condition: of the worst pair of sensors, 1 is "
+    "best. Dimension: of the motion. SNR: motion over noise, least and most of all channels. Model "
+    "test: 1 where one common motion explains everything; p: how often chance alone makes it as "
+    "large."
+)
 
 
 def summary(snapshot: Snapshot) -> list[str]:
@@ -32,13 +38,24 @@ def summary(snapshot: Snapshot) -> list[str]:
         if in_short is None or (len(found) == 1 and kind != FAILS):
             lines += [_with_remedy(advice.text, advice.remedy) for advice in found]
         else:
-            lines.append(_with_remedy(f"{in_short(found, names)}.", found[0].remedy))
+            lines.append(
+                _with_remedy(f"{in_short(found, names)}.{_odd_one(found, names)}", found[0].remedy)
+            )
     tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
     if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
         lines.append("model test: one common motion explains what the sensors share, in all bands")
     if "dimension" in snapshot.diagnostics:
         lines += _dimensions(snapshot)
     return lines
+
+
+def _odd_one(found: Sequence[Advice], names: list[str]) -> str:
+    """Say which sensor all pairs that something is wrong with have in common."""
+    common = set.intersection(*(set(advice.sensors) for advice in found))
+    at_fault = all(advice.level == "warning" or "gain" in advice.numbers for advice in found)
+    if len(common) != 1 or not at_fault:
+        return ""
+    return f" All of these have {names[common.pop()]} in common: look there first."
 
 
 def _with_remedy(text: str, remedy: str) -> str:
@@ -50,7 +67,15 @@ def details(snapshot: Snapshot) -> list[RenderableType]:
     found = snapshot.diagnostics
     if "bands" not in found:
         return ["too few sensors or averages to diagnose the test"]
-    parts: list[RenderableType] = [_bands(snapshot), _pairs(snapshot)]
+    parts: list[RenderableType] = [
+        "[b]What the sensors have in common, band by band[/b]",
+        _bands(snapshot),
+        _LEGEND,
+    ]
+    if found["responses"]:
+        parts += ["[b]How the sensors stand to each other[/b]", _pairs(snapshot)]
+    if snapshot.octaves:
+        parts += ["[b]What each octave rests on[/b]", _octaves(snapshot)]
     parts += [
         f"{advice.level}: {_with_remedy(advice.text, advice.remedy)}" for advice in found["advice"]
     ]
@@ -70,9 +95,30 @@ def _bands(snapshot: Snapshot) -> Table:
             f"{band.coherence:.4f}",
             f"{band.condition:.3g}",
             f"{band.dimension:.0f}",
-            f"{min(known):.2g}…{max(known):.2g}" if known else "?",
+            f"{_ratio(min(known))}…{_ratio(max(known))}" if known else "?",
             f"{ratio:.3f}",
             f"{band.test.p_value:.2g}",
+        )
+    return table
+
+
+def _ratio(value: float) -> str:
+    """Return a ratio to two digits, without an exponent where people need none."""
+    return f"{float(f'{value:.2g}'):.0f}" if 10 <= value < 1e5 else signed(value, ".2g")
+
+
+def _octaves(snapshot: Snapshot) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("octave (Hz)", "segment", "segments", "left out: gap", "disturbed", "averages"):
+        table.add_column(name, justify="right")
+    for octave in snapshot.octaves:
+        table.add_row(
+            f"{octave.low:.3g}–{octave.high:.3g}",
+            f"{octave.segment:.4g} s",
+            str(octave.n_segments),
+            str(octave.left_out.get("gap", 0)),
+            str(octave.left_out.get("transient", 0)),
+            f"{octave.n_effective:.0f}",
         )
     return table
 
@@ -152,6 +198,16 @@ def _delayed(found: Sequence[Advice], names: list[str]) -> str:
     return f"sensors lag each other: {pairs}: segments then differ at their ends"
 
 
+def _reversed(found: Sequence[Advice], _names: list[str]) -> str:
+    pairs = ", ".join(advice.text.split(":")[0] for advice in found)
+    return f"{pairs}: no bias, but a sensitivity has the wrong sign"
+
+
+def _swapped(found: Sequence[Advice], _names: list[str]) -> str:
+    pairs = "; ".join(advice.text.split(": ", 1)[1].split(". ")[0] for advice in found)
+    return f"channels are swapped: {pairs}: no bias, but the noise stands under the wrong names"
+
+
 def _singular(found: Sequence[Advice], _names: list[str]) -> str:
     where = ", ".join(_span(advice) for advice in found)
     return (
@@ -165,6 +221,8 @@ _SHORT: dict[str, Callable[[Sequence[Advice], list[str]], str]] = {
     "angle_deg": _turned,
     "gain": _gains,
     "delay_s": _delayed,
+    "channel": _reversed,
+    "swapped": _swapped,
     "condition": _singular,
 }
 

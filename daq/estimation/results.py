@@ -192,7 +192,8 @@ def time_left(
     inside = (frequency >= band[0]) & (frequency <= band[1])
     inside[0] = False
     cov = next(iter(results.values())).cov[inside]
-    if not np.isfinite(cov).any():
+    cov = cov[:, np.isfinite(cov).any(axis=0)]  # a dead channel never gets there
+    if not cov.size:
         return None
     reached = float(np.nanmax(np.nanmedian(cov, axis=0)))
     # c.o.v. ~ 1 / √n, and averages come at a steady pace.

@@ -73,6 +73,19 @@ def test_faults_of_one_sensor(fault: FloatArray, words: str) -> None:
     assert any(words in advice.text for advice in found.advice if 1 in advice.sensors)
 
 
+def test_swapped_channels_are_told_from_a_turned_sensor() -> None:
+    near = Rotation.from_euler("z", 7, degrees=True).as_matrix()
+    found = of(averages(bench(np.eye(3), near[[1, 0, 2]], np.eye(3))))
+    swapped = [advice for advice in found.advice if "swapped" in advice.text]
+    assert [advice.sensors for advice in swapped] == [(0, 1), (1, 2)]
+    assert "2.1 moves as 1.2 does, 2.2 moves as 1.1 does" in swapped[0].text
+    assert not any("polarity" in advice.text for advice in found.advice)
+    turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    other = of(averages(bench(np.eye(3), turned, np.eye(3))))
+    assert not any("swapped" in advice.text for advice in other.advice)
+    assert any("turned by 90.0°" in advice.text for advice in other.advice)
+
+
 def test_incoherence_is_a_problem_where_it_is() -> None:
     csm = plane_waves(FREQUENCY, pentagon()[:3], snr=400.0)
     found = of(averages(csm))

@@ -1,0 +1,113 @@
+"""Diagnostics as the command prints them."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from scipy.linalg import block_diag
+
+from estimator.diagnostics import diagnose
+from estimator.self_noise import Flag
+from tests.tui.made import CHANNELS, SENSORS, SETTINGS, made_snapshot, rotation
+from tui.diagnosis import details, summary
+from tui.results import remarks, result_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import RenderableType
+
+    from daq.estimation import Snapshot
+    from estimator.arrays import FloatArray
+
+
+def diagnosed(change: FloatArray | None = None, *, n_effective: float = 400.0) -> Snapshot:
+    """Return a finished snapshot with the diagnosis of its averages, changed before."""
+    snapshot = made_snapshot(n_effective=n_effective, closed=True)
+    csm = snapshot.csm if change is None else change @ snapshot.csm @ change.T
+    found = diagnose(
+        csm[::2],
+        snapshot.frequency[::2],
+        dims=snapshot.dims,
+        n_effective=n_effective,
+        names=SENSORS,
+        channels=CHANNELS * 3,
+        vertical=2,
+    )
+    diagnostics = snapshot.diagnostics | {
+        "bands": found.bands,
+        "responses": found.responses,
+        "advice": found.advice,
+    }
+    return replace(snapshot, csm=csm, diagnostics=diagnostics)
+
+
+def test_angles_have_the_minus_of_typography_and_pairs_are_put_together() -> None:
+    other_way = block_diag(*(rotation(-2 * angle) for angle in (0.0, 5.0, 9.0)))
+    (turned,) = [line for line in summary(diagnosed(other_way)) if "turned" in line]
+    assert "A–B −5.000°, A–C −9.000°, B–C −4.000°" in turned
+    assert turned.count("no bias") == 1
+    assert "−5.000°" in shown(details(diagnosed(other_way)))
+
+
+def test_what_is_wrong_with_one_sensor_names_it() -> None:
+    change = np.eye(9)
+    change[5, 5] = -1
+    lines = summary(diagnosed(change))
+    (polarity,) = [line for line in lines if "polarity" in line]
+    assert "B.Z has the opposite polarity of A.Z" in polarity
+    assert "All of these have B in common: look there first." in polarity
+    swapped = np.eye(9)
+    swapped[6:8] = swapped[[7, 6]]
+    (said,) = [line for line in summary(diagnosed(swapped)) if "swapped" in line]
+    assert "C.X moves as A.Y does" in said
+    assert "All of these have C in common" in said
+    assert not any("in common" in line for line in summary(diagnosed()))
+
+
+def test_a_dead_channel_is_said_once_for_all_methods_and_with_what_to_do() -> None:
+    change = np.eye(9)
+    change[4, 4] = 0
+    snapshot = diagnosed(change)
+    results = dict(snapshot.results)
+    for method, noise in results.items():
+        flags = noise.flags.copy()
+        flags[:, 4] |= Flag.DEAD_CHANNEL
+        flags[:, 0] |= Flag.SINGULAR
+        results[method] = replace(noise, flags=flags)
+    snapshot = replace(snapshot, results=results)
+    lines = [*remarks(snapshot), *summary(snapshot)]
+    (dead,) = [line for line in lines if "no signal" in line]
+    assert dead.startswith("B.Y has no signal")
+    assert "Look at cable" in dead
+    assert sum("A.X: nothing can be said" in line for line in lines) == len(results)
+    assert all("at all frequencies" in line for line in lines if "A.X: nothing" in line)
+
+
+def shown(parts: Sequence[RenderableType]) -> str:
+    console = Console(width=120, record=True, file=io.StringIO())
+    for part in parts:
+        console.print(part)
+    return console.export_text()
+
+
+def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> None:
+    text = shown(details(diagnosed()))
+    assert "Model test: 1 where one common motion explains everything" in " ".join(text.split())
+    assert "How the sensors stand" in text
+    assert "e+0" not in text
+    dead = np.eye(9)
+    dead[4, 4] = 0
+    without = shown(details(diagnosed(dead)))
+    assert "How the sensors stand" not in without
+    assert "problem: B.Y has no signal" in without
+
+
+def test_a_channel_without_signal_has_no_level() -> None:
+    change = np.eye(9)
+    change[4, 4] = 0
+    assert "no signal" in shown([result_table(diagnosed(change), SETTINGS)])
