@@ -4,7 +4,12 @@ What the real device does and this one too: two register windows (with the trap 
 a burst request in one and a register write in the other), the modes and their state bits, rates,
 filters, burst fields, tilt, UART_AUTO and bursts on request, no answers to reads while streaming,
 software reset, flash backup, factory defaults, AUTO_START, busy and not-ready bits that last, COUNT
-wrapping, each burst sent when its last bit would have left the UART.
+wrapping, each burst sent when its last bit would have left the UART, sampling by an external
+trigger, and, on an M-A370, in step with 1PPS.
+
+What is connected to the EXT pin is told by ``settings``, beyond the driver's: ``trigger_rate``, a
+generator of so many Hz that is never off (else nothing: then no sample is ever taken), or ``pps`` =
+true, the seconds of UTC (else nothing: then the device samples by its own clock).
 
 What it does not do: the filters' attenuation and delay, and sleep, which nothing but a reset ends.
 """
@@ -31,6 +36,8 @@ if TYPE_CHECKING:
 FULL_SCALE = 15 * epson.COUNTS_PER_G
 RESET_TIME, FLASH_TIME, FILTER_TIME, TEST_TIME = 0.97, 0.31, 0.005, 0.2
 """How long the device is not ready or busy, s."""
+TRIGGER, PPS = 0x40, 0x80
+"""Bits of MSC_CTRL: samples are taken when a trigger comes, or in step with 1PPS (M-A370)."""
 AHEAD = 1.0
 """How much is simulated at a time, s of world time."""
 
@@ -67,10 +74,14 @@ class EpsonDevice:
         fields = device.settings.get("fields") or ("x", "y", "z")
         self._axes = [field for field in fields if field != "temperature"]
         self._first_count = int(device.settings.get("first_count", 0))
+        self._trigger_rate = float(device.settings.get("trigger_rate", 0.0))
+        self._pps = bool(device.settings.get("pps"))
+        self._utc_ns = device.utc_ns
         self._baud_rate = int(device.settings.get("baud_rate", 460800))
         serial_number = device.serial_number or f"S{zlib.crc32(self._sensor.encode()) % 10**7:07d}"
         self._fixed: dict[Register, int] = {epson.ID: epson.DEVICE_ID, epson.VERSION: 0x0104}
-        self._fixed |= _text(epson.PROD_ID, "A370AD10" if "370" in device.model else "A352AD10")
+        self._has_pps = "370" in device.model
+        self._fixed |= _text(epson.PROD_ID, "A370AD10" if self._has_pps else "A352AD10")
         self._fixed |= _text(epson.SERIAL_NUM, serial_number)
         self._source = source
         self._sampled = source
@@ -146,7 +157,8 @@ class EpsonDevice:
     @property
     def _streaming(self) -> bool:
         automatic = self._registers[epson.UART_CTRL] & epson.UART_AUTO
-        return self._mode == epson.SAMPLING and bool(automatic)
+        never = self._registers[epson.MSC_CTRL] & TRIGGER and not self._trigger_rate
+        return self._mode == epson.SAMPLING and bool(automatic) and not never
 
     def _read(self, command: Read, now: float) -> Iterable[bytes]:
         if self._streaming or self._mode == epson.SLEEP:
@@ -208,8 +220,11 @@ class EpsonDevice:
         if register == epson.MSC_CTRL and shift:  # self-tests: bits that clear when done
             self._busy[register] = (command.value << 8, now + TEST_TIME)
             return
+        value = command.value
+        if register == epson.MSC_CTRL and not self._has_pps:
+            value &= ~PPS
         kept = self._registers[register] & (0xFF00 if shift == 0 else 0x00FF)
-        self._registers[register] = kept | command.value << shift
+        self._registers[register] = kept | value << shift
         if register == epson.FILTER_CTRL:
             self._registers[register] &= ~epson.FILTER_BUSY
             self._busy[register] = (epson.FILTER_BUSY, now + FILTER_TIME)
@@ -238,9 +253,16 @@ class EpsonDevice:
         self._starts = NEVER
         self._mode = epson.SAMPLING
         code = self._registers[epson.SMPL_CTRL] >> 8
-        rate = next((rate for rate, c in epson.RATES.items() if c == code), 200)
+        rate: float = next((rate for rate, c in epson.RATES.items() if c == code), 200)
+        external = self._registers[epson.MSC_CTRL]
+        if external & TRIGGER:
+            rate = self._trigger_rate
         if rate != self._sampled.sampling_rate:
-            self._sampled = self._source.at_rate(float(rate))
+            self._sampled = self._source.at_rate(float(rate)) if rate else self._source
+        if external & TRIGGER:
+            self._sampled = self._sampled.disciplined(0.0)
+        elif external & PPS and self._pps:
+            self._sampled = self._sampled.disciplined(-self._utc_ns % 10**9 / 1e9)
         self._burst = BurstFormat(self._registers[epson.BURST_CTRL])
         self._latency = self._burst.size * 10 / self._baud_rate
         self._begin = self._sampled.first_sample_after(self._sensor, now)

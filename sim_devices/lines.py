@@ -173,18 +173,22 @@ class PseudoTerminal:
 
 
 class TcpPort:
-    """A TCP port that serves one connection at a time, as serial servers do."""
+    """A TCP port that serves one connection at a time, as serial servers do.
 
-    def __init__(self, listener: Listener, scheme: str) -> None:
+    ``number`` is the port's; any that is free, if 0.
+    """
+
+    def __init__(self, listener: Listener, scheme: str, number: int = 0) -> None:
         self._listener = listener
         self._scheme = scheme
+        self._number = number
         self._writer: asyncio.StreamWriter | None = None
         self._down = False
         self.address = ""
 
     async def open(self) -> None:
-        """Listen on a free port of this machine."""
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        """Listen on a port of this machine."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -322,10 +326,10 @@ class UdpServer(asyncio.DatagramProtocol):
         self._listener.disconnected()
 
 
-def make_wire(kind: Kind, listener: Listener, *, scheme: str) -> Wire:
-    """Return a line of this kind, not yet open."""
+def make_wire(kind: Kind, listener: Listener, *, scheme: str, number: int = 0) -> Wire:
+    """Return a line of this kind, not yet open; ``number`` is that of a TCP port."""
     if kind == "pty":
         return PseudoTerminal(listener)
     if kind == "udp-server":
         return UdpServer(listener, scheme)
-    return TcpPort(listener, scheme) if kind == "tcp" else UdpPort(listener, scheme)
+    return TcpPort(listener, scheme, number) if kind == "tcp" else UdpPort(listener, scheme)

@@ -12,6 +12,8 @@ The specification is one JSON object::
        {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
         "driver": "epson",         whose protocol it speaks: a key of FAMILIES
         "port": "pty",             or "tcp", "udp"
+        "number": 0,               of a TCP port, and of further ones those that the settings name;
+                                   any that are free if it is 0
         "sampling_rate": 200.0,    Hz
         "settings": {...},         as the driver's settings in the bench file
         "sensor_settings": {"A": {...}},      where its sensors' settings differ
@@ -79,6 +81,8 @@ class Served:
         faults: LineFaults,
         tell: Callable[[float, Fault], None],
         tell_sent: Callable[[float, bytes], None] | None = None,
+        *,
+        number: int = 0,
     ) -> None:
         self.line = line
         self._faults = faults
@@ -91,7 +95,7 @@ class Served:
         self._timer: asyncio.TimerHandle | None = None
         self._last = 0.0
         self._down = False
-        self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme)
+        self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme, number=number)
 
     def connected(self) -> None:
         """Somebody opened the line."""
@@ -195,6 +199,7 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
         tell_sent.write(at=at, unit=unit.hex())
 
     tell_sent.write(at=clock.now(), utc_ns=device.utc_ns)
+    first_port = int(spec["devices"][index].get("number", 0))
     served = [
         Served(
             line,
@@ -206,6 +211,7 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
             ),
             tell,
             sent if line.carries_samples and tell_sent.is_wanted else None,
+            number=int(device.settings.get(line.setting, 0)) if k and first_port else first_port,
         )
         for k, line in enumerate(lines)
     ]

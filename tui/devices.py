@@ -7,6 +7,7 @@ import time
 import tomllib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from daq.bench import dump, load, parse
 from daq.errors import BenchFileError
@@ -82,6 +83,7 @@ def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
         "sensors": [sensor.name for sensor in sensors],
         "driver": first.driver,
         "port": _kind(first.port),
+        "number": _number(first.port),
         "sampling_rate": first.sampling_rate,
         "settings": first.settings,
         "sensor_settings": {sensor.name: sensor.settings for sensor in sensors},
@@ -107,6 +109,16 @@ def _kind(port: str) -> str:
     if rest:
         return "udp" if scheme == "udp" else "tcp"
     return "tcp" if sys.platform == "win32" else "pty"
+
+
+def _number(port: str) -> int:
+    """Return the number of a port on this machine, which a simulated device can have; else 0."""
+    parts = urlsplit(port)
+    try:
+        number = parts.port
+    except ValueError:
+        number = None
+    return number or 0 if parts.hostname in {"127.0.0.1", "localhost"} else 0
 
 
 @contextmanager

@@ -90,8 +90,8 @@ class EpsonSession:
                     received, at = await self._stream.read()
             except TimeoutError as error:
                 raise NoAnswerError(
-                    f"{self._stream.label}: nothing came for {patience:g} s;"
-                    f" expected {configuration.sampling_rate} frames a second"
+                    f"{self._stream.label}: nothing came for {patience:g} s; expected"
+                    f" {configuration.sampling_rate} frames a second{configuration.hint}"
                 ) from error
             patience = STALLED
             for item in self.decoder.receive(received, at):

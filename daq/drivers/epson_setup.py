@@ -117,6 +117,12 @@ class Configuration:
         usual = settings.filter or epson.USUAL_FILTER[rate]
         return cls(rate, usual, fields, burst, settings)
 
+    @property
+    def hint(self) -> str:
+        """What to look at if no sample comes."""
+        is_triggered = self.settings.external.startswith("trigger")
+        return ", one for each trigger: is there a signal at EXT?" if is_triggered else ""
+
     def decoder(self, sensor: str) -> BurstDecoder:
         """Return a decoder of the bursts the device will send."""
         full_scale = self.settings.full_scale * epson.COUNTS_PER_G

@@ -1,0 +1,143 @@
+"""What the EXT pin does: a trigger for every sample, or 1PPS on the M-A370."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.clock import SystemClock
+from daq.drivers.registry import driver_type
+from daq.errors import NoAnswerError, WrongDeviceError
+from daq.protocols import epson
+from daq.transport import open_port
+from sim_devices import launch
+from sim_devices.device import Source
+from sim_devices.pacing import utc_of
+from sim_devices.scenario import Scenario
+from sim_devices.serve import device_spec
+from tests.drivers.reading import record
+from tests.sim_devices.bench import device, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from daq.bench import Sensor
+    from sim_devices.launch import RunningDevice
+
+SPEED = 8.0
+DRIVER = driver_type("epson")
+XYZ = [{"name": axis, "sensitivity": epson.COUNTS_PER_UNIT} for axis in "xyz"]
+OFF = 500.0
+"""ppm of the devices' own clocks."""
+TABLES = {
+    "pps": device("pps", model="M-A370", channels={"pps": XYZ}, settings={"pps": True}),
+    "none": device("none", model="M-A370", channels={"none": XYZ}),
+    "trigger": device(
+        "trigger", model="M-A370", channels={"trigger": XYZ}, settings={"trigger_rate": 100.0}
+    ),
+    "A352": device("A352", model="M-A352", channels={"A352": XYZ}),
+}
+
+
+def world() -> dict[str, Any]:
+    told = spec(*TABLES.values(), speed=SPEED)
+    for table in told["scenario"]["sensors"].values():
+        table["clock"] = {"offset": 0.0021, "ppm": OFF}
+    return told
+
+
+SPEC = world()
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[dict[str, RunningDevice]]:
+    with launch.start(SPEC) as devices:
+        yield {one.sensors[0]: one for one in devices}
+
+
+def connecting(running: dict[str, RunningDevice], name: str, **changes: Any) -> Sensor:  # noqa: ANN401
+    (sensor,) = sensors(running[name], TABLES[name], **changes)
+    return sensor
+
+
+def source(name: str) -> Source:
+    return Source(Scenario.from_dict(SPEC["scenario"]), device_spec(TABLES[name]))
+
+
+async def mismatch(sensor: Sensor, truth: Source) -> float:
+    """Return how far 800 samples are from what ``truth`` took, in counts."""
+    blocks, events = await record(DRIVER, sensor, 800, speed=SPEED)
+    assert not events
+    ends = [0, *(block.end_sample for block in blocks)]
+    assert [block.first_sample for block in blocks] == ends[:-1]
+    counts: NDArray[Any] = np.concatenate([block.counts for block in blocks])[:800]
+    taken = truth.counts(sensor.name, 0, round(200 * truth.sampling_rate))
+    start = int(np.argmin(np.abs(taken - counts[0]).max(axis=1)))
+    return float(np.abs(taken[start : start + 800] - counts).max())
+
+
+@pytest.mark.parametrize("edge", ["rising", "falling"])
+async def test_samples_are_in_step_with_the_seconds(
+    running: dict[str, RunningDevice], edge: str
+) -> None:
+    sensor = connecting(running, "pps", settings={"external": f"pps-{edge}"})
+    whole_seconds = -utc_of(SPEC["epoch_ns"]) % 10**9 / 1e9
+    # The system's UTC at world time 0 is known to some µs, and is another one here and there.
+    truth = source("pps").disciplined(whole_seconds)
+    alone = await mismatch(sensor, source("pps"))
+    assert await mismatch(sensor, truth) < 0.02 * alone
+
+
+async def test_without_pps_a_device_samples_by_its_own_clock(
+    running: dict[str, RunningDevice],
+) -> None:
+    sensor = connecting(running, "none", settings={"external": "pps-rising"})
+    assert await mismatch(sensor, source("none")) <= 0.5
+
+
+async def test_every_trigger_makes_a_sample(running: dict[str, RunningDevice]) -> None:
+    settings = {"external": "trigger-falling"}
+    sensor = connecting(running, "trigger", settings=settings, sampling_rate=100.0)
+    truth = source("trigger").at_rate(100.0).disciplined(0.0)
+    assert await mismatch(sensor, truth) <= 0.5
+
+
+async def test_without_a_trigger_there_is_no_sample(running: dict[str, RunningDevice]) -> None:
+    sensor = connecting(running, "A352", settings={"external": "trigger-rising"})
+    with pytest.raises(NoAnswerError, match="one for each trigger: is there a signal at EXT"):
+        await record(DRIVER, sensor, 1, speed=SPEED)
+
+
+async def test_a_model_without_pps_is_named(running: dict[str, RunningDevice]) -> None:
+    sensor = connecting(running, "A352", settings={"external": "pps-rising"})
+    with pytest.raises(WrongDeviceError, match="this model does not have that setting"):
+        await record(DRIVER, sensor, 1, speed=SPEED)
+
+
+@pytest.mark.parametrize(
+    ("external", "bits"),
+    [
+        ("off", 0b000),
+        ("trigger-rising", 0b010),
+        ("trigger-falling", 0b011),
+        ("pps-rising", 0b100),
+        ("pps-falling", 0b101),
+    ],
+)
+async def test_the_register_says_so(
+    running: dict[str, RunningDevice], external: str, bits: int
+) -> None:
+    """MSC_CTRL: bit 6 EXT_SEL, bit 5 EXT_POL; 1PPS is code 4 or 5 in bits 7:5."""
+    sensor = connecting(running, "pps", settings={"external": external})
+    async with DRIVER.open([sensor], SystemClock(SPEED)):
+        pass
+    async with open_port(sensor.port, SystemClock()) as stream:
+        await stream.write(epson.read(epson.MSC_CTRL))
+        received = b""
+        while (value := epson.find_reply(received, epson.MSC_CTRL.address)) is None:
+            received += (await stream.read())[0]
+    assert value & 0xFF == bits << 5 | 0x06
