@@ -47,9 +47,8 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
     """
     bench = found[0].bench
     judged = judgements(bench, snapshot, settings)
-    running = not all(source.closed for source in found)
     sentence = verdict(bench, judged)
-    if running:
+    if not (snapshot.closed and all(source.closed for source in found)):
         sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")
     sections = [
         _test_section(found),

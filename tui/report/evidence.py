@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
-MATTERS = 0.01
-"""Share of the noise from which an error of the clocks is worth a word."""
+MATTERS, SPOILS = 0.01, 0.1
+"""Shares of the noise from which an error of the clocks is worth a word, and worth doing more."""
 _USUAL = {"started", "connected", "stopped", "mark"}
 
 
@@ -161,8 +161,14 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
             text = f"What is left between the clocks adds {share(worst)} to the noise at most"
             parts.append(Paragraph(f"{text}, within {band}: they do not matter here.", "good"))
         else:
-            text = f"What is left between the clocks may add up to {share(worst)} to the noise"
-            parts.append(Paragraph(f"{text}, within {band}: they matter here.", "doubtful"))
+            decibels = f"{10 * math.log10(1 + worst):.2g} dB"
+            text = (
+                f"What is left between the clocks may add {share(worst)} ({decibels}) to the noise"
+            )
+            text += f" within {band}."
+            if worst > SPOILS:
+                text += " Give the sensors one clock, or record longer for their rates to be known."
+            parts.append(Paragraph(text, "doubtful" if worst <= SPOILS else "bad"))
     rows = [
         _clock_row(clock, effects.get(clock.sensor, math.nan), snapshot)
         for clock in snapshot.clocks
@@ -178,7 +184,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
         parts += [
             Paragraph(
                 "Drift: by how much each sensor's own count of time lags behind the host's, "
-                "without its straight line; the line's slope is the rate in ppm.",
+                "without its straight line (the rate in ppm) and without the steps of restarts.",
                 "quiet",
             ),
             plot,
@@ -211,7 +217,12 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
             _when(each.utc_ns),
             each.sensor or "all",
             each.kind,
-            each.text + (f" ({count} of this kind, until {_when(last)})" if count > 1 else ""),
+            each.text
+            + (
+                f" ({count} of this kind, until {_when(last, after=each.utc_ns)})"
+                if count > 1
+                else ""
+            ),
         )
         for each, count, last in _together(happenings)
     ]
@@ -304,8 +315,10 @@ def _together(happenings: Sequence[Happening]) -> list[tuple[Happening, int, int
     return list(alike.values())
 
 
-def _when(utc_ns: int) -> str:
-    return utc(utc_ns)[:19].replace("T", " ")
+def _when(utc_ns: int, *, after: int | None = None) -> str:
+    """Return an instant to the second, without its day where that is the day of one before."""
+    text = utc(utc_ns)[:19].replace("T", " ")
+    return text[11:] if after is not None and utc(after)[:10] == text[:10] else text
 
 
 def _sentence(line: str) -> str:

@@ -122,7 +122,7 @@ def noise_section(snapshot: Snapshot, settings: Settings, bench: Bench | None) -
             f"Below: one-sided power spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and "
             f"its root in ({snapshot.unit})/√Hz (right). Each point is a mean over its share of "
             "the axis. Dotted: the band of the table. Where the interval reaches the bottom, the "
-            "noise is known only to be below its upper end.",
+            "noise is known only to be below its upper end. Hatched: nothing can be said.",
             "quiet",
         )
     )
@@ -164,7 +164,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
         rows.append(
             (
                 f"{label.sensor}.{label.channel}",
-                decibel(float(data[number])),
+                decibel(float(data[number])) if data[number] > 0 else "no signal",
                 decibel(mean[0], 2),
                 _interval(mean[1], mean[2]),
                 scientific(math.sqrt(mean[0])) if mean[0] > 0 else decibel(mean[0]),
@@ -234,7 +234,8 @@ def _level_with_error(mean: float, low: float, high: float) -> str:
         return decibel(mean)
     if low <= 0:
         return f"< {decibel(high)}"
-    return f"{decibel(mean)} ±{decibels(high) - decibels(mean):.1f}"
+    error = decibels(high) - decibels(mean)
+    return f"{decibel(mean)} ±{error:.1f}" if error >= 0.1 else f"{decibel(mean, 2)} ±{error:.2f}"
 
 
 def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:

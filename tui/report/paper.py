@@ -36,6 +36,10 @@ LINE = 1.4
 """Distance of lines over the size of letters."""
 NAMES = 1.45
 """Width of the names of facts."""
+LEAST_GAP = 0.1
+"""Between columns."""
+TABLE_TITLE, TOGETHER = 0.18, 2.6
+"""Height of a table's title; tables that are lower are not broken."""
 BOX = 0.75
 """Height of a box to be filled in."""
 
@@ -49,34 +53,45 @@ _COLOURS: dict[Tone, str] = {
 _FAMILY = "DejaVu Sans"
 
 
-def write_paper(report: Report, file: BinaryIO) -> int:
-    """Write a report as PDF; return the number of pages."""
+def write_paper(report: Report, file: BinaryIO) -> None:
+    """Write a report as PDF."""
     with drawing.look():
-        sheets = _Sheets(report.subtitle)
-        sheets.line(report.title, TITLE, bold=True)
-        sheets.text(report.subtitle, TEXT, "quiet")
-        sheets.room(0.08)
-        sheets.text(report.verdict.text, 10.0, report.verdict.tone, bold=True)
-        for number, section in enumerate(report.sections, start=1):
-            sheets.heading(f"{number}   {section.title}", followed_by=_least(section.parts[:1]))
-            for part in section.parts:
-                sheets.add(part)
-        pages = sheets.numbered()
+        # no date: the same recording gives the same file
         nothing = dict.fromkeys(("Creator", "Producer", "CreationDate"))
         with PdfPages(file, metadata=nothing) as paper:
-            for page in pages:
+            for page in pages(report):
                 paper.savefig(page)
-    return len(pages)
+
+
+def pages(report: Report) -> list[Figure]:
+    """Return the pages of a report; within `drawing.look`."""
+    sheets = _Sheets(report.subtitle)
+    sheets.line(report.title, TITLE, bold=True)
+    sheets.text(report.subtitle, TEXT, "quiet")
+    sheets.room(0.08)
+    sheets.verdict(report.verdict)
+    for number, section in enumerate(report.sections, start=1):
+        sheets.heading(f"{number}   {section.title}", followed_by=_least(section.parts))
+        for place, part in enumerate(section.parts):
+            if isinstance(part, Paragraph):
+                sheets.room(0, needed=_least(section.parts[place:]))
+            sheets.add(part)
+    return sheets.numbered()
 
 
 def _least(parts: Sequence[Part]) -> float:
-    """Return what must fit under a heading for it to stay on a page."""
+    """Return about what must fit for the beginning of some parts to stay together."""
+    height = 0.0
     for part in parts:
+        if isinstance(part, Paragraph):
+            height += 0.2 * -(-len(part.text) // 120)
+            continue
         if isinstance(part, Plot):
-            return drawing.height_of(part)
-        if isinstance(part, Signatures):
-            return 2.2 * BOX
-    return 0.5
+            return height + drawing.height_of(part) + 0.25
+        if isinstance(part, Table):
+            return height + min(TOGETHER, 0.5 + 0.2 * len(part.rows))
+        return height + (2.2 * BOX if isinstance(part, Signatures) else 0.4)
+    return height
 
 
 @lru_cache(maxsize=20_000)
@@ -175,6 +190,15 @@ class _Sheets:
             self.room(size * LINE / 72)
             self.put(LEFT + indent, line, size, tone=tone, bold=bold)
 
+    def verdict(self, sentence: Paragraph) -> None:
+        """Set the one sentence that all comes to, with a bar beside it."""
+        top = self.y - 0.02
+        self.text(sentence.text, 10.0, sentence.tone, bold=True, indent=0.14)
+        corner = (LEFT / WIDTH, (self.y - 0.06) / HEIGHT)
+        height = (top - self.y + 0.06) / HEIGHT
+        colour = _COLOURS[sentence.tone]
+        self.page.add_artist(Rectangle(corner, 0.05 / WIDTH, height, color=colour, lw=0))
+
     def heading(self, text: str, *, followed_by: float) -> None:
         """Set the title of a section, with its beginning below it."""
         self.room(0.38, needed=0.1 + followed_by)
@@ -249,28 +273,27 @@ class _Sheets:
     @add.register
     def _(self, part: Table) -> None:
         widths = _column_widths(part)
-        step = TABLE * LINE / 72
-        if part.title:
-            self.room(0.18, needed=4 * step)
-            self.put(LEFT, part.title, TABLE, bold=True)
         header = [
-            _wrapped(w, width, TABLE, bold=True)
-            for w, width in zip(part.header, widths, strict=True)
+            _wrapped(w, x, TABLE, bold=True) for w, x in zip(part.header, widths, strict=True)
         ]
-        self._header(part, header, widths)
-        for number, row in enumerate(part.rows):
-            cells = [_wrapped(w, width, TABLE) for w, width in zip(row, widths, strict=True)]
-            height = max(len(cell) for cell in cells) * step + 0.035
-            if self.y - height < BOTTOM:
+        rows = [
+            [_wrapped(w, x, TABLE) for w, x in zip(row, widths, strict=True)] for row in part.rows
+        ]
+        title = TABLE_TITLE if part.title else 0.0
+        whole = title + sum(_row_height(row) for row in [header, *rows])
+        if self.y - whole < BOTTOM and whole < TOGETHER:
+            self.turn()
+        self.room(title, needed=_row_height(header) + 0.3)
+        if part.title:
+            self.put(LEFT, part.title, TABLE, bold=True)
+        self._row(part, _sunk(header), widths, number=None)
+        for number, row in enumerate(rows):
+            last_two = rows[number : number + 2] if number == len(rows) - 2 else [row]
+            if self.y - sum(_row_height(each) for each in last_two) < BOTTOM:
                 self.turn()
-                self._header(part, header, widths)
-            self._row(part, cells, widths, number=number)
+                self._row(part, _sunk(header), widths, number=None)
+            self._row(part, row, widths, number=number)
         self.room(0.12)
-
-    def _header(self, part: Table, cells: list[list[str]], widths: list[float]) -> None:
-        self.room(0, needed=max(len(cell) for cell in cells) * TABLE * LINE / 72 + 0.3)
-        most = max(len(cell) for cell in cells)
-        self._row(part, [[""] * (most - len(c)) + c for c in cells], widths, number=None)
 
     def _row(
         self, part: Table, cells: list[list[str]], widths: list[float], *, number: int | None
@@ -293,7 +316,7 @@ class _Sheets:
                     flush_right=not flush_left,
                 )
             x += width + _gap(widths)
-        self.y = top - max(len(cell) for cell in cells) * step - 0.035
+        self.y = top - _row_height(cells)
         heading = number is None
         self.rule(_COLOURS["quiet"] if heading else drawing.GRID, 0.7 if heading else 0.4)
 
@@ -307,7 +330,14 @@ class _Sheets:
         return self.pages
 
 
-LEAST_GAP, MOST_GAP = 0.1, 0.5
+def _row_height(cells: list[list[str]]) -> float:
+    return max(len(cell) for cell in cells) * TABLE * LINE / 72 + 0.035
+
+
+def _sunk(cells: list[list[str]]) -> list[list[str]]:
+    """Return cells whose words stand at the bottom of their row."""
+    most = max(len(cell) for cell in cells)
+    return [[""] * (most - len(cell)) + cell for cell in cells]
 
 
 def _gap(widths: Sequence[float]) -> float:

@@ -39,6 +39,8 @@ TEST_POINTS = 90
 DRIFT_POINTS = 400
 NOISE_HEIGHT, TEST_HEIGHT, DRIFT_HEIGHT = 1.45, 1.25, 1.5
 REJECT = 0.01
+JUMP, STEEP = 1e-4, 5e-5
+"""Seconds, and seconds per second, by which no clock changes but at a restart."""
 _TIMES = ((300, "s", 1), (10800, "min", 60), (259200, "h", 3600), (math.inf, "days", 86400))
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
@@ -177,8 +179,7 @@ def drift_plot(snapshot: Snapshot) -> Plot | None:
         return None
     drift = drift[:: max(1, len(drift) // DRIFT_POINTS)]
     seconds = drift[:, 0]
-    line = np.polynomial.polynomial.polyfit(seconds, drift[:, 1:], 1)
-    left = drift[:, 1:] - (line[0] + np.outer(seconds, line[1]))
+    left = np.column_stack([without_line(seconds, delay) for delay in drift[:, 1:].T])
     names = _names_by_clock(snapshot, drift)
     kept = list(names)
     return Plot(
@@ -189,6 +190,32 @@ def drift_plot(snapshot: Snapshot) -> Plot | None:
         key_rows=-(-len(kept) // 4),
         alt="Drift of each sensor's clock without its straight line against time",
     )
+
+
+def without_line(seconds: FloatArray, delay: FloatArray) -> FloatArray:
+    """Return a clock's delay without its straight line, and without what restarts made it jump.
+
+    Parameters
+    ----------
+    seconds, delay : float64, shape (n,)
+        In seconds.
+
+    Returns
+    -------
+    float64, shape (n,)
+        NaN at the first moment after a jump, for the curve to break there.
+    """
+    apart = np.diff(seconds)
+    step = np.diff(delay)
+    usual = np.median(step / apart) * apart
+    jumps = np.concatenate(([False], np.abs(step - usual) > JUMP + STEEP * apart))
+    stretch = np.cumsum(jumps)
+    count = np.bincount(stretch)
+    x = seconds - (np.bincount(stretch, seconds) / count)[stretch]
+    y = delay - (np.bincount(stretch, delay) / count)[stretch]
+    left = y - (x @ y) / max(x @ x, 1e-300) * x
+    left[jumps] = np.nan
+    return np.asarray(left)
 
 
 def _groups(snapshot: Snapshot) -> Iterator[tuple[str, list[int]]]:
@@ -324,17 +351,18 @@ def _draw_test(
 
 
 def _draw_drift(seconds: FloatArray, left: FloatArray, names: list[str], axes: Axes) -> None:
-    largest = float(np.abs(left).max())
+    largest = float(np.nanmax(np.abs(left)))
+    length = float(seconds[-1])
+    word, one = next((word, one) for limit, word, one in _TIMES if length < limit)
+    time = seconds / one
     unit, size = ("ms", 1e3) if largest >= 1e-3 else ("µs", 1e6)
     for number, (column, name) in enumerate(zip(left.T, names, strict=True)):
         dashes = [(), (4, 1.5), (1, 1)][number // len(drawing.LINES) % 3]
         colour = drawing.LINES[number % len(drawing.LINES)]
-        axes.plot(seconds, size * column, color=colour, dashes=dashes or (None, None), label=name)
-    length = float(seconds[-1])
-    word, one = next((word, one) for limit, word, one in _TIMES if length < limit)
+        axes.plot(time, size * column, color=colour, dashes=dashes or (None, None), label=name)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 1.5, 2, 3, 5, 6, 10]))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / one:g}"))
-    axes.set_xlim(0, length + float(seconds[0]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set_xlim(0, float(time[0] + time[-1]))
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
     axes.set_xlabel(f"time since the first sample ({word})")

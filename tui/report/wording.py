@@ -34,7 +34,10 @@ def scientific(value: float, digits: int = 3) -> str:
 
 def plain_number(value: float, form: str) -> str:
     """Return a number in Python's format, with a true minus; ``?`` where there is none."""
-    return format(value, form).replace("-", "−") if math.isfinite(value) else NOTHING
+    if not math.isfinite(value):
+        return NOTHING
+    text = format(value, form)
+    return text.replace("-", "−") if text.strip("+-0.") else text.lstrip("-")
 
 
 def share(value: float) -> str:
