@@ -184,6 +184,12 @@ class Told:
         """Note it."""
         self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
 
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Note it."""
+        assert snapshot.closed
+        self.told.append(f"report {path.name} {settings.segment:g}")
+        return path.with_suffix(".html")
+
     def find_running(self) -> Path | None:
         """Return what was prepared."""
         return self.running

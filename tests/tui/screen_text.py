@@ -25,7 +25,7 @@ def screen_text(app: App[None]) -> str:
     for x, number, text in _TEXT.findall(app.export_screenshot()):
         line = lines.get(int(number), "").ljust(round(float(x) / _CELL))
         lines[int(number)] = line + html.unescape(text).replace("\xa0", " ")
-    return "\n".join(lines.get(n, "").rstrip() for n in range(max(lines) + 1)) + "\n"
+    return "\n".join(lines.get(n, "").rstrip() for n in range(max(lines, default=-1) + 1)) + "\n"
 
 
 def assert_looks_as_before(app: App[None], name: str) -> None:

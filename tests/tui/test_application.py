@@ -119,6 +119,21 @@ async def test_trouble_is_told(told: Told) -> None:
         assert "no answer" in screen_text(app)
 
 
+async def test_the_result_comes_by_itself_and_its_report_on_request(
+    told: Told, tmp_path: Path
+) -> None:
+    app = HuddleApp(told, path=tmp_path / "run.h5")  # which is not there: nothing else comes
+    async with app.run_test(size=WIDE) as pilot:
+        await app.workers.wait_for_complete()
+        await shown(pilot, app, *running())
+        assert "95 %" not in screen_text(app)
+        await shown(pilot, app, *ended())
+        assert "noise, 95 %" in screen_text(app)
+        await pilot.press("w")
+        await app.workers.wait_for_complete()
+    assert told.told == ["report run.h5 2"]
+
+
 async def test_quitting_tells_the_recorder_nothing(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:

@@ -68,8 +68,10 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
         snapshot = second.snapshot
         assert snapshot is not None
         assert {"three-sensor", "three-channel"} <= set(snapshot.results)
-        assert "No limits in the bench file" in screen_text(second)
+        await until(pilot, lambda: "No limits in the bench file" in screen_text(second))
         await until(pilot, lambda: all(w.group != "follow" for w in second.workers))
+        await pilot.press("w")
+        await until(pilot, lambda: recorder.out.with_suffix(".html").exists())
     recorder.wait()
     controls.release()
     with Recording.open(recorder.out) as recording:

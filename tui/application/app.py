@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from textual import on, work
 from textual.app import App
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Controls
     from tui.state import Now
 
+Outcome = TypeVar("Outcome")
 GROWTH = 0.01  # of the segments, from which on curves change to the eye
 SLOW_REMARK = 2.0  # seconds that writing a remark may take before the mark says so
 
@@ -87,6 +89,7 @@ class HuddleApp(App[None]):
         self._snapshot_at = 0.0
         self._starting = False
         self._ended = threading.Event()
+        self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
         self._offered: tuple[bool, ...] = ()
 
     def compose(self) -> ComposeResult:
@@ -121,8 +124,11 @@ class HuddleApp(App[None]):
 
     @work(thread=True, group="follow")
     def _follow(self, path: Path, ended: threading.Event) -> None:
-        messenger = Messenger(self, self._controls, path=path, ended=ended)
-        follow(path, self._controls.settings, onlooker=messenger, ended=ended, growth=GROWTH)
+        messenger = Messenger(self, ended)
+        with self._reading:
+            follow(path, self._controls.settings, onlooker=messenger, ended=ended, growth=GROWTH)
+            if messenger.result is not None:
+                self._try(partial(self._controls.keep, path, messenger.result))
 
     @on(Looked)
     def _on_looked(self, message: Looked) -> None:
@@ -304,13 +310,16 @@ class HuddleApp(App[None]):
         self._control(self._controls.find_running)
 
     def _control(self, act: Callable[[], Path | None]) -> None:
+        path = self._try(act)
+        if path is not None:
+            self.post_message(Following(path))
+
+    def _try(self, act: Callable[[], Outcome]) -> Outcome | None:
         try:
-            path = act()
+            return act()
         except (HuddleError, OSError) as error:
             self.post_message(Trouble(str(error)))
-        else:
-            if path is not None:
-                self.post_message(Following(path))
+        return None
 
     def action_stop(self) -> None:
         """Stop the recorder, once that has been confirmed."""
@@ -340,11 +349,30 @@ class HuddleApp(App[None]):
 
     @work(thread=True, group="control")
     def _tell(self, path: Path, what: str, text: str = "") -> None:
-        try:
+        def tell() -> bool:
             if what == "stop":
                 self._controls.stop(path)
             else:
                 self._controls.mark(path, text)
-                self.call_from_thread(self.notify, f"marked: {text}", timeout=3, markup=False)
-        except (HuddleError, OSError) as error:
-            self.post_message(Trouble(str(error)))
+            return True
+
+        if self._try(tell) and what == "mark":
+            self.call_from_thread(self.notify, f"marked: {text}", timeout=3, markup=False)
+
+    def action_report(self) -> None:
+        """Write the report of the test that has ended."""
+        if self._has_result and self._path is not None and self._settings is not None:
+            self.notify("writing the report …", timeout=3)
+            self._report(self._path)
+
+    @work(thread=True, group="control")
+    def _report(self, path: Path) -> None:
+        snapshot, settings = self.snapshot, self._settings
+        if snapshot is None or settings is None:
+            return
+        with self._reading:
+            report = self._try(lambda: self._controls.report(path, snapshot, settings))
+        if report is not None:
+            self.call_from_thread(
+                self.notify, f"{report}", title="Report written", timeout=15, markup=False
+            )

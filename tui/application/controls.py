@@ -59,3 +59,7 @@ class Controls(Protocol):
     def keep(self, path: Path, snapshot: Snapshot) -> None:
         """Write the result into a recording whose end has been seen here. Blocks."""
         ...
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report of a recording; returns its file. Blocks."""
+        ...

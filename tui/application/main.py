@@ -85,6 +85,10 @@ class BenchControls:
                 return
         finish_recording(path, snapshot)
 
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report beside the recording."""
+        return _report(path, snapshot, settings)
+
     def release(self) -> None:
         """Forget the recorders; they go on."""
         for recorder in self.started:
@@ -127,6 +131,18 @@ class RecordingControls:
 
     def keep(self, path: Path, snapshot: Snapshot) -> None:
         """Leave that to who records."""
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report beside the recording."""
+        return _report(path, snapshot, settings)
+
+
+def _report(path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+    from tui.report import write  # noqa: PLC0415 - loads matplotlib
+
+    out = path.with_suffix(".html")
+    write(snapshot, out, recordings=[path], settings=settings)
+    return out
 
 
 def open_application(source: Path, *, method: str | None) -> None:

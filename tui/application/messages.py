@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 from textual.message import Message
 
-from daq.errors import HuddleError
-
 if TYPE_CHECKING:
     import threading
     from pathlib import Path
@@ -16,7 +14,6 @@ if TYPE_CHECKING:
     from textual.app import App
 
     from daq.estimation import Settings, Snapshot
-    from tui.application.controls import Controls
     from tui.state import Now
 
 
@@ -66,19 +63,19 @@ class Messenger:
     ----------
     app : App
         Is posted the messages.
-    controls : Controls
-        Keeps the result of a recording whose end is seen.
-    path : Path
-        The recording.
     ended : threading.Event
         Set when nobody wants to know any more.
+
+    Attributes
+    ----------
+    result : Snapshot or None
+        The estimate from the whole recording, if its end has been seen here.
     """
 
-    def __init__(
-        self, app: App[None], controls: Controls, *, path: Path, ended: threading.Event
-    ) -> None:
-        self._app, self._controls, self._path, self._ended = app, controls, path, ended
+    def __init__(self, app: App[None], ended: threading.Event) -> None:
+        self._app, self._ended = app, ended
         self._was_open = False
+        self.result: Snapshot | None = None
 
     def look(self, now: Now) -> None:
         """Tell how the sensors are doing."""
@@ -86,13 +83,10 @@ class Messenger:
         self._post(Looked(now))
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Show an estimate, and keep it if it is the result."""
-        self._post(Fresh(snapshot, settings))
+        """Show an estimate."""
         if snapshot.closed and self._was_open:
-            try:
-                self._controls.keep(self._path, snapshot)
-            except (HuddleError, OSError) as error:
-                self._post(Trouble(str(error)))
+            self.result = snapshot
+        self._post(Fresh(snapshot, settings))
 
     def progress(self, done: int, total: int) -> None:
         """Tell how far the result is."""
