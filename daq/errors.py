@@ -11,6 +11,10 @@ class BenchFileError(HuddleError, ValueError):
     """The bench file is wrong; the message lists every fault with file, key, value, expectation."""
 
 
+class DriverError(HuddleError, ImportError):
+    """An installed driver cannot be used; the message names it, its package and why."""
+
+
 class DeviceError(HuddleError):
     """A device cannot be used; the message names sensor, port, what was expected and what came."""
 
