@@ -12,7 +12,7 @@ import contextlib
 import heapq
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import groupby
+from itertools import groupby, islice, takewhile
 from typing import TYPE_CHECKING, Literal
 from zoneinfo import ZoneInfo
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 GRACE = timedelta(minutes=1)
 """A run that starts later than this was missed."""
+MOST_TOLD = 20
+"""Runs that were not done of which each is told: a clock that is set may leave years of them."""
 _LONGEST_SLEEP = 30.0
 """In s; the system's clock may be set meanwhile."""
 
@@ -55,8 +57,10 @@ def due_times(schedule: Schedule, after: datetime) -> Iterator[datetime]:
     """
     local = after.astimezone(ZoneInfo(schedule.time_zone))
     lines = [CronSim(line, local) for line in schedule.cron]
-    for due, _ in groupby(heapq.merge(*lines, key=datetime.timestamp)):
-        yield due
+    merged = heapq.merge(*lines, key=datetime.timestamp)
+    # by instant: in the hour that comes twice, datetimes of both are equal
+    for _, same in groupby(merged, key=datetime.timestamp):
+        yield next(same)
 
 
 def utc_now() -> datetime:
@@ -80,7 +84,7 @@ async def serve(
     schedule : Schedule
         When.
     run : coroutine function of the due time
-        Does one run; a HuddleError, alone or in groups, fails that run only.
+        Does one run; a HuddleError or OSError, alone or in groups, fails that run only.
     stop : asyncio.Event
         Ends the loop; a run that is going on must look at it itself.
     notice : callable
@@ -100,16 +104,34 @@ async def serve(
         if stop.is_set():
             return
         if now() - due > GRACE:
-            notice(RunNotice("missed", due, "the computer was off, asleep or busy"))
-            after = due
+            why = "the computer was off, asleep or busy"
+            until = now() - GRACE
+            after = _not_done(schedule, after, until, kind="missed", why=why, notice=notice)
             continue
         await _run_once(run, due, notice)
+        why = "the run before was still going on"
+        after = _not_done(schedule, due, now(), kind="refused", why=why, notice=notice)
+
+
+def _not_done(
+    schedule: Schedule,
+    after: datetime,
+    until: datetime,
+    *,
+    kind: Literal["missed", "refused"],
+    why: str,
+    notice: Callable[[RunNotice], None],
+) -> datetime:
+    """Tell of the runs that were due and not done; return after when the next is looked for."""
+    passed = takewhile(lambda due: due <= until, due_times(schedule, after))
+    for due in islice(passed, MOST_TOLD):
+        notice(RunNotice(kind, due, why))
         after = due
-        for passed in due_times(schedule, due):
-            if passed > now():
-                break
-            notice(RunNotice("refused", passed, "the run before was still going on"))
-            after = passed
+    further = next(passed, None)
+    if further is None:
+        return after
+    notice(RunNotice(kind, further, f"{why}; and so were all others until {until:%Y-%m-%d %H:%M}"))
+    return until
 
 
 async def _run_once(
@@ -120,7 +142,7 @@ async def _run_once(
     notice(RunNotice("started", due))
     try:
         await run(due)
-    except* HuddleError as group:
+    except* (HuddleError, OSError) as group:
         text = "; ".join(str(error) for error in _leaves(group))
         notice(RunNotice("failed", due, text))
     else:
@@ -144,33 +166,39 @@ def _sleep_until(stop: asyncio.Event) -> Callable[[float], Awaitable[object]]:
     return sleep
 
 
-def remove_old(directory: Path, retention: float, *, now: datetime | None = None) -> list[Path]:
-    """Remove recordings that are older than ``retention`` seconds, and return which.
+def remove_old(
+    directory: Path, retention: float, *, bench: str, now: datetime | None = None
+) -> list[Path]:
+    """Remove recordings of a bench that are older than ``retention`` seconds, and return which.
 
-    Only closed huddle recordings are removed: what is something else, still grows, or was left by a
-    crash stays.
+    Only closed huddle recordings of the bench of that name are removed: what is something else, is
+    of another bench or imported, still grows, or was left by a crash stays.
 
     Raises
     ------
     RecordingError
-        If one cannot be removed.
+        If some cannot be removed; the others are.
     """
     limit = (now or utc_now()) - timedelta(seconds=retention)
-    removed = []
+    removed, kept = [], []
     for path in sorted(directory.glob("*.h5")):
-        if _is_old(path, limit):
+        if _is_old(path, limit, bench):
             try:
                 path.unlink()
             except OSError as error:
-                raise RecordingError(f"{path}: cannot be removed: {error.strerror}") from error
-            removed.append(path)
+                kept.append(f"{path}: cannot be removed: {error.strerror}")
+            else:
+                removed.append(path)
+    if kept:
+        raise RecordingError("; ".join(kept))
     return removed
 
 
-def _is_old(path: Path, limit: datetime) -> bool:
+def _is_old(path: Path, limit: datetime, bench: str) -> bool:
     try:
         with Recording.open(path) as recording:
             old = recording.closed and recording.created < limit
-    except RecordingError:
+            own = old and recording.bench is not None and recording.bench.name == bench
+        return own and not is_being_written(path)
+    except (HuddleError, OSError):  # no recording of ours, or gone meanwhile
         return False
-    return old and not is_being_written(path)

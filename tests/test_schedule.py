@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import pathlib
 from datetime import UTC, datetime, timedelta
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -10,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench import Channel, Schedule
-from daq.errors import NoAnswerError, NotConnectedError
+from daq.bench import Channel, Schedule, parse
+from daq.errors import NoAnswerError, NotConnectedError, RecordingError
 from daq.protocols.block import HostTime
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
-from daq.schedule import RunNotice, due_times, remove_old, serve
+from daq.schedule import GRACE, MOST_TOLD, RunNotice, due_times, remove_old, serve
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -171,21 +172,104 @@ async def test_stop_ends_the_wait() -> None:
     await asyncio.wait_for(task, 5)
 
 
-def test_only_old_closed_recordings_are_removed(tmp_path: Path) -> None:
-    def make(name: str, age_days: float, *, close: bool = True) -> Path:
+def test_in_the_hour_that_comes_twice_runs_come_twice() -> None:
+    """25 October 2026 in Berlin: hourly runs stay hourly, a daily one stays daily."""
+    before = datetime(2026, 10, 24, 23, 0, tzinfo=UTC)
+    hourly = Schedule(cron=("30 * * * *",), time_zone="Europe/Berlin")
+    times = [due.astimezone(UTC).strftime("%H:%M") for due in islice(due_times(hourly, before), 4)]
+    assert times == ["23:30", "00:30", "01:30", "02:30"]
+    daily = Schedule(cron=("30 2 * * *",), time_zone="Europe/Berlin")
+    days = [due.strftime("%d %H:%M") for due in islice(due_times(daily, before), 2)]
+    assert days == ["25 02:30", "26 02:30"]
+
+
+async def test_years_that_were_missed_are_told_in_a_few_words() -> None:
+    """A computer without a clock of its own wakes up in 1970, and is then told the time."""
+    night = Night(timedelta(minutes=1))
+    night.time = datetime(1970, 1, 1, 0, 0, 30, tzinfo=UTC)
+
+    async def set_clock(seconds: float) -> None:
+        early = night.time.year == 1970
+        night.time = START + GRACE if early else night.time + timedelta(seconds=seconds)
+
+    await serve(
+        Schedule(cron=("*/10 * * * *",)),
+        night.run,
+        stop=night.stop,
+        notice=night.notice,
+        now=lambda: night.time,
+        sleep=set_clock,
+    )
+    assert [kind for kind, _ in night.said] == ["missed"] * (MOST_TOLD + 1) + [
+        "started",
+        "finished",
+    ]
+    assert night.said[-1] == ("finished", "12:10")
+    assert "all others until 2026-11-21 12:00" in night.texts[MOST_TOLD]
+
+
+async def test_trouble_of_the_system_fails_one_run() -> None:
+    night = Night(OSError(28, "No space left on device"), timedelta(minutes=1))
+    await night.serve("0 * * * *")
+    assert [kind for kind, _ in night.said] == ["started", "failed", "started", "finished"]
+    assert "No space left" in night.texts[1]
+
+
+BENCH = """
+name = "{name}"
+sampling_rate = 10.0
+
+[[sensors]]
+name = "a"
+driver = "epson"
+port = "x"
+channels = [{{name = "x", sensitivity = 1.0}}]
+"""
+
+
+def test_only_old_closed_recordings_of_the_bench_are_removed(tmp_path: Path) -> None:
+    def make(name: str, age_days: float, *, bench: str | None = "mine") -> RecordingWriter:
         utc_ns = round((START.timestamp() - age_days * 86400) * 1e9)
         sensor = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 10.0, np.dtype("i4"))
-        path = tmp_path / name
-        writer = RecordingWriter.create(path, sensors=[sensor], created=HostTime(0, utc_ns))
-        if close:
-            writer.close()
-        else:
-            writer.abandon()
-        return path
+        return RecordingWriter.create(
+            tmp_path / name,
+            parse(BENCH.format(name=bench), "bench.toml", check=False) if bench else None,
+            sensors=[sensor],
+            created=HostTime(0, utc_ns),
+        )
 
-    old = make("old.h5", 31)
-    make("new.h5", 29)
-    make("killed.h5", 31, close=False)
+    make("old.h5", 31).close()
+    make("new.h5", 29).close()
+    make("other.h5", 31, bench="other").close()
+    make("imported.h5", 31, bench=None).close()
+    make("killed.h5", 31).abandon()
     (tmp_path / "foreign.h5").write_text("mine", encoding="utf-8")
-    assert remove_old(tmp_path, 30 * 86400, now=START) == [old]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign.h5", "killed.h5", "new.h5"]
+    running = make("running.h5", 31)
+    removed = remove_old(tmp_path, 30 * 86400, bench="mine", now=START)
+    running.close()
+    assert removed == [tmp_path / "old.h5"]
+    kept = ["foreign.h5", "imported.h5", "killed.h5", "new.h5", "other.h5", "running.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == kept
+
+
+def test_one_that_cannot_be_removed_does_not_keep_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    utc_ns = round((START.timestamp() - 31 * 86400) * 1e9)
+    sensor = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 10.0, np.dtype("i4"))
+    bench = parse(BENCH.format(name="mine"), "bench.toml", check=False)
+    for name in ("1.h5", "2.h5"):
+        RecordingWriter.create(
+            tmp_path / name, bench, sensors=[sensor], created=HostTime(0, utc_ns)
+        ).close()
+    unlink = pathlib.Path.unlink
+
+    def refuse(path: Path) -> None:
+        if path.name == "1.h5":  # a superuser's test cannot take itself the right
+            raise PermissionError(13, "Permission denied")
+        unlink(path)
+
+    monkeypatch.setattr(pathlib.Path, "unlink", refuse)
+    with pytest.raises(RecordingError, match=r"1\.h5: cannot be removed: Permission denied"):
+        remove_old(tmp_path, 30 * 86400, bench="mine", now=START)
+    assert [path.name for path in tmp_path.iterdir()] == ["1.h5"]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from daq.bench import load
 from daq.clock import SystemClock
-from daq.errors import BenchFileError, HuddleError
+from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.recorder import recording_path
 from daq.schedule import due_times, remove_old, serve, utc_now
 from tui.output import for_people, notices, write_json
@@ -65,12 +65,23 @@ async def _serve(path: Path, bench: Bench) -> None:
             loop.add_signal_handler(number, stop.set)
 
     async def run(_: datetime) -> None:
+        _remove_old(bench)  # first: a full disk would end the run before it has begun
         await _run(path, bench, stop)
-        if bench.recording.retention is not None:
-            for old in remove_old(bench.recording_directory, bench.recording.retention):
-                notices().print(f"{old} removed: older than the bench file keeps")
+        _remove_old(bench)
 
     await serve(bench.schedule, run, stop=stop, notice=_tell)
+
+
+def _remove_old(bench: Bench) -> None:
+    """Keep to the bench file's retention; what cannot be removed is no reason not to run."""
+    if bench.recording.retention is None:
+        return
+    directory, retention = bench.recording_directory, bench.recording.retention
+    try:
+        for old in remove_old(directory, retention, bench=bench.name):
+            notices().print(f"{old} removed: older than the bench file keeps", soft_wrap=True)
+    except RecordingError as error:
+        notices().print(str(error), soft_wrap=True)
 
 
 async def _run(path: Path, bench: Bench, stop: asyncio.Event) -> None:
