@@ -243,6 +243,15 @@ class ScreamServer:
             return ()
         return (scream.ACKNOWLEDGED, *self.due(now))
 
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: packets are numbered anew, and none can be asked for again."""
+        if kind == "reset":
+            self._sequence = 0
+            self._sent.clear()
+            if self._until > now:
+                self._digitizer.start(now)
+        return ()
+
     def _begin(self, now: float, until: float) -> None:
         if self._until <= now:
             self._digitizer.start(now)
@@ -250,7 +259,8 @@ class ScreamServer:
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the packets of the blocks completed by ``now``."""
-        if self._until <= now:
+        if self._until <= now:  # nobody has asked for long enough
+            self._until = 0.0
             return ()
         packets: list[bytes] = []
         for block in self._digitizer.blocks(now):

@@ -55,9 +55,8 @@ class Samples:
     def end_before(self, now: float, start: int) -> int:
         """Index after the last sample, from ``start`` on, that has been taken by ``now``."""
         self._hold(start)
-        while self._times[-1] <= now:
-            start = self._first + len(self._times)
-            self._hold(start)
+        if self._times[-1] <= now:  # not stretch by stretch: nobody may have asked for hours
+            self._hold(self.first_after(now))
         return self._first + int(np.searchsorted(self._times, now, side="right"))
 
     def counts(self, first: int, n: int) -> NDArray[np.float64]:

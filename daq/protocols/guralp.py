@@ -45,6 +45,8 @@ MAX_PENDING = 64
 """Blocks a stream may be ahead of the others."""
 FULL_SCALE_COUNTS = (1 << 23) - 1
 """Of a 24-bit digitizer."""
+MOST_PACKETS = 1024
+"""Packets whose number lies further from what is due are of a server that was restarted."""
 
 
 @dataclass(slots=True)
@@ -379,7 +381,13 @@ class ScreamDecoder:
         sequence = packet.sequence
         due = sequence if self._next is None else self._next
         ahead = (sequence - due) % 65536
-        if ahead < 32768:
+        if min(ahead, 65536 - ahead) > MOST_PACKETS:
+            self._missing.clear()
+            self._next = (sequence + 1) % 65536
+            self.streams.lost("server restarted")
+            text = f"the server numbers anew: packet {sequence} came, {due} was due"
+            yield Event(self._name, "reset", text, at)
+        elif ahead < 32768:
             yield from self._advance(due, ahead, at)
             self._next = (sequence + 1) % 65536
         self._missing.pop(sequence, None)

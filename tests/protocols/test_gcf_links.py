@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -386,3 +387,21 @@ def test_memory_stays_bounded() -> None:
     tcp = ScreamDecoder(SENSORS)
     tcp.receive(b"\x28" * 300_000, AT)
     assert len(tcp._finder._buffer) <= 4096  # noqa: SLF001 -- the claim
+
+
+@pytest.mark.parametrize("before", [3, 40_000, 60_000])
+def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
+    """Its packets go on being told apart: one that is lost afterwards is awaited again."""
+    decoder = ScreamDecoder(SENSORS)
+    blocks = [scream.Packet(0, "", sample_block(i, s)) for s in range(30) for i in range(3)]
+    numbers = [*range(before, before + 45), *range(20_000, 20_045)]
+    found: list[Block | Event] = []
+    for packet, number in zip(blocks, numbers, strict=True):
+        if number != 20_009:
+            data = scream.encode_packet(replace(packet, sequence=number))
+            found += decoder.receive_datagram(data, AT)
+        if number == 20_012:
+            assert decoder.missing == (20_009,)
+    _, _, events = joined(found)
+    said = f"the server numbers anew: packet 20000 came, {before + 45} was due"
+    assert [e.text for e in events if e.kind == "reset"] == [said]

@@ -1,0 +1,50 @@
+"""Samples that a device has taken, however long nobody asked."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from daq.protocols import rtu
+from sim_devices.device import Source
+from sim_devices.fifo import FifoDevice
+from sim_devices.guralp import create as create_guralp
+from sim_devices.sampling import Samples
+from sim_devices.serve import device_spec
+from tests.sim_devices.bench import device, scenario
+
+RATE = 200.0
+
+
+def test_the_end_is_where_the_times_say() -> None:
+    spec = device_spec(device("A", "text"))
+    source = Source(scenario("A"), spec)
+    samples = Samples(source, spec.sensors)
+    now, start = 0.0, 0
+    for step in np.random.default_rng(3).exponential(1.0, 40):
+        now += float(step)
+        start = samples.end_before(now, start)
+        times = source.times("A", max(0, start - 2), 4)
+        assert np.searchsorted(times, now, side="right") == min(2, start)
+
+
+def test_a_fifo_nobody_read_for_a_day_answers_at_once() -> None:
+    spec = device_spec(device("A", "fifo", sampling_rate=RATE, settings={"capacity": 3000}))
+    unit = FifoDevice(spec, Source(scenario("A"), spec))
+    began = time.process_time()
+    unit.receive(rtu.read_request(1, 2, 1), 86_400.0)
+    (reply,) = unit.due(86_401.0)
+    assert time.process_time() - began < 2.0
+    assert int.from_bytes(reply[3:5], "big") == 3000
+
+
+def test_a_scream_server_whose_client_is_gone_rests() -> None:
+    spec = replace(device_spec(device("A", "guralp", port="udp")), utc_ns=1_795_219_200 * 10**9)
+    server = create_guralp(spec, Source(scenario("A"), spec))[0].endpoint
+    server.receive(b"GCFSEND:B\0", 1.0)
+    assert server.due(20.0)
+    assert server.next_due() < 25.0
+    assert not server.due(100.0)
+    assert server.next_due() == float("inf")
