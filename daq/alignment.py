@@ -124,7 +124,9 @@ class AlignedRecording:
     @property
     def is_exact(self) -> bool:
         """Whether every sensor's samples fall on the grid, so that no clock had to be estimated."""
-        return self._start is None or all(self._passes(source) for source in self._sources)
+        return self._start is None or all(
+            self._passes(source) and not source.offset_in_doubt for source in self._sources
+        )
 
     def delays(self, at: FloatArray) -> FloatArray:
         """Return how far each sensor's count of time lags the grid, by the clocks as known now.
@@ -150,6 +152,7 @@ class AlignedRecording:
     def measurable(self) -> tuple[int, ...]:
         """Sensors whose delay the samples could tell: the reference, then one of each free clock.
 
+        And those that share a clock, where it is in doubt how many samples apart they began.
         Empty where no clock has to be estimated. Sensors are numbered in order.
         """
         if self.is_exact:
@@ -159,7 +162,7 @@ class AlignedRecording:
         free = []
         for number, source in enumerate(self._sources):
             stated = source.device_utc or source.polled
-            if not stated and source.clock_name not in seen:
+            if not stated and (source.clock_name not in seen or source.offset_in_doubt):
                 free.append(number)
                 seen.add(source.clock_name)
         return (reference, *free) if free else ()
@@ -210,28 +213,28 @@ class AlignedRecording:
         together = len({source.clock_name for source in sources}) == 1 and not any(
             source.device_utc or source.polled for source in sources
         )
-        if together and len({source.record.sampling_rate for source in sources}) == 1:
-            for source in sources:
+        together = together and len({source.record.sampling_rate for source in sources}) == 1
+        reference = sources[self._reference]
+        first_of: dict[str, SensorSource] = {}
+        for source in [reference, *sources]:
+            first = first_of.setdefault(source.clock_name, source)
+            measured = None if source is reference else source.measured(reference.known_clock)
+            if source.polled:
+                source.clock = self._polled(source)
+            elif first is not source and not source.device_utc:
+                source.share(first, measured)
+            elif together:
+                ppm, ppm_std = source.arrivals.rate()
                 source.clock = nominal(
                     source.record.name,
                     f"clock of {source.clock_name}",
                     end_sample=source.end_sample,
                     sampling_rate=source.record.sampling_rate,
+                    ppm=ppm,
+                    ppm_std=ppm_std,
                 )
-            return
-        reference = sources[self._reference]
-        solved: dict[str, Clock] = {}
-        for source in [reference, *sources]:
-            name = source.record.name
-            known = solved.get(source.clock_name)
-            if source.polled:
-                source.clock = self._polled(source)
-            elif known is None or source.device_utc:
-                measured = None if source is reference else source.measured(reference.known_clock)
-                source.clock = source.arrivals.solve(name, measured)
-                solved[source.clock_name] = source.clock
-            elif known.state.sensor != name:
-                source.clock = known.shared_by(name).extended(source.end_sample)
+            else:
+                source.clock = source.arrivals.solve(source.record.name, measured)
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""

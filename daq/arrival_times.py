@@ -39,6 +39,8 @@ from daq.polling import Polls
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
@@ -158,6 +160,33 @@ class ArrivalTimes:
         """
         first = self._index <= self._index[0] + _NODE * self.sampling_rate
         return float(self._late[first & (self._epoch == self._epoch[0])].min())
+
+    def come_with(self, other: ArrivalTimes) -> bool:
+        """Whether blocks of both are received together, so that both count alike."""
+        _, mine, others = np.intersect1d(self._index, other._index, return_indices=True)
+        return len(mine) > 0 and np.array_equal(self._late[mine], other._late[others])
+
+    def earliest(self) -> Iterator[tuple[int, int, FloatArray, FloatArray]]:
+        """Yield of each epoch its first sample and the one after its last, and early arrivals.
+
+        Those are indices of samples, and seconds from the origin by which they were taken.
+        """
+        for number, (first, end) in enumerate(self._bounds()):
+            index = self._index[self._epoch == number].astype(np.float64)
+            late = self._late[self._epoch == number]
+            yield first, end, index, index / self.sampling_rate + late
+
+    def rate(self) -> tuple[float, float]:
+        """Return the rate against nominal on the host's clock in ppm, and its uncertainty.
+
+        By the line under all arrivals: for sensors that share a clock, which need no more.
+        """
+        slope, anchors = self._lines()
+        above = self._late - slope * self._index - np.array(anchors)[self._epoch]
+        duration = float(self._index[-1] - self._index[0]) / self.sampling_rate
+        drift = slope * self.sampling_rate
+        std = float(np.median(above)) / duration if duration else math.nan
+        return -drift / (1 + drift) * 1e6, std * 1e6
 
     def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:
         """Return the clock, from everything taken so far.

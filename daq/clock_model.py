@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
+_NEVER = 1 << 62  # a sample index beyond all others
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:
@@ -137,10 +139,41 @@ class Clock:
         last = replace(self.epochs[-1], end_sample=end_sample)
         return replace(self, epochs=(*self.epochs[:-1], last))
 
-    def shared_by(self, sensor: str) -> Clock:
-        """Return the same clock for another sensor."""
-        state = replace(self.state, sensor=sensor, source=f"clock of {self.state.sensor}")
-        return replace(self, state=state)
+    def shared_by(self, sensor: str, *, end_sample: int) -> Clock:
+        """Return the same clock for a sensor whose samples it counts alike."""
+        clock = self.extended(end_sample)
+        return replace(clock, state=replace(self.state, sensor=sensor, source=self._shared))
+
+    def shifted(
+        self, sensor: str, stretches: Sequence[tuple[int, int, int]], *, by_samples: bool
+    ) -> Clock:
+        """Return the same clock for a sensor that began to count at another sample.
+
+        Parameters
+        ----------
+        sensor : str
+        stretches : sequence of (first_sample, end_sample, n)
+            In which its sample i is taken with sample i + n of this clock.
+        by_samples : bool
+            Whether n is known from the samples, rather than from arrival times.
+        """
+        ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
+        starts = [-_NEVER, *ends[:-1]]
+        epochs = tuple(
+            Epoch(max(first, start - n), min(end, stop - n), epoch.index - n, epoch.seconds)
+            for first, end, n in stretches
+            for epoch, start, stop in zip(self.epochs, starts, ends, strict=True)
+            if max(first, start - n) < min(end, stop - n)
+        )
+        how = "samples" if by_samples else "arrival times"
+        source = f"{self._shared}, whole samples apart by {how}"
+        state = replace(self.state, sensor=sensor, source=source, offset=epochs[0].start)
+        return Clock(epochs, replace(state, n_epochs=len(epochs)))
+
+    @property
+    def _shared(self) -> str:
+        source, name = self.state.source, self.state.sensor
+        return source if source.startswith("clock of") else f"clock of {name}"
 
     def _by_epoch(
         self,
@@ -192,12 +225,14 @@ def nominal(
     end_sample: int,
     sampling_rate: float,
     first: int = 0,
+    ppm: float = 0.0,
+    ppm_std: float = 0.0,
     residual: float = 0.0,
 ) -> Clock:
     """Return the clock that *is* the timeline: sample n is taken at (first + n) / sampling_rate."""
     index = np.array([0.0, max(float(end_sample), 1.0)])
     epoch = Epoch(0, end_sample, index, (first + index) / sampling_rate)
-    state = ClockState(sensor, source, epoch.start, 0.0, 0.0, 0.0, residual, 1)
+    state = ClockState(sensor, source, epoch.start, ppm, ppm_std, 0.0, residual, 1)
     return Clock((epoch,), state)
 
 

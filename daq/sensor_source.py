@@ -61,6 +61,8 @@ class SensorSource:
     clock: Clock | None = None
     learnt: list[Learnt] = field(default_factory=list)
     frame_delay: float = 0.0
+    offset_in_doubt: bool = False
+    """Whether how many samples apart it and others of its clock began had to be estimated."""
 
     @property
     def end_sample(self) -> int:
@@ -147,6 +149,31 @@ class SensorSource:
         seconds = reference.at(at_reference) - delay - self.frame_delay
         std = np.concatenate([each.std for each in self.learnt])
         return MeasuredDelays(index, seconds, std)
+
+    def share(self, first: SensorSource, measured: MeasuredDelays | None) -> None:
+        """Set the clock to that of another sensor, which the same oscillator samples.
+
+        Sensors whose blocks are received together count alike. Others have begun to count at
+        different samples: how many apart, the samples tell, or else the arrival times.
+        """
+        name, known = self.record.name, first.known_clock
+        self.offset_in_doubt = not self.arrivals.come_with(first.arrivals)
+        if not self.offset_in_doubt:
+            self.clock = known.shared_by(name, end_sample=self.end_sample)
+            return
+        stretches, by_samples = [], measured is not None
+        for begin, end, index, seconds in self.arrivals.earliest():
+            apart = float((known.position(seconds) - index).min())
+            if measured is not None:
+                mine = (measured.index >= begin) & (measured.index < end)
+                mine &= np.isfinite(measured.std)
+                if mine.any():
+                    position = known.position(measured.seconds[mine])
+                    apart = float(np.median(position - measured.index[mine]))
+                else:
+                    by_samples = False
+            stretches.append((begin, end, round(apart)))
+        self.clock = known.shifted(name, stretches, by_samples=by_samples)
 
 
 def main_columns(record: SensorRecord) -> list[int]:

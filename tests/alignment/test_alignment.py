@@ -9,6 +9,7 @@ import pytest
 
 from daq.alignment import AlignedRecording
 from daq.errors import CannotAlignError
+from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
 from daq.resampling import reach
 from tests.alignment.recordings import Sensor, blocks, counts, create, write
@@ -159,3 +160,60 @@ def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
         pytest.raises(CannotAlignError, match="ask for 100 Hz or less"),
     ):
         AlignedRecording(recording, sampling_rate=200.0)
+
+
+def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(tmp_path: Path) -> None:
+    raw = counts(5000, 1, 8)
+    sensors = {
+        "a": Sensor(raw[:4000], clock="one"),
+        "b": Sensor(raw[137:4600], clock="one", start=1.37, late=1.2e-3),
+        "c": Sensor(raw[60:4700], clock="one", start=0.60, late=2.9e-3, restarts=(2000,)),
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert valid.all()
+        assert len(samples) == 4000 - 137
+        assert np.array_equal(samples, np.repeat(raw[137:4000], 3, axis=1).astype(float))
+        assert [clock.source for clock in aligned.clocks] == [
+            "clock of one",
+            *["clock of one, whole samples apart by arrival times"] * 2,
+        ]
+
+
+def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    motion = np.cumsum(rng.standard_normal((12_200, 1)), axis=0)
+
+    def seen(first: int, seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
+        return np.round(1e5 * (motion[first : first + 12_000] + 0.01 * noise)).astype(np.int32)
+
+    sensors = {
+        "a": Sensor(seen(0, 1), clock="one"),
+        "b": Sensor(seen(0, 2), clock="one"),
+        "c": Sensor(seen(50, 3), clock="one", start=0.5, late=27e-3),  # nearly three samples late
+    }
+    path = write(tmp_path / "r.h5", sensors)
+    apart = {}
+    for clocks in ("arrivals", "refined"):
+        snapshot = estimate([path], Settings(segment=4.0, clocks=clocks))
+        apart[clocks] = -100.0 * (snapshot.drift[:, 3] - snapshot.drift[:, 1])
+        assert snapshot.clocks[1].source == "clock of one"  # with "a" in every block
+    assert np.allclose(apart["arrivals"], -53.0)
+    assert np.allclose(apart["refined"], -50.0)
+    assert snapshot.clocks[2].source == "clock of one, whole samples apart by samples"
+    assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
+
+
+def test_a_shared_clock_has_a_rate_too(tmp_path: Path) -> None:
+    rate = 100.0 * (1 + 18e-6)
+    sensors = {
+        n: Sensor(counts(60_000, 1, 1), rate=rate, nominal=100.0, clock="one") for n in "abc"
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        for state in aligned.clocks:
+            assert state.ppm == pytest.approx(18.0, abs=0.01)
+            assert state.ppm_std < 0.01
