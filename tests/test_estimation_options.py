@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -163,6 +164,33 @@ def test_the_dimension_is_chosen_by_band_and_lowers_the_scatter(tmp_path: Path) 
     assert np.nanmedian(with_one[1:-1]) < 0.9 * np.nanmedian(with_three[1:-1])
     with pytest.raises(InsufficientDataError, match="at most"):
         estimate([path], replace(usual, dimension=9))
+
+
+def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
+    tmp_path: Path,
+) -> None:
+    sensors = bench()
+    writer = create(tmp_path / "r.h5", sensors)
+    arriving = sorted(
+        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
+        key=lambda block: block.received.monotonic_ns,
+    )
+    settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
+    chosen_at: list[int] = []
+    last: object = None
+    with Estimation([tmp_path / "r.h5"], settings) as live:
+        for number, block in enumerate(arriving[:480]):  # 80 s, 160 segments
+            writer.append(block)
+            if number % 30 == 29:
+                writer.commit()
+                live.update()
+                choices = live.snapshot().diagnostics.get("dimension")
+                if choices is not None and choices is not last:
+                    chosen_at.append(live.n_segments)
+                    last = choices
+        writer.close()
+    assert len(chosen_at) >= 3
+    assert all(later >= 2 * earlier for earlier, later in pairwise(chosen_at))
 
 
 def test_gains_known_beforehand_are_those_of_the_two_channel_method(tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ _LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are t
 _FINAL_TOLERANCE = 1e-7
 _REVIEW = 1.25  # growth after which that is looked at
 _FIRST_REVIEW = 8  # segments
+_RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
 _MOST_PASSES = 4
 
 
@@ -250,7 +251,7 @@ class Estimation:
         if not bands:
             return Estimates({}, {}, None)
         dims = self._passes[0].aligned.dims
-        keep = not final and self.n_segments < _REVIEW * self._chosen_at
+        keep = not final and self.n_segments < _RECHOICE * self._chosen_at
         estimates = noise_estimates(
             bands,
             self.settings,
