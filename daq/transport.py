@@ -53,13 +53,15 @@ class ByteStream:
         self._paused = False
         self._wire: Wire
 
-    def expect(self, n_bytes: int) -> None:
-        """Wake only when so many bytes are there, instead of one: as many frames at once.
+    def expect(self, n_frames: int, size: int = 1) -> None:
+        """Wake only when so many frames of ``size`` bytes are there, instead of at every byte.
 
         The kernel does the waiting, so that the time at which the last byte came is no less exact.
-        A serial port counts to 255 at the most. A hang-up is still seen at once.
+        A serial port counts to 255 bytes at the most, which are then fewer frames. A hang-up is
+        still seen at once.
         """
-        self._wire.expect(max(1, n_bytes))
+        most = max(1, self._wire.most_expected // size)
+        self._wire.expect(max(1, min(n_frames, most) * size))
 
     async def read(self) -> tuple[bytes, HostTime]:
         """Return all that has come, at least one byte, and when the last of it came.

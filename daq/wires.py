@@ -31,6 +31,9 @@ _POLL = 0.1  # how long a reading thread may take to see that it should end, s
 class Wire(Protocol):
     """What a kind of port must be able to do; it feeds the stream by itself."""
 
+    most_expected: int
+    """Bytes that can be waited for together."""
+
     async def write(self, payload: bytes) -> None:
         """Send it all; raises OSError."""
         ...
@@ -54,6 +57,8 @@ class Wire(Protocol):
 
 class _TcpWire(asyncio.Protocol):
     """A TCP connection."""
+
+    most_expected = READ_SIZE
 
     def __init__(self, stream: ByteStream) -> None:
         self._stream = stream
@@ -110,6 +115,8 @@ async def open_tcp(host: str, number: int, stream: ByteStream) -> Wire:
 class _DescriptorWire:
     """Reads when the event loop says so; no thread, no polling."""
 
+    most_expected = 255
+
     def __init__(self, port: serial.SerialBase, stream: ByteStream) -> None:
         self._port = port
         self._descriptor: int = port.fileno()
@@ -156,7 +163,7 @@ class _DescriptorWire:
     def expect(self, n_bytes: int) -> None:
         with contextlib.suppress(termios.error):  # gone: the next read says so
             attributes = termios.tcgetattr(self._descriptor)
-            attributes[6][termios.VMIN] = min(n_bytes, 255)
+            attributes[6][termios.VMIN] = min(n_bytes, self.most_expected)
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
 
     def pause(self) -> None:
@@ -177,6 +184,8 @@ def _settle(future: asyncio.Future[None]) -> None:
 
 class _ThreadWire:
     """A thread reads; the event loop is told."""
+
+    most_expected = READ_SIZE
 
     def __init__(self, port: serial.Serial, stream: ByteStream, clock: HostClock) -> None:
         self._port = port

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 STALLED = 1.0
 """Without a frame for so long, in s, the device has stopped sending."""
-GATHER = 0.05
-"""Frames of so many seconds are decoded together."""
+GATHER = 0.1
+"""Frames of so many seconds are decoded together, which is what a row of ``blocks`` holds."""
 LISTEN = 0.5
 """How long a device that was lost is listened to before it is set up anew, s."""
 
@@ -83,7 +83,8 @@ class EpsonSession:
             self.decoder.resume()
             for item in self.decoder.receive(*self._heard):
                 yield item
-        self._stream.expect(round(GATHER * configuration.sampling_rate) * configuration.burst.size)
+        n_frames = round(GATHER * configuration.sampling_rate)
+        self._stream.expect(n_frames, configuration.burst.size)
         while True:
             try:
                 async with asyncio.timeout(patience):

@@ -153,6 +153,19 @@ async def test_it_wakes_when_as_many_bytes_are_there_as_were_expected(kind: str)
             await reading
 
 
+async def test_a_terminal_that_cannot_count_so_far_wakes_at_the_end_of_a_frame() -> None:
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(3, 100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(199))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 200
+
+
 async def test_discard_forgets_what_was_not_read() -> None:
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         stream.feed(b"old")
