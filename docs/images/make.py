@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import io
 import os
 import re
 import subprocess
@@ -18,12 +19,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from daq.estimation import Settings, estimate
 from daq.formats.import_ import import_files
 from tui.application.app import HuddleApp
 from tui.application.main import RecordingControls
 from tui.bands import band_means, log_edges
+from tui.report import drawing
+from tui.report.contents import report_of
+from tui.report.paper import pages
+from tui.report.source import sources
 from tui.results import correlation_of
 
 HERE = Path(__file__).parent
@@ -31,6 +37,12 @@ ROOT = HERE.parents[1]
 DATA = Path(os.environ.get("HUDDLE_DATA", ROOT.parent / "shared" / "data")) / "usgs-tst-huddle"
 BRAILLE = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3))
 METHODS = ("three-sensor", "three-channel")
+LIMIT = """
+[[limits]]
+name = "data sheet"
+frequency = [1.0, 10.0, 80.0]
+psd = [5e-12, 3e-12, 3e-12]
+"""
 
 
 _TEXT = re.compile(
@@ -118,9 +130,32 @@ def real_recording(folder: Path) -> None:
     figure.savefig(HERE / "usgs.png", dpi=110)
 
 
+def report(folder: Path) -> None:
+    """Draw the first two pages of a report on the demo's bench, with a limit, side by side."""
+    bench, recording = folder / "bench.toml", folder / "report.h5"
+    demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
+    bench.write_text(demo + LIMIT, encoding="utf-8")
+    command = [sys.executable, "-m", "tui", "simulate", str(bench), "--duration", "20min"]
+    subprocess.run([*command, "--out", str(recording)], check=True)
+    settings = Settings(segment=2.0, band=(2.0, 20.0))
+    contents = report_of(estimate([recording], settings), settings, sources([recording]))
+    sheets = []
+    with drawing.look():
+        for page in pages(contents)[:2]:
+            file = io.BytesIO()
+            page.savefig(file, dpi=240, facecolor="white")
+            sheets.append(Image.open(file).convert("RGB").reduce(3))
+    width, height = sheets[0].size
+    picture = Image.new("RGB", (2 * width + 8, height), "#c8cdd2")
+    for number, sheet in enumerate(sheets):
+        picture.paste(sheet, (number * (width + 8), 0))
+    picture.quantize(96, Image.Quantize.MAXCOVERAGE).save(HERE / "report.png", optimize=True)
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         application(Path(folder))
+        report(Path(folder))
         real_recording(Path(folder))
 
 

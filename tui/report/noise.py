@@ -233,9 +233,8 @@ def _level_with_error(mean: float, low: float, high: float) -> str:
     if not mean > 0:
         return decibel(mean)
     if low <= 0:
-        return f"< {decibel(high)}"
-    error = decibels(high) - decibels(mean)
-    return f"{decibel(mean)} ±{error:.1f}" if error >= 0.1 else f"{decibel(mean, 2)} ±{error:.2f}"
+        return f"< {decibel(high, 2)}"
+    return f"{decibel(mean, 2)} ±{decibels(high) - decibels(mean):.2f}"
 
 
 def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:

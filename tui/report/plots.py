@@ -39,6 +39,8 @@ TEST_POINTS = 90
 DRIFT_POINTS = 400
 NOISE_HEIGHT, TEST_HEIGHT, DRIFT_HEIGHT = 1.45, 1.25, 1.5
 REJECT = 0.01
+LEAST_DRIFT = 1e-7
+"""Seconds: less is drawn as none."""
 JUMP, STEEP = 1e-4, 5e-5
 """Seconds, and seconds per second, by which no clock changes but at a restart."""
 _TIMES = ((300, "s", 1), (10800, "min", 60), (259200, "h", 3600), (math.inf, "days", 86400))
@@ -363,6 +365,8 @@ def _draw_drift(seconds: FloatArray, left: FloatArray, names: list[str], axes: A
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 1.5, 2, 3, 5, 6, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(0, float(time[0] + time[-1]))
+    if largest < LEAST_DRIFT:
+        axes.set_ylim(-size * LEAST_DRIFT, size * LEAST_DRIFT)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
     axes.set_xlabel(f"time since the first sample ({word})")
