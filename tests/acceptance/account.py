@@ -178,6 +178,7 @@ class Account:
     between: int
     """Sent while the device was being found, identified and set up again, and not recorded."""
     gaps: int
+    """Between samples: not the one at the end of a device that is still lost."""
     exact_gaps: int
     """Of them with a length that the recording calls exact."""
     exact_gaps_off: int
@@ -187,6 +188,14 @@ class Account:
     missing: int
     """Samples in gaps."""
     sessions: int
+    power_failures: int
+    """Of the device: what is missing over one is estimated, and over nothing else."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether all is accounted for, and each gap exact that can be."""
+        is_exact = self.gaps - self.exact_gaps <= self.power_failures
+        return is_exact and not (self.wrong or self.lost or self.exact_gaps_off)
 
 
 def account(spec: Mapping[str, Any], log: Log, recording: SensorRecord) -> Account:
@@ -234,12 +243,15 @@ def account(spec: Mapping[str, Any], log: Log, recording: SensorRecord) -> Accou
         wrong=int(wrong.sum()),
         lost=len(missed) - len(set_up),
         between=len(set_up),
-        gaps=len(gaps),
+        gaps=len(errors),
         exact_gaps=int(exact.sum()),
         exact_gaps_off=int(np.count_nonzero(error[exact])),
         worst_estimate=int(np.abs(error[~exact]).max(initial=0)),
         missing=int(gaps["missing"].sum()),
         sessions=len(restarts),
+        power_failures=sum(
+            told["kind"] == "reset" for told in log.struck if told["sensors"] == [sensor]
+        ),
     )
 
 
