@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import resources
 
 import numpy as np
 import pytest
 
+from daq.bench import parse
 from tests.tui.made import SETTINGS, empty_snapshot, made_snapshot
-from tui.application.clocks import clock_line, drift_lines, effect
+from tui.application.clocks import clock_line, drift_lines
+from tui.demo import compare
+from tui.devices import scenario_of
+from tui.synchronisation import effect
 
 
 def test_effect_is_the_share_of_the_band_s_noise() -> None:
@@ -67,3 +72,17 @@ def test_drift_is_what_a_constant_rate_leaves() -> None:
     assert bent.x[-1] == pytest.approx(59 / 60)
     assert np.ptp(bent.y) == pytest.approx(20, rel=0.01)  # µs
     assert len(drift_lines(made_snapshot(), chosen="B", n_points=20)[0].x) <= 30
+
+
+@pytest.mark.parametrize(("share", "added"), [(0.0, 0.0), (0.1, 0.4), (3.0, 1.0)])
+def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    scenario = scenario_of(parse(text))
+    exact, ours = (
+        compare(made_snapshot(clock_share=each), SETTINGS, scenario) for each in (0.0, share)
+    )
+    noise = {(e.sensor, e.channel): e.noise_psd for e in exact if e.method == "three-sensor"}
+    for before, after in zip(exact, ours, strict=True):
+        wanted = added * noise[after.sensor, after.channel]  # by either method
+        assert before.low - after.low == pytest.approx(wanted, rel=1e-6, abs=1e-20)
+        assert after.high == before.high

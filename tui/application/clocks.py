@@ -10,35 +10,17 @@ from rich.table import Table
 from rich.text import Text
 
 from tui.application.curves import Line
-from tui.results import band_of
+from tui.synchronisation import effect, residuals
 
 if TYPE_CHECKING:
     from daq.clock_model import ClockState
     from daq.estimation import Settings, Snapshot
-    from tui.bands import FloatArray
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 NOTHING, HARMLESS, MATTERS = 0.001, 0.01, 0.05
 """Share of the noise that comes from the clocks: below it nothing, negligible, small."""
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
 _FEWEST_POINTS = 3
-
-
-def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
-    """Return which share of each channel's noise in the band is expected to come from clocks.
-
-    Shape (n_channels,); NaN where it is not known (yet).
-    """
-    share = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
-    if share is None or not snapshot.results:
-        return np.full(len(snapshot.channels), np.nan)
-    low, high = band_of(settings, snapshot.frequency)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    noise = next(iter(snapshot.results.values())).noise_psd[inside]
-    added = np.where(np.isfinite(share[inside] * noise), share[inside] * np.abs(noise), 0.0)
-    total = np.nansum(noise, axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
 
 
 def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
@@ -78,15 +60,6 @@ def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
     if worst < MATTERS:
         return f"small, {percent(worst)} of the noise", DOUBTFUL
     return f"they matter here, {percent(worst)} of the noise", BAD
-
-
-def residuals(snapshot: Snapshot) -> dict[str, float]:
-    """Return what is left between the clocks in seconds rms, by sensor.
-
-    Where the motion measures it, it is against the reference sensor, which has none itself.
-    """
-    known = snapshot.diagnostics.get("synchronisation", {}).get("residual")
-    return {clock.sensor: clock.residual for clock in snapshot.clocks} if known is None else known
 
 
 def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:
