@@ -36,13 +36,25 @@ def for_people(json_file: str | None, csv_file: str | None = None) -> Console:
     return notices() if STANDARD_OUTPUT in {json_file, csv_file} else console()
 
 
-def write_text(file: str, text: str) -> None:
-    """Write to a file, or to standard output if it is called ``-``."""
-    if file == STANDARD_OUTPUT:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    else:
-        Path(file).write_text(text, encoding="utf-8")
+def write_text(file: str, text: str, *, append: bool = False) -> None:
+    """Write to a file, or to standard output if it is called ``-``.
+
+    Raises
+    ------
+    OSError
+        With the name of what could not be written: a full disk tells none.
+    """
+    try:
+        if file == STANDARD_OUTPUT:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        else:
+            with Path(file).open("a" if append else "w", encoding="utf-8") as out:
+                out.write(text)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = "standard output" if file == STANDARD_OUTPUT else file
+        raise
 
 
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:

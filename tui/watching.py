@@ -6,7 +6,6 @@ import json as json_text
 import math
 import sys
 import threading
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import RecordingError
@@ -14,11 +13,13 @@ from daq.estimation import Settings
 from daq.recording.reader import Recording
 from tui.estimating import chosen, show_result
 from tui.following import follow
-from tui.output import STANDARD_OUTPUT, console, finite
+from tui.output import console, finite, write_text
 from tui.results import band_of, channel_means, reached_cov
 from tui.text import clock_time, time_left
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from daq.estimation import Snapshot
     from tui.state import Now
 
@@ -93,7 +94,8 @@ class _Lines:
 
     def _write(self, document: dict[str, Any]) -> None:
         if self._json is not None:
-            _append(self._json, json_text.dumps(finite(document), ensure_ascii=False) + "\n")
+            line = json_text.dumps(finite(document), ensure_ascii=False) + "\n"
+            write_text(self._json, line, append=True)
 
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:
@@ -144,12 +146,3 @@ def _update(snapshot: Snapshot, settings: Settings, now: Now | None) -> dict[str
             for method, noise in snapshot.results.items()
         }
     return document
-
-
-def _append(file: str, line: str) -> None:
-    if file == STANDARD_OUTPUT:
-        sys.stdout.write(line)
-        sys.stdout.flush()
-    else:
-        with Path(file).open("a", encoding="utf-8") as lines:
-            lines.write(line)

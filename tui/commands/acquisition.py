@@ -32,9 +32,9 @@ from tui.options import (
 @examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
 def tui(
     source: Annotated[
-        Path,
+        Path | None,
         typer.Argument(metavar="BENCH", help="Bench file, or a recording to look at."),
-    ],
+    ] = None,
     *,
     method: MethodOption = None,
 ) -> None:
@@ -42,6 +42,13 @@ def tui(
 
     Closing it does not stop a recording; opening it again finds it.
     """
+    if source is None:
+        there = sorted(path.name for path in Path().glob("*.toml"))
+        here = f"; in this folder: {', '.join(there)}" if there else ""
+        raise typer.BadParameter(
+            f"expected a bench file (huddle init writes one) or a recording{here}; without either,"
+            " huddle demo shows a bench at work"
+        )
     from tui.application.main import open_application
 
     open_application(source, method=method)

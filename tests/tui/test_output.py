@@ -1,0 +1,52 @@
+"""Where results go, and what is said when they cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tui.command import app
+from tui.output import write_text
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="a device that is always full")
+@pytest.mark.parametrize("append", [False, True])
+def test_a_full_disk_is_told_with_the_file_s_name(append: bool) -> None:
+    with pytest.raises(OSError, match="No space left") as trouble:
+        write_text(str(FULL), "{}", append=append)
+    assert trouble.value.filename == str(FULL)
+
+
+def test_lines_are_appended(tmp_path: Path) -> None:
+    out = tmp_path / "lines.json"
+    for line in ("1\n", "2\n"):
+        write_text(str(out), line, append=True)
+    assert out.read_text(encoding="utf-8") == "1\n2\n"
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("arrays.npz", "huddle import arrays.npz --out arrays.h5"),
+        ("missing.toml", "huddle init -o missing.toml"),
+    ],
+)
+def test_the_application_says_what_to_do_with_other_files(source: str, said: str) -> None:
+    result = CliRunner().invoke(app, ["tui", source])
+    assert result.exit_code == 2
+    assert said in " ".join(result.output.split())
+
+
+def test_the_application_without_a_file_says_what_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lab.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["tui"])
+    assert result.exit_code == 2
+    assert "lab.toml" in result.output
+    assert "huddle init" in result.output
