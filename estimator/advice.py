@@ -198,7 +198,7 @@ def _incoherence(
         if likely >= FAR_OFF:
             level = "problem"
         apart = (
-            f"{percent(at_most)} of it where waves cross sensors that stand apart"
+            f"up to {percent(at_most)} of it where waves cross sensors that stand apart"
             if np.isfinite(at_most)
             else "any amount where waves cross sensors that stand apart, which three sensors of "
             f"{d} channel{'s' if d > 1 else ''} cannot show"
@@ -206,9 +206,10 @@ def _incoherence(
         few = "1 dimension" if d == 1 else f"{d} dimensions"
         text = (
             f"At {in_hz(_span(run))} one motion of {few} does not explain what the sensors have in "
-            f"common (statistic {ratio:.3g} times its expectation{at}). "
-            f"Unexplained is {percent(seen)} of the noise; the estimate "
-            f"{'is wrong' if off >= FAR_OFF else 'may be off'} there, by up to about "
+            f"common (statistic {ratio:.3g} times its expectation{at}"
+            f"{'' if level == 'problem' else ': certain, but small'}). At worst "
+            f"{percent(seen)} of the noise is unexplained, and the estimate "
+            f"{'is wrong' if off >= FAR_OFF else 'may be off'}, by up to about "
             f"{percent(off)} of it, and by {apart}."
         )
         remedy = (
@@ -233,6 +234,8 @@ def _incoherence(
             {
                 "statistic over expectation": ratio,
                 "worst": most,
+                "worst_low_hz": worst.low,
+                "worst_high_hz": worst.high,
                 "least p value": min(b.test.p_value for b in run),
                 "unexplained": seen,
                 "off": off,

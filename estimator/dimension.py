@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 LEVEL = 0.05
 """A dimension is accepted when its pooled p value is above this. An unneeded factor costs
 precision, a missing one is a bias: one band in twenty pays rather than all risk it."""
+SURE = 0.01
+"""Below this p value a band that nothing explains is not left to chance."""
 LEAST_BINS = 8
 MOST_BINS = 64
 """Frequencies of a band that are tested: of more, every second, third, …"""
@@ -67,15 +69,21 @@ class BandDimension:
     usual_cov: float
 
     @property
+    def is_biased(self) -> bool:
+        """Whether no dimension explains the band, beyond what chance does to one in a hundred."""
+        return not self.accepted and self.test.p_value < SURE
+
+    @property
     def text(self) -> str:
         """The choice and its price in words."""
         band = f"{self.low:.3g}–{self.high:.3g} Hz"
         price = f"c.o.v. of one bin {self.cov:.2g} instead of {self.usual_cov:.2g}"
         if not self.accepted:
+            effect = "the noise estimate is biased here"
             return (
                 f"{band}: not even {self.n_factors} dimensions of motion explain the averages "
-                f"(statistic {self.test.statistic / self.test.degrees:.2g} times its expectation): "
-                "the noise estimate is biased here"
+                f"(statistic {self.test.statistic / self.test.degrees:.3g} times its expectation): "
+                f"{effect if self.is_biased else 'by chance, or just so'}"
             )
         if self.n_factors < self.usual:
             return f"{band}: the motion has {self.n_factors} of {self.usual} dimensions; {price}"

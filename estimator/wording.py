@@ -46,7 +46,8 @@ def signed(value: float, spec: str) -> str:
 
 def percent(share: float) -> str:
     """Return a share in per cent, to two digits."""
-    return f"{100 * share:.2g} %" if share < 9.95 else f"{100 * share:.0f} %"
+    value = float(f"{100 * share:.2g}")
+    return f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
 def in_hz(band: tuple[float, float]) -> str:

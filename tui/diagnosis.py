@@ -79,7 +79,8 @@ def details(snapshot: Snapshot) -> list[RenderableType]:
     parts += [
         f"{advice.level}: {_with_remedy(advice.text, advice.remedy)}" for advice in found["advice"]
     ]
-    parts += [choice.text for choice in found.get("dimension", ())]
+    if "dimension" in found:
+        parts += _dimensions(snapshot)
     return parts
 
 
@@ -145,7 +146,7 @@ def _dimensions(snapshot: Snapshot) -> list[str]:
     """Return the choice and its price for the bands where it is not the usual one, in short."""
     choices = snapshot.diagnostics["dimension"]
     unusual = [choice for choice in choices if choice.accepted and choice.n_factors != choice.usual]
-    failing = [choice for choice in choices if not choice.accepted]
+    failing = [choice for choice in choices if choice.is_biased]
     lines = [choice.text for choice in unusual]
     if failing:
         where = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
@@ -161,14 +162,14 @@ def degrees(angle: float) -> str:
 
 
 def _fails(found: Sequence[Advice], _names: list[str]) -> str:
-    worst = sorted(found, key=lambda advice: advice.numbers["worst"], reverse=True)
-    where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in worst)
-    most = max(found, key=lambda advice: advice.numbers["unexplained"])
-    _, effect = most.text.split(". ", 1)
+    by_worst = sorted(found, key=lambda advice: advice.numbers["worst"], reverse=True)
+    most = by_worst[0].numbers
+    where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in by_worst)
+    effect = by_worst[0].text.partition("). ")[2].rstrip(".")
     return (
-        "model test fails at (statistic over its expectation) "
-        f"{where}: one common motion does not explain what the sensors share. "
-        f"At {_span(most)}: {effect.rstrip('.')}"
+        f"model test fails at {where}: one common motion does not explain what the sensors share "
+        f"(in brackets its statistic over the expectation, at worst, which is at "
+        f"{most['worst_low_hz']:.3g}–{most['worst_high_hz']:.3g} Hz). {effect}"
     )
 
 

@@ -221,10 +221,11 @@ def test_a_small_certain_misfit_is_graded_by_what_it_does() -> None:
     off = np.abs(truth.psi - 1).max()
     seen = np.sqrt(2 * truth.discrepancy[0] / 27)
     assert misfit.level == "warning"
+    assert "certain, but small" in misfit.text
     assert misfit.numbers["worst"] < 2.5
     assert misfit.numbers["unexplained"] == pytest.approx(seen, rel=0.2)
     assert off < misfit.numbers["off"] < 5 * off
-    assert "may be off there, by up to about" in misfit.text
+    assert "may be off, by up to about" in misfit.text
     assert "sensors closer together" in misfit.remedy
 
 
