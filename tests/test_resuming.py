@@ -1,6 +1,7 @@
-"""What is missing across a reconnection: exact where the device counted on, else estimated.
+"""Late, lost, and back: what is noticed when, and what is missing then.
 
-Against what the world made the devices feel and what they sent: every gap has its true length.
+Across a reconnection that is known exactly where the device counted on, else estimated. Against
+what the world made the devices feel and what they sent: every gap has its true length.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ if TYPE_CHECKING:
 SPEED = 8.0
 EPSON = [{"name": axis, "sensitivity": epson.COUNTS_PER_UNIT} for axis in "xyz"]
 LABJACK = [{"name": axis, "sensitivity": 3e5} for axis in "xyz"]
-EVERY = {"at": 30.0, "every": 60.0}  # for a busy machine, which starts devices slowly
+EVERY = {"at": 30.0, "every": 45.0}  # for a busy machine, which starts devices slowly
 CABLE = {"kind": "disconnect", "duration": 9.0, **EVERY}
-POWER = {"kind": "reset", "every": 60.0, "at": 34.0}
+POWER = {"kind": "reset", "every": 45.0, "at": 34.0}
 STALL = {"kind": "stall", "duration": 9.0, **EVERY}
 CASES: dict[str, tuple[str, list[dict[str, Any]]]] = {
     # driver, what happens; E: the epson driver, L: the labjack driver
@@ -100,3 +101,60 @@ async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> Non
                 assert (one.exact_gaps, one.exact_gaps_off) == (one.gaps, 0), (name, one, events)
             # An Epson that streams on keeps its sampling; a stream that is started anew does not.
             assert restarts.sum() == (1 if name == "E cable" else 1 + one.gaps), name
+
+
+PERIOD = 0.5
+"""Of the packets, s of world time: 100 scans of five."""
+
+
+@pytest.mark.timeout(120)
+async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_stall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.overdue.LATENESS", 1.0)  # however busy the machine is
+    speed = 4.0
+    told = spec(table("L", "labjack"), speed=speed, age=0.0)
+    told["faults"] = [  # one packet lost, and the next a little late; then nothing for a while
+        {"kind": "drop", "at": 16.0, "every": 32.0},
+        {"kind": "late", "at": 16.1, "every": 32.0, "duration": 1.0},
+        {"kind": "stall", "at": 26.0, "every": 32.0, "duration": 10.0},
+    ]
+    stop = asyncio.Event()
+    statuses: list[Status] = []
+    until = 0
+
+    def acknowledged(status: Status) -> None:
+        nonlocal until
+        statuses.append(status)
+        seen = [s.sensors["L"].state for s in statuses if s.sensors]
+        now = status.sensors["L"]
+        if "lost" in seen and now.state == "recording":
+            until = until or now.samples + 200
+            if now.samples >= until:
+                stop.set()
+
+    path = tmp_path / "r.h5"
+    async with started(told) as (one,):
+        settings = {**one.settings, "samples_per_packet": 500}
+        bench = Bench(
+            name="simulated",
+            sampling_rate=200.0,
+            sensors=tuple(sensors(one, table("L", "labjack"), settings=settings)),
+        )
+        await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
+    states = [status.sensors["L"].state for status in statuses if status.sensors]
+    with Recording.open(path) as recording:
+        (sensor,) = recording.sensors
+        by_kind = {e.kind: e for e in recording.events if e.sensor == "L"}
+        kinds = [e.kind for e in recording.events if e.sensor == "L" and e.kind != "resynchronised"]
+        assert kinds == ["connected", "late", "stalled", "connected"]
+        *lost, stalled = sensor.gaps
+        assert stalled["reason"] == b"stalled"
+        assert [(g["reason"], g["missing"], g["estimated"]) for g in lost] == [
+            (b"lost packet", 100, 0)
+        ] * len(lost)
+        if lost:  # the recorder had started before
+            assert "late" in states[: states.index("lost") - 1]
+        before = sensor.blocks[sensor.blocks["first_sample"] < stalled["first_sample"]][-1]
+        noticed = (by_kind["late"].received.monotonic_ns - before["monotonic_ns"]) / 1e9
+        assert 2 * PERIOD - 0.01 < noticed < 2 * PERIOD + 0.3 * speed
