@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
-_START = np.array([1e-2, 1e-4, 1e-1])  # what is not known at first: s, s/s, s
+_START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
 _RESTART_RATE = 1e-6
 _HUBER = 4.0
 

@@ -42,6 +42,7 @@ _NEWTON_STEPS = 3
 _FEWEST_SEGMENTS = 12  # in the first batch, per channel of the reference: P is a mean of those
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
+_OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
 _RIDGE = 1e-10  # of the mean power: keeps a dead channel from stopping everything
 
 
@@ -152,7 +153,8 @@ class DelayMeter:
             own = np.einsum("fpp->f", frame.own).real / frame.n_segments
             # How much of the sensor is predicted, as a weight that noise cannot raise.
             weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
-            delays[number] = self._peak((weight * squares / size)[:, None])[0] / 2
+            turned = (weight * squares / size)[:, None]
+            delays[number] = self._peak(turned, beyond=len(self.window) / 2)[0] / 2
         return delays
 
     def _spectra(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
@@ -193,10 +195,13 @@ class DelayMeter:
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
 
-    def _peak(self, crossed: ComplexArray) -> FloatArray:
-        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column."""
+    def _peak(self, crossed: ComplexArray, *, beyond: float = 0.0) -> FloatArray:
+        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column.
+
+        Up to `_LONGEST`; farther, up to `beyond` samples, where noise cannot be the reason.
+        """
         omega = self.omega
-        tau = self._search(crossed)
+        tau = self._search(crossed, beyond)
         for _ in range(_NEWTON_STEPS):
             turned = crossed * _turn(omega, tau)
             curvature = omega**2 @ turned.real
@@ -204,16 +209,24 @@ class DelayMeter:
             tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
         return tau
 
-    def _search(self, crossed: ComplexArray) -> FloatArray:
+    def _search(self, crossed: ComplexArray, beyond: float) -> FloatArray:
         """Return the best delay on a grid of a fraction of a period of the highest frequency."""
         n = scipy.fft.next_fast_len(4 * len(self.window), real=True)
         padded = np.zeros((crossed.shape[1], n // 2 + 1), dtype=np.complex128)
         padded[:, 1 : len(crossed) + 1] = crossed.T
         height = scipy.fft.irfft(padded, n=n, axis=-1)
         step = 2 * np.pi / self.omega[0] / n
-        reach = min(n // 2 - 1, int(_LONGEST / self.sampling_rate / step))
-        near = np.concatenate([height[:, -reach:], height[:, : reach + 1]], axis=1)
-        return np.asarray((np.argmax(near, axis=1) - reach) * step)
+
+        def highest(longest: float) -> tuple[FloatArray, FloatArray]:
+            reach = min(n // 2 - 1, int(longest / self.sampling_rate / step))
+            near = np.concatenate([height[:, -reach:], height[:, : reach + 1]], axis=1)
+            return (np.argmax(near, axis=1) - reach) * step, near.max(axis=1)
+
+        tau, top = highest(_LONGEST)
+        if beyond > _LONGEST:
+            far, top_far = highest(beyond)
+            tau = np.where(top_far > _OUTSTANDING * top, far, tau)
+        return np.asarray(tau)
 
 
 def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:

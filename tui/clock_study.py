@@ -19,7 +19,7 @@ from sim_devices.scenario import Scenario
 from tui.studies import Curve, Panel, Point, Series, Study
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -64,6 +64,7 @@ def synthesise(
     block: float = 0.1,
     seed: int = 1,
     instants: bool = False,
+    utc: Mapping[str, float] | None = None,
 ) -> Path:
     """Write the recording that a bench of this scenario would have given.
 
@@ -81,6 +82,8 @@ def synthesise(
         Of the latencies.
     instants : bool
         Store when each sample was really taken, as no device could.
+    utc : mapping of str to float, optional
+        Sensors that state UTC themselves, and by how many seconds the host's is behind theirs.
     """
     latency = latency or Latency()
     layouts = [
@@ -105,7 +108,14 @@ def synthesise(
         ends = scenario.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
         arrivals = latency.arrivals(ends, rng)
         for each in _blocks(scenario, layout, length=length, arrivals=arrivals, instants=instants):
-            writer.append(each)
+            if utc and layout.name in utc:
+                taken = float(scenario.sample_times(layout.name, each.first_sample, 1)[0])
+                stated = ORIGIN.utc_ns + round((taken + utc[layout.name]) * 1e9)
+                writer.append(
+                    replace(each, flags=each.flags | BlockFlag.DEVICE_UTC, device_counter=stated)
+                )
+            else:
+                writer.append(each)
     writer.close()
     return Path(path)
 
