@@ -12,12 +12,14 @@ import numpy as np
 from daq.drivers.epson import identify
 from daq.drivers.modbus import TCP, RefusedError, open_bus
 from daq.drivers.registry import driver_type
-from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.identity import require
 from daq.protocols import epson
 from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Sequence
+    from collections.abc import AsyncGenerator, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -110,33 +112,70 @@ async def probe(
     DeviceError
         As the driver raises it.
     """
-    items: dict[str, list[Block]] = {sensor.name: [] for sensor in sensors}
+    found, errors = await _probe(sensors, clock, duration=duration)
+    if errors:
+        raise errors[0]
+    return tuple(found)
+
+
+async def _probe(
+    sensors: Sequence[Sensor], clock: HostClock, *, duration: float
+) -> tuple[list[SensorCheck], list[DeviceError]]:
+    """Return what is found of each sensor of a port, and what is wrong with the others."""
+    blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in sensors}
     events: dict[str, list[str]] = {sensor.name: [] for sensor in sensors}
     wanted = {s.name: max(LEAST_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
+    longest = max(wanted[s.name] / s.sampling_rate for s in sensors) / clock.speed
     async with driver_type(sensors[0].driver).open(sensors, clock) as session:
+        information = {one.sensor: one for one in session.information}
+        errors = list(_wrong(sensors, information))
+        awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
         async with contextlib.aclosing(
             cast("AsyncGenerator[Block | Event]", session.read())  # else there is nothing to close
         ) as stream:
-            while True:
-                try:
-                    async with asyncio.timeout(FIRST_BLOCK):
-                        item = await anext(stream)
-                except TimeoutError as error:
-                    silent = ", ".join(repr(name) for name, came in items.items() if not came)
-                    raise NoAnswerError(
-                        f"port {sensors[0].port}: no samples of {silent} in {FIRST_BLOCK:g} s"
-                    ) from error
-                if isinstance(item, Event):
-                    events.setdefault(item.sensor, []).append(f"{item.kind}: {item.text}")
-                    continue
-                items[item.sensor].append(item)
-                if all(_n(items[name]) >= n for name, n in wanted.items()):
-                    break
-        information = {one.sensor: one for one in session.information}
-    return tuple(
-        _check(sensor, information[sensor.name], items[sensor.name], events[sensor.name])
-        for sensor in sensors
-    )
+            try:
+                async with asyncio.timeout(FIRST_BLOCK + 3 * longest):
+                    async for item in stream:
+                        if isinstance(item, Event):
+                            name = item.sensor if item.sensor in events else sensors[0].name
+                            events[name].append(f"{item.kind}: {item.text}")
+                            continue
+                        blocks[item.sensor].append(item)
+                        if all(_n(blocks[name]) >= n for name, n in awaited.items()):
+                            break
+            except TimeoutError as error:
+                if isinstance(error, DeviceError):
+                    raise
+    for sensor in sensors:
+        if not blocks[sensor.name] and not information[sensor.name].trouble:
+            said = f"; it said: {'; '.join(events[sensor.name])}" if events[sensor.name] else ""
+            errors.append(
+                NoAnswerError(
+                    f"sensor {sensor.name!r} on {sensor.port}: no samples in {FIRST_BLOCK:g} s"
+                    f"{said}"
+                )
+            )
+    found = [
+        _check(one, information[one.name], blocks[one.name], events[one.name])
+        for one in sensors
+        if blocks[one.name]
+    ]
+    return found, errors
+
+
+def _wrong(
+    sensors: Sequence[Sensor], information: Mapping[str, DeviceInformation]
+) -> Iterator[DeviceError]:
+    """Yield what is wrong with who answers."""
+    for sensor in sensors:
+        found = information[sensor.name]
+        if found.trouble:
+            yield NoAnswerError(found.trouble)
+            continue
+        try:
+            require(sensor, found)
+        except WrongDeviceError as error:
+            yield error
 
 
 async def probe_bench(
@@ -144,18 +183,21 @@ async def probe_bench(
 ) -> tuple[list[SensorCheck], list[DeviceError]]:
     """Probe every port of a bench at once; what is in trouble is returned, not raised."""
     answers = await asyncio.gather(
-        *(probe(sensors, clock, duration=duration) for sensors in bench.ports().values()),
+        *(_probe(sensors, clock, duration=duration) for sensors in bench.ports().values()),
         return_exceptions=True,
     )
     found: list[SensorCheck] = []
     errors: list[DeviceError] = []
-    for answer in answers:
+    for port, answer in zip(bench.ports(), answers, strict=True):
         if isinstance(answer, DeviceError):
             errors.append(answer)
+        elif isinstance(answer, RemoteProtocolError):
+            errors.append(DeviceError(f"port {port}: {answer}"))
         elif isinstance(answer, BaseException):
             raise answer
         else:
-            found.extend(answer)
+            found.extend(answer[0])
+            errors.extend(answer[1])
     return found, errors
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from daq.drivers.base import Resuming
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
+from daq.identity import require
 from daq.overdue import Watch
 from daq.protocols.block import Block, Event
 from daq.yielded import Checked
@@ -212,18 +213,7 @@ class Connection:
             if now.trouble and not known:
                 raise NoAnswerError(now.trouble)
             before = known.get(sensor.name)
-            wanted = sensor.serial_number or (before.serial_number if before else "")
-            if wanted and now.serial_number and now.serial_number != wanted:
-                raise WrongDeviceError(
-                    f"sensor {sensor.name!r} on {self.port}: expected serial number {wanted!r},"
-                    f" got {now.serial_number!r}"
-                )
-            rate = now.sampling_rate
-            if rate is not None and abs(rate / sensor.sampling_rate - 1) > 0.02:
-                raise WrongDeviceError(
-                    f"sensor {sensor.name!r} on {self.port}: expected {sensor.sampling_rate:g} Hz,"
-                    f" the device samples at {rate:g} Hz"
-                )
+            require(sensor, now, serial_number=before.serial_number if before else "")
         self.information = self.information or found
 
     def _introduced(self, session: Session, name: str) -> Event | Trouble:

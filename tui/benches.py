@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from importlib import resources
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from tui.output import console, for_people, write_json
 from tui.results import plain
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from daq.bench import Bench
@@ -57,6 +58,9 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
         found, errors = asyncio.run(probe_bench(bench, SystemClock(bench.speed)))
         if found:
             screen.print(_device_table(found))
+            for entry in found:
+                for remark in _remarks(entry):
+                    screen.print(f"  {entry.information.sensor}: {remark}", markup=False)
             screen.print(_channel_table(found))
     write_json(
         json,
@@ -121,13 +125,10 @@ def _table(columns: Sequence[str]) -> Table:
 
 def _device_table(found: Sequence[SensorCheck]) -> Table:
     table = _table(
-        ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature", "")
+        ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature")
     )
     for entry in found:
         told = entry.information
-        remarks = [*(["clipped"] if entry.clipped else []), *entry.events]
-        if entry.n_missing:
-            remarks.append(f"{entry.n_missing} samples missing")
         table.add_row(
             told.sensor,
             told.model,
@@ -136,9 +137,26 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
             "" if told.sampling_rate is None else f"{told.sampling_rate:g} Hz",
             "" if entry.measured_rate is None else f"{entry.measured_rate:.1f} Hz",
             "" if told.temperature is None else f"{told.temperature:.1f} °C",
-            "; ".join(remarks),
         )
     return table
+
+
+def _remarks(entry: SensorCheck) -> Iterator[str]:
+    """Yield what else there is to say of a sensor, a line each."""
+    if entry.clipped:
+        yield "clipped: samples at the end of the range"
+    if entry.n_missing:
+        yield f"{entry.n_missing} of {entry.n_samples + entry.n_missing} samples missing"
+    if entry.information.details:
+        yield ", ".join(f"{key} {value}" for key, value in entry.information.details.items())
+    if entry.jitter is not None and entry.bandwidth is not None:
+        noise = entry.signal_to_noise_db
+        yield (
+            f"polling leaves {entry.bandwidth:.3g} Hz of bandwidth and {1e3 * entry.jitter:.2g} ms"
+            " of jitter" + ("" if noise is None else f" (SNR {noise:.0f} dB at the edge of it)")
+        )
+    for text, times in Counter(entry.events).items():
+        yield text if times == 1 else f"{text} ({times} times)"
 
 
 def _channel_table(found: Sequence[SensorCheck]) -> Table:

@@ -159,6 +159,7 @@ class FifoDriver:
             )
             information = DeviceInformation(
                 sensor=sensor.name,
+                model=sensor.model or "block FIFO",
                 sampling_rate=sensor.sampling_rate,
                 details={"unit": str(settings.unit), "header": settings.header},
             )

@@ -169,6 +169,11 @@ class TextSession:
         self._source = source
         self._settings = settings
         self._label = label
+        self._advice = (
+            "does the device cast to this computer and port, and does a firewall let it pass?"
+            if isinstance(source, _DatagramSource)
+            else "check cable, power, settings.baud_rate and settings.start"
+        )
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Ask for samples and yield blocks of them."""
@@ -184,8 +189,7 @@ class TextSession:
                     items = await self._source.receive()
             except TimeoutError as error:
                 raise NoAnswerError(
-                    f"{self._label}: no samples for {patience - last:.2g} s; check cable, power,"
-                    " settings.baud_rate and settings.start"
+                    f"{self._label}: no samples for {patience - last:.2g} s; {self._advice}"
                 ) from error
             for item in items:
                 if isinstance(item, Block):
@@ -221,6 +225,7 @@ class TextDriver:
         )
         information = DeviceInformation(
             sensor=sensor.name,
+            model=sensor.model,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
         )
         async with _opened(sensor, clock, settings, decoder, label=label) as source:
