@@ -79,6 +79,22 @@ class Maximum:
     singular: BoolArray
     penalty: FloatArray
 
+    def take(self, index: IntArray | BoolArray) -> Maximum:
+        """Return the same for some frequencies only."""
+        return Maximum(
+            psi=self.psi[index],
+            discrepancy=self.discrepancy[index],
+            eigenvalues=self.eigenvalues[index],
+            eigenvectors=self.eigenvectors[index],
+            n_factors=self.n_factors,
+            iterations=self.iterations[index],
+            gradient_norm=self.gradient_norm[index],
+            converged=self.converged[index],
+            boundary=self.boundary[index],
+            singular=self.singular[index],
+            penalty=self.penalty,
+        )
+
 
 @dataclass(slots=True)
 class _Point:

@@ -11,11 +11,17 @@ from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError
 from estimator.factor_analysis import Maximum, check_factors, max_factors, maximise
 from estimator.prior import NOISE_SPREAD, expected_noise, maximise_expecting
+from estimator.resolution import resolved
 from estimator.self_noise import Flag, SelfNoise
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
     from estimator.coherency import Coherency
+
+BEYOND = 2
+"""Factors above those asked for that the error allows for, where these are more than usual."""
 
 
 def maximum_likelihood(
@@ -43,6 +49,8 @@ def maximum_likelihood(
         Remove the small-sample bias, see Notes.
     n_factors : int or int64, shape (n_freqs,), optional
         Dimension of the common motion; ``max(dims)`` by default, `estimator.dimension` finds it.
+        With `correct`, fewer where the averages cannot tell so many from scatter, flagged
+        UNRESOLVED.
     noise_spread : float
         Only where `n_factors` exceeds ``max(dims)``: standard deviation of ln psi expected
         beforehand among like channels, about the ratios at frequencies of fewer factors. There
@@ -53,7 +61,8 @@ def maximum_likelihood(
     -------
     SelfNoise
         ``cov`` is the Cramér-Rao bound at the estimate, over ``n_effective - n_factors``
-        averages; the interval is symmetric in the logarithm (`fisher.interval`). A channel whose
+        averages, and what an uncertain number of factors adds; the interval is symmetric in the
+        logarithm (`fisher.interval`). A channel whose
         likelihood grows towards zero noise gets 0, no c.o.v., an upper end of the interval
         and the flag BOUNDARY.
 
@@ -70,9 +79,10 @@ def maximum_likelihood(
     Maximum likelihood estimates are low by q / n at high SNR (as the three-sensor estimate is
     at any), and by more at low SNR: `fisher.bias`. The correction divides by 1 - q / n and
     multiplies by one plus the rest, at most 1.5, beyond which an expansion in 1/n says nothing.
-    What then is left was measured on three equal sensors of 1, 2 and 3 channels: under 0.6 % at
-    n = 20 for an SNR of 10 and more, under 0.4 % at n = 1080 for an SNR of 0.1 and more. Where
-    the averages cannot find the motion it is more: -16 to -23 % at n = 20 and SNR 0.1.
+    Factors that cannot be told from scatter, which no expansion corrects, are left out first
+    (`estimator.resolution`); the fits with and without then differ by something that is added to
+    the standard error. No estimate whatever is unbiased where the averages cannot find the motion:
+    `docs/decisions/0033-small-samples.md`, with what is left.
     """
     check_dims(dims)
     given = coherency(csm, dims)
@@ -91,36 +101,85 @@ def maximum_likelihood(
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
-    for q in np.unique(factors[~few]):
-        here = np.flatnonzero((factors == q) & ~few)
+    for q in np.unique(factors[~few]):  # rising: what is usual is fitted before it is expected
+        rows = np.flatnonzero((factors == q) & ~few)
         if q <= max(dims):
-            maximum = maximise(matrix[here], int(q))
-        else:  # np.unique rises: what was usual has been fitted
-            expected = expected_noise(noise_psd * given.psd, factors <= max(dims), dims)
-            maximum = maximise_expecting(
-                matrix[here],
-                int(q),
-                expected[here] / given.psd[here],
+            fits = _usual(matrix[rows], int(q), n_effective=n_effective, correct=correct)
+        else:
+            fits = _expecting(
+                matrix[rows],
+                (int(q), int(min(q + BEYOND, max_factors(p - absent[rows].sum(axis=1)).min()))),
+                expected_noise(noise_psd * given.psd, factors <= max(dims), dims)[rows]
+                / given.psd[rows],
                 dims=dims,
                 n_effective=n_effective,
                 spread=noise_spread,
             )
-        psi = np.where(maximum.boundary, 0.0, maximum.psi)
-        error = standard_error(maximum, n_effective=n_effective)
-        cov[here] = np.where(maximum.boundary, np.nan, error / maximum.psi)
-        gain = small_sample_correction(maximum, n_effective=n_effective) if correct else 1.0
-        noise_psd[here] = psi * gain
-        low[here], high[here] = fisher.interval(noise_psd[here], error * gain)
-        flags[here] |= np.where(maximum.boundary, Flag.BOUNDARY, 0)
-        undetermined = ~np.isfinite(error) & ~maximum.boundary & (given.flags[here] == 0)
-        flags[here] |= np.where(undetermined, Flag.SINGULAR, 0)
-        lost = ~maximum.converged & ~maximum.singular
-        flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
+        for some, fit, error in fits:
+            here = rows[some]
+            good = given.flags[here] == 0
+            psi = np.where(fit.boundary, 0.0, fit.psi)
+            cov[here] = np.where(fit.boundary, np.nan, error / fit.psi)
+            gain = small_sample_correction(fit, n_effective=n_effective) if correct else 1.0
+            noise_psd[here] = psi * gain
+            low[here], high[here] = fisher.interval(noise_psd[here], error * gain)
+            flags[here] |= np.where(fit.boundary, Flag.BOUNDARY, 0)
+            flags[here] |= np.where(good & (fit.n_factors < q), Flag.UNRESOLVED, 0)
+            undetermined = ~np.isfinite(error) & ~fit.boundary & good
+            flags[here] |= np.where(undetermined, Flag.SINGULAR, 0)
+            lost = ~fit.converged & ~fit.singular
+            flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
     unknown = (given.flags | (flags & Flag.SINGULAR)) != 0
     for result in (noise_psd, cov, low, high):
         result[unknown] = np.nan
     return SelfNoise(
         "maximum-likelihood", noise_psd * given.psd, cov, low * given.psd, high * given.psd, flags
+    )
+
+
+def _usual(
+    matrix: ComplexArray, q: int, *, n_effective: float, correct: bool
+) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
+    """Fit q factors or, corrected, as many of them as can be told from scatter.
+
+    Yields frequencies, their fit and the standard error of psi; to that where factors are left
+    out, the difference this makes.
+    """
+    maximum = maximise(matrix, q)
+    if not correct:
+        yield np.arange(len(matrix)), maximum, standard_error(maximum, n_effective=n_effective)
+        return
+    for some, fit in resolved(matrix, maximum, n_effective=n_effective):
+        error = standard_error(fit, n_effective=n_effective)
+        if fit.n_factors < q:
+            error = np.hypot(error, fit.psi - maximum.psi[some])
+        yield some, fit, error
+
+
+def _expecting(
+    matrix: ComplexArray,
+    n_factors: tuple[int, int],
+    expected: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    spread: float,
+) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
+    """Fit more factors than usual; the standard error allows for some more than were asked for.
+
+    Factors that are only just visible are as likely to be missed, and then the motion they carry
+    is shared out among the noise of channels in ways that the fit itself thinks are certain.
+    """
+    fit, wider = (
+        maximise_expecting(matrix, q, expected, dims=dims, n_effective=n_effective, spread=spread)
+        for q in n_factors
+    )
+    error, beyond = (standard_error(each, n_effective=n_effective) for each in (fit, wider))
+    beyond = np.where(np.isfinite(beyond), np.minimum(beyond, fit.psi), 0.0)
+    yield (
+        np.arange(len(matrix)),
+        fit,
+        np.hypot(np.maximum(error, beyond), fit.psi - wider.psi),
     )
 
 

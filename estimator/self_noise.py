@@ -29,6 +29,9 @@ class Flag(enum.IntFlag):
     """The iteration stopped before it reached the maximum."""
     BOUNDARY = 128
     """The likelihood is largest at zero noise: the estimate stands at its lower bound."""
+    UNRESOLVED = 256
+    """The averages cannot tell all dimensions of the motion from scatter. What there is in the
+    others is still in the noise: at most about as much as its standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)
