@@ -47,7 +47,7 @@ def _line(status: Status) -> str:
     sensors = "  ".join(
         f"{name} {sensor.samples}"
         + (f" ({sensor.gaps} gaps, {sensor.missing} missing)" if sensor.gaps else "")
-        + (" lost" if sensor.state == "lost" else "")
+        + (f" {sensor.state}" if sensor.state in {"late", "lost"} else "")
         for name, sensor in status.sensors.items()
     )
     return f"{clock_time(status.elapsed)}  samples safe: {sensors}"

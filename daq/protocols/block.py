@@ -98,7 +98,7 @@ class Block:
 class Event:
     """Something that happened to a sensor (or, with an empty name, to the run).
 
-    ``kind`` is one of a small vocabulary: ``connected``, ``disconnected``, ``stalled``,
+    ``kind`` is one of a small vocabulary: ``connected``, ``disconnected``, ``late``, ``stalled``,
     ``resynchronised``, ``checksum``, ``reset``, ``overflow``, ``status``, ``mark``, ``started``,
     ``stopped``, ``refused``. ``text`` says it in words, in at most 200 bytes.
     """
