@@ -76,10 +76,12 @@ def estimate(path: Path, *options: str) -> dict[str, Any]:
 
 def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.h5"
-    code, said, err = finished(
-        start("run", str(bench), "--duration", "14s", "--out", str(out), "--json", "-")
-    )
+    pdf = tmp_path / "run.pdf"
+    wanted = ("--duration", "14s", "--out", str(out), "--json", "-", "--report", str(pdf))
+    code, said, err = finished(start("run", str(bench), *wanted))
     assert code == 0, err
+    assert pdf.read_bytes().startswith(b"%PDF-")
+    assert f"{pdf} written" in err
     live, offline = json.loads(said), estimate(out)
     assert live["segments"] == offline["segments"] >= 8
     for ours, theirs in zip(live["channels"], offline["channels"], strict=True):
@@ -134,7 +136,10 @@ def test_ctrl_c_stops_the_recorder_and_still_prints_the_result(bench: Path, tmp_
 
 def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "until.h5"
-    process = start("run", str(bench), "--out", str(out), "--until-cov", "0.4", "--json", "-")
+    with_report = tmp_path / "bench.toml"
+    text = bench.read_text(encoding="utf-8")
+    with_report.write_text(text.replace("[recording]", '[recording]\nreport = "html"'), "utf-8")
+    process = start("run", str(with_report), "--out", str(out), "--until-cov", "0.4", "--json", "-")
     code, said, err = finished(process)
     assert code == 0, err
     document = json.loads(said)
@@ -144,6 +149,7 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     assert np.median(cov, axis=1).max() <= 0.6
     with Recording.open(out) as recording:
         assert recording.events[-1].text != "duration reached"
+    assert "self-noise" in out.with_suffix(".html").read_text(encoding="utf-8")
 
 
 def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:

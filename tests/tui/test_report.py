@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import resource
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -106,7 +107,7 @@ class Words(HTMLParser):
 
 
 def record(
-    path: Path, *, psd: float = 4e-10, before_end: Callable[[], None] = lambda: None
+    path: Path, *, psd: float = 4e-10, before_end: Callable[[], object] = lambda: None
 ) -> Path:
     """Four biaxial sensors: B misses samples, and Y of the last is dead."""
     rng = np.random.default_rng(8)
@@ -257,6 +258,15 @@ def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
     text = Words(out.read_text(encoding="utf-8")).text
     assert "Still running, preliminary. PASS" in text
     assert "none: the file is still being written" in text
+
+
+def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
+    recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
+    record(recording, before_end=lambda: shutil.copyfile(recording, copy))
+    snapshot = estimate([copy], reported.settings)
+    report = report_of(snapshot, reported.settings, sources([copy]))
+    assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
+    assert hashlib.sha256(copy.read_bytes()).hexdigest() in said(report)
 
 
 def test_where_the_motion_is_not_shared_the_report_says_so(tmp_path: Path) -> None:

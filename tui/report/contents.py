@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from daq.estimation import Settings, Snapshot
     from tui.report.source import RecordedSensor, Source
 
+_STATES = {
+    "closed": "closed",
+    "growing": "still being written",
+    "left open": "not closed: its recorder was killed",
+}
 _CLOCKS = {
     "refined": "by arrival times and the motion that the sensors share",
     "arrivals": "by arrival times alone",
@@ -48,8 +53,14 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
     bench = found[0].bench
     judged = judgements(bench, snapshot, settings)
     sentence = verdict(bench, judged)
-    if not (snapshot.closed and all(source.closed for source in found)):
+    states = {source.state for source in found}
+    if "growing" in states or (not snapshot.closed and states == {"closed"}):
         sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")
+    elif "left open" in states:
+        text = (
+            f"Of a recording whose recorder was killed (huddle repair closes it). {sentence.text}"
+        )
+        sentence = Paragraph(text, "bad" if sentence.tone == "bad" else "doubtful")
     sections = [
         _test_section(found),
         _sensors_section(snapshot, found),
@@ -87,9 +98,8 @@ def _test_section(found: Sequence[Source]) -> Section:
     ]
     parts: list[Part] = [Facts(tuple(rows))]
     for source in found:
-        state = "closed" if source.closed else "still being written"
         length = (source.last - source.started).total_seconds()
-        size = f"{source.n_bytes / 1e6:.1f} MB, {state}"
+        size = f"{source.n_bytes / 1e6:.1f} MB, {_STATES[source.state]}"
         parts.append(
             Facts(
                 (

@@ -6,17 +6,19 @@ import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench import Bench, Channel
-    from daq.recording.reader import SensorRecord
+    from daq.recording.locking import is_being_written
+from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000
 
@@ -58,7 +60,8 @@ class Source:
         UTC.
     last : datetime
         UTC of the last block received.
-    closed : bool
+    state : {"closed", "growing", "left open"}
+        Left open by a recorder that was killed, and not repaired since.
     bench : Bench or None
     sensors : tuple of RecordedSensor
     happenings : tuple of Happening
@@ -74,7 +77,7 @@ class Source:
     location: str
     started: datetime
     last: datetime
-    closed: bool
+    state: Literal["closed", "growing", "left open"]
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
     happenings: tuple[Happening, ...]
@@ -105,9 +108,10 @@ def _source(path: Path) -> Source:
         for sensor in recording.sensors:
             happenings += _gaps(sensor, created)
         happenings.sort(key=lambda each: each.utc_ns)
+        growing = not recording.closed and is_being_written(path)
         return Source(
             path=path,
-            sha256=_sha256(path) if recording.closed else "",
+            sha256="" if growing else _sha256(path),
             n_bytes=path.stat().st_size,
             run_id=recording.run_id,
             software=recording.software,
@@ -115,7 +119,7 @@ def _source(path: Path) -> Source:
             location=recording.location,
             started=recording.created.astimezone(UTC),
             last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
-            closed=recording.closed,
+            state="closed" if recording.closed else "growing" if growing else "left open",
             bench=recording.bench,
             sensors=tuple(
                 RecordedSensor(
