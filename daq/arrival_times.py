@@ -21,7 +21,8 @@ host's clock has been asleep.
 
 Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
-its nominal rate.
+its nominal rate. A step of one second while the samples are counted on is a leap second: UTC's, and
+not the sensor's.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ _RATE_OFF = 0.02  # share by which a rate may be off
 _STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
 _LEVEL = 10  # groups over which a slope can be told from jitter
 _UTC_JUMP = 0.01  # samples
+_LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
 _HULL_POINTS = 512
@@ -103,6 +105,7 @@ class ArrivalTimes:
     _device_utc: bool = False
     _polls: Polls = field(default_factory=Polls)
     _lowest: float = np.inf
+    _leapt: float = 0.0
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -131,7 +134,13 @@ class ArrivalTimes:
         if not self._device_utc:
             self._polls.add(index, late)
         if self._device_utc:
+            late -= self._leapt
             step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
+            counted_on = first == np.append(self._end_sample, (first + length)[:-1])
+            leaps = np.where(counted_on & (np.abs(np.abs(step) - 1) < _LEAP), np.round(step), 0.0)
+            late -= np.cumsum(leaps)
+            step -= leaps
+            self._leapt += float(leaps.sum())
             breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
         else:
             # Far below all before, even if the rate is off: the host's clock stood still.

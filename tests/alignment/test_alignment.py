@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from daq.alignment import AlignedRecording
 from daq.errors import CannotAlignError
 from daq.estimation import Settings, estimate
+from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
 from daq.resampling import reach
-from tests.alignment.recordings import Sensor, blocks, counts, create, write
+from tests.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -204,6 +206,44 @@ def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path:
     assert np.allclose(apart["refined"], -50.0)
     assert snapshot.clocks[2].source == "clock of one, whole samples apart by samples"
     assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
+
+
+def test_an_hour_of_suspend_is_a_short_gap_and_clocks_meet_again_behind_it(tmp_path: Path) -> None:
+    # CLOCK_MONOTONIC stands still in suspend; the sensors' counters do not.
+    hour, n_before, n_after = 3600.0, 30_000, 30_000
+    writer_of, found = {}, []
+    for name, ppm, start in (("a", 0.0, 0.0), ("b", 18.0, 0.0123), ("c", -20.0, 0.0371)):
+        rate = 100.0 * (1 + ppm * 1e-6)
+        lost = round(hour * rate)
+        index = np.concatenate([np.arange(n_before), n_before + lost + np.arange(n_after)])
+        times = start + index / rate
+        signal = np.round(1e6 * _band_limited(times, 3, 44.0)).astype(np.int32)
+        sensor = Sensor(signal[:, None], rate=rate, nominal=100.0, start=start, clock=name)
+        writer_of[name] = sensor
+        for block in blocks(name, sensor):
+            if block.first_sample < n_before:
+                found.append(block)
+                continue
+            # It counts on; the host has slept for all of the hour.
+            arrival = start + (block.end_sample + lost - 1) / rate - hour + sensor.late
+            shift = round(arrival * 1e9) + ORIGIN.monotonic_ns - block.received.monotonic_ns
+            at = HostTime(block.received.monotonic_ns + shift, block.received.utc_ns + shift)
+            found.append(replace(block, first_sample=block.first_sample + lost, received=at))
+    writer = create(tmp_path / "r.h5", writer_of)
+    for block in found:
+        writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert [clock.n_epochs for clock in aligned.clocks] == [2, 2, 2]
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert n_before + n_after - 200 < len(samples) < n_before + n_after
+        assert np.count_nonzero(~valid) < 200  # two seconds, with the kernel's neighbours
+        middle = int(np.flatnonzero(~valid)[0])
+        for rows in (slice(0, middle), slice(middle + 200, None)):
+            for column in (1, 2):
+                error = samples[rows, column] - samples[rows, 0]
+                assert np.std(error) < 1e-4 * np.std(samples[rows, 0])
 
 
 def test_a_shared_clock_has_a_rate_too(tmp_path: Path) -> None:

@@ -143,6 +143,19 @@ def test_device_utc_is_the_clock_exactly_where_it_keeps_its_rate() -> None:
     assert np.abs(clock.at(index) - (0.0055 + index / RATE * (1 + 1e-5))).max() < 1e-8
 
 
+@pytest.mark.parametrize("leap", [-1, 1])
+@pytest.mark.parametrize("pieces", [1, 5])
+def test_a_leap_second_of_device_utc_is_no_step_of_its_clock(leap: int, pieces: int) -> None:
+    rows = block_rows(np.zeros(600))
+    rows["flags"] = BlockFlag.DEVICE_UTC
+    rows["device_counter"] = np.round(0.0055e9 + rows["first_sample"] / RATE * 1e9)
+    rows["device_counter"][300:] += leap * 10**9
+    clock = solved(rows, pieces=pieces)
+    index = np.arange(0.0, 12_000.0, 7.0)
+    assert clock.state.n_epochs == 1
+    assert np.abs(clock.at(index) - (0.0055 + index / RATE)).max() < 1e-9
+
+
 def test_delays_from_the_samples_outweigh_arrivals_up_to_their_constant() -> None:
     rng = np.random.default_rng(8)
     poll = 16e-3
