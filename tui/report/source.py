@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.bench import Bench, Channel
-    from daq.recording.locking import is_being_written
-from daq.recording.reader import SensorRecord
+    from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000
 
