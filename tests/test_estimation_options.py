@@ -113,13 +113,32 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
         for block in blocks(name, sensor):
             clipped = name == "b" and block.first_sample == 5000  # samples 5000 to 5049
             flags = block.flags | BlockFlag.CLIPPED if clipped else block.flags
-            writer.append(replace(block, flags=flags))
+            counts = np.full_like(block.counts, 70_000) if clipped else block.counts
+            writer.append(replace(block, flags=flags, counts=counts))
     writer.close()
     found = estimate([tmp_path / "r.h5"], SETTINGS)
+    assert "clipped" not in found.diagnostics  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
     assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
     np.testing.assert_allclose(found.csm, spectra_of(sensors, kept).csm(), rtol=1e-9, atol=1e-3)
     assert estimate([tmp_path / "r.h5"], replace(SETTINGS, reject=False)).n_dropped == 0
+
+
+def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -> None:
+    sensors = bench(n_samples=60_000)
+    n = np.arange(60_000)
+    sensors["a"].counts[:, 0] = np.rint(3000 * np.sin(2 * np.pi * n / 77.7))  # a shaker is no fault
+    sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 1e4)  # nor are few values
+    sensors["b"].counts[:, 1] = np.clip(sensors["b"].counts[:, 1], -30_000, 20_000)
+    sensors["c"].counts[:, 1] = 5
+    found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, methods=("all",)))
+    shares = found.diagnostics["clipped"]
+    assert set(shares) == {"b.c1"}
+    at_ends = np.mean(
+        (sensors["b"].counts[:, 1] == 20_000) | (sensors["b"].counts[:, 1] == -30_000)
+    )
+    assert shares["b.c1"] == pytest.approx(at_ends, rel=0.2)
+    assert "clipped" not in estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics
 
 
 def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_path: Path) -> None:

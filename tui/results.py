@@ -119,6 +119,13 @@ def remarks(snapshot: Snapshot) -> list[str]:
         worst = max(left[clock.sensor] for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
+    clipped = snapshot.diagnostics.get("clipped")
+    if clipped:
+        names = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in clipped.items())
+        lines.append(
+            f"clipped: {names} of the samples stand at the largest or smallest count there is: the "
+            "noise of these channels comes out too high. Use a larger range, or less motion"
+        )
     if "two-channel" in snapshot.results:
         lines.append(
             "two-channel: takes like channels to point the same way, and their gains as given "

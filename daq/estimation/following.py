@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import CannotAlignError
+from daq.estimation.clipping import clipped_shares
 from daq.estimation.diagnosis import diagnosis, synchronisation
 from daq.estimation.results import (
     Dimensions,
@@ -122,6 +123,14 @@ class Estimation:
         """Segments looked at so far, those left out for gaps included."""
         return sum(each.n_seen for each in self._passes)
 
+    @property
+    def lacking(self) -> float:
+        """Seconds that the recording, as of the last `update`, lacks to hold one more segment."""
+        last = self._passes[-1]
+        welch = last.welch
+        end = last.n_seen * welch.hop + welch.segment_length
+        return (end - last.aligned.n_available) / welch.sampling_rate
+
     def update(self) -> bool:
         """Take what has been committed since; return whether there was a new segment.
 
@@ -215,6 +224,7 @@ class Estimation:
             diagnostics["dimension"] = estimates.dimensions.chosen
         if final:
             diagnostics |= diagnosis(bands, dims, channels)
+            diagnostics |= self._clipped()
         return Snapshot(
             frequency=frequency,
             csm=csm,
@@ -267,6 +277,20 @@ class Estimation:
         """Whether the dimensions chosen before are for the same frequencies."""
         before = () if self._dimensions is None else self._dimensions.n_factors
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
+
+    def _clipped(self) -> dict[str, dict[str, float]]:
+        """Return which channels stand at the end of their range, and in what share of samples."""
+        taking_part = {
+            (sensor, channel.name) for sensor, channel in self._passes[0].aligned.channels
+        }
+        shares: dict[str, float] = {}
+        for recording in self._recordings:
+            for record in recording.sensors:
+                for channel, share in clipped_shares(record).items():
+                    if (record.name, channel) in taking_part:
+                        label = f"{record.name}.{channel}"
+                        shares[label] = max(share, shares.get(label, 0.0))
+        return {"clipped": shares} if shares else {}
 
     def _left_out(self) -> dict[str, int]:
         counts: Counter[Reason] = Counter()

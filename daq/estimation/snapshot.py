@@ -95,7 +95,9 @@ class Snapshot:
         ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
         ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
         ``dimension``: tuple of `estimator.dimension.BandDimension`, where it was chosen.
-        Of a finished estimate also what `daq.estimation.diagnosis.diagnosis` returns.
+        Of a finished estimate also ``clipped``, the share of samples that stand at the end of the
+        range by channel ("B.X") where there are any, and what
+        `daq.estimation.diagnosis.diagnosis` returns.
     """
 
     frequency: FloatArray

@@ -1,0 +1,65 @@
+"""Channels that stand at the end of their range without their devices having said so.
+
+Where a signal is cut off, its largest or smallest count comes far more often than the one beside
+it. That is looked for in stretches spread over the recording, in raw counts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.block import BlockFlag
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.recording.reader import SensorRecord
+
+_STRETCHES = 16
+_ROWS = 2048  # of each
+_DISTINCT = 16  # counts: what has fewer may well have a favourite at its end
+_FEWEST = 8  # samples at an end
+_TIMES = 5  # more often than the count beside it; a sine reaches 2.4
+
+
+def clipped_shares(record: SensorRecord) -> dict[str, float]:
+    """Return the share of samples at the end of the range, by name of the channel.
+
+    Only channels of the huddle test that are cut off; blocks that say so themselves (the estimate
+    leaves them out) are not looked at.
+    """
+    rows = _rows(record)
+    if len(rows) == 0:
+        return {}
+    counts = np.concatenate([record.counts(int(first), int(last)) for first, last in rows])
+    which = np.concatenate([np.arange(first, last) for first, last in rows])
+    blocks = record.blocks
+    begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
+    flags = blocks["flags"][np.searchsorted(begins, which, side="right") - 1]
+    counts = counts[(flags & int(BlockFlag.CLIPPED)) == 0]
+    shares = {
+        channel.name: _share(counts[:, column])
+        for column, channel in enumerate(record.channels)
+        if not channel.auxiliary
+    }
+    return {name: share for name, share in shares.items() if share}
+
+
+def _rows(record: SensorRecord) -> NDArray[np.int64]:
+    """First and last + 1 row of every stretch, shape (n, 2)."""
+    n_rows = int(record.blocks["n_samples"].sum())
+    if n_rows <= _STRETCHES * _ROWS:
+        return np.array([[0, n_rows]] if n_rows else np.empty((0, 2)), dtype=np.int64)
+    first = np.linspace(0, n_rows - _ROWS, _STRETCHES).astype(np.int64)
+    return np.column_stack([first, first + _ROWS])
+
+
+def _share(counts: NDArray[np.generic]) -> float:
+    values, times = np.unique(counts, return_counts=True)
+    if len(values) < _DISTINCT:
+        return 0.0
+    ends = ((times[0], times[1]), (times[-1], times[-2]))
+    cut = [int(end) for end, beside in ends if end >= max(_FEWEST, _TIMES * beside)]
+    return sum(cut) / len(counts)
