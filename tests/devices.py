@@ -55,6 +55,8 @@ class PlayedDevice:
     left_quiet: bool = True
     hangs: bool = False
     """When it is to be left."""
+    may_end: asyncio.Event | None = None
+    """Until then it does not end, whoever cancels it."""
     sampling_rate: float | None = None
 
 
@@ -117,6 +119,9 @@ class PlayedDriver:
         finally:
             if device.hangs:
                 await asyncio.Event().wait()
+            while device.may_end is not None and not device.may_end.is_set():
+                with contextlib.suppress(asyncio.CancelledError):
+                    await device.may_end.wait()
             device.left_quiet = True
 
 

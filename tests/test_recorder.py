@@ -256,6 +256,26 @@ async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
         ]
 
 
+async def test_a_driver_that_cannot_be_ended_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.session.LEAVE_TIMEOUT", 0.2)
+    monkeypatch.setattr("daq.recorder.CANCEL_TIMEOUT", 0.5)
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").may_end = may_end = asyncio.Event()
+    async with asyncio.timeout(10), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    assert run.statuses[-1].closed
+    with Recording.open(run.path) as recording:
+        assert "the driver on a does not end; it was left alone" in [
+            e.text for e in recording.events
+        ]
+    (left,) = [task for task in asyncio.all_tasks() if task.get_name() == "a"]
+    may_end.set()
+    await asyncio.wait([left])
+
+
 async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
     tmp_path: Path,
 ) -> None:
