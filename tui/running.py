@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 INTERVAL = 0.5
 LONGEST_INTERVAL = 5.0
+BEHIND = 2.0
+"""Seconds by which a recording that is looked at may lie behind its sensors, at most."""
 SHARE = 0.03
 """Of one core, at most, that estimating live may take."""
 
@@ -123,6 +125,8 @@ def follow_to_end(
     """
     interrupted, snapshot = False, None
     with Estimation([recorder.out], settings) as estimation, _progress() as show:
+        bench = estimation.recordings[0].bench
+        speed = 1.0 if bench is None else bench.speed
         while True:
             try:
                 began = time.process_time()
@@ -135,7 +139,8 @@ def follow_to_end(
                     if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
                         recorder.request_stop()
                 pause = (time.process_time() - began) / SHARE
-                recorder.ends_within(min(max(INTERVAL, pause), LONGEST_INTERVAL))
+                coming = (estimation.lacking - BEHIND) / speed  # before, there is nothing to see
+                recorder.ends_within(min(max(INTERVAL, pause, coming), LONGEST_INTERVAL))
             except KeyboardInterrupt:
                 if interrupted:
                     raise
