@@ -282,7 +282,7 @@ def outcome(
         noise_psd=np.stack([noise[band].mean(axis=0) for band in bands]),
         cov=cov,
         left=_left(diagnostics, scenario, origin_utc_ns, truths),
-        stated=np.array([stated[name] for name in scenario.names[1:]]),
+        stated=np.array([stated[name] for name in scenario.names[1:]], dtype=float),
         ppm=tuple(clock["ppm"] for clock in diagnostics["clocks"]),
     )
 
@@ -364,6 +364,10 @@ def _failures(outcomes: dict[str, Outcome], snr: float) -> Iterator[str]:
         yield f"residual {refined.left.max() * 1e6:.2f} µs rms; 2 µs wanted"
 
 
+def _stated(residual: float) -> str:
+    return "unknown" if np.isnan(residual) else f"{residual * 1e6:.3g}"
+
+
 def _show(screen: Console, title: str, outcomes: dict[str, Outcome]) -> None:
     table = Table(title=title, box=None)
     table.add_column("")
@@ -390,7 +394,7 @@ def _show(screen: Console, title: str, outcomes: dict[str, Outcome]) -> None:
     for number in range(len(oracle.left)):
         name = "BC"[number]
         row(f"{name}: residual, µs rms", [f"{o.left[number] * 1e6:.3g}" for o in each])
-        row("  as huddle says", [f"{o.stated[number] * 1e6:.3g}" for o in each])
+        row("  as huddle says", [_stated(o.stated[number]) for o in each])
     row("ppm", [" ".join(f"{ppm:+.2f}" for ppm in o.ppm) for o in each])
     screen.print(table)
 
