@@ -19,7 +19,7 @@ import numpy as np
 from estimator.presence import presence
 from estimator.self_noise import Flag
 from estimator.stance import stance
-from estimator.wording import Advice, in_hz, listed, percent
+from estimator.wording import Advice, in_hz, listed, percent, ratio
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -187,7 +187,7 @@ def _incoherence(
     crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
     for run in _runs(bands, lambda band: band.test.p_value < REJECT):
         ratios = [b.test.statistic / b.test.degrees for b in run]
-        ratio = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
+        mean = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
         most = max(ratios)
         worst = run[ratios.index(most)]
         seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
@@ -206,7 +206,7 @@ def _incoherence(
         few = "1 dimension" if d == 1 else f"{d} dimensions"
         text = (
             f"At {in_hz(_span(run))} one motion of {few} does not explain what the sensors have in "
-            f"common (statistic {ratio:.3g} times its expectation{at}"
+            f"common (statistic {mean:.3g} times its expectation{at}"
             f"{'' if level == 'problem' else ': certain, but small'}). At worst "
             f"{percent(seen)} of the noise is unexplained, and the estimate "
             f"{'is wrong' if off >= FAR_OFF else 'may be off'}, by up to about "
@@ -232,7 +232,7 @@ def _incoherence(
             _span(run),
             text,
             {
-                "statistic over expectation": ratio,
+                "statistic over expectation": mean,
                 "worst": most,
                 "worst_low_hz": worst.low,
                 "worst_high_hz": worst.high,
@@ -260,7 +260,7 @@ def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> It
         _span(strong),
         f"Sensors of {d} channel{'s' if d > 1 else ''} feel {d} of three dimensions of motion: no "
         f"bias if the motion has no more, or if their {which} are parallel; otherwise motion "
-        f"across them is taken for noise. At the SNR here ({snr:.2g}) 1° between their {which} "
+        f"across them is taken for noise. At the SNR here ({ratio(snr)}) 1° between their {which} "
         f"adds up to {percent(leaked)} of the noise.",
         {"SNR": snr, "added by 1 degree": leaked},
         f"Level or align the sensors so that their {which} are parallel, or use triaxial data.",
@@ -306,7 +306,7 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
             "note",
             (),
             _span(run),
-            f"At {in_hz(_span(run))} the motion is weaker than the noise (SNR {snr:.2g} at "
+            f"At {in_hz(_span(run))} the motion is weaker than the noise (SNR {ratio(snr)} at "
             "most): the spectra are nearly the noise itself, and neither alignment nor method "
             "matters much.",
             {"SNR": snr},

@@ -50,6 +50,11 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
+def ratio(value: float) -> str:
+    """Return a ratio to two digits, without an exponent where people need none."""
+    return f"{float(f'{value:.2g}'):.0f}" if 10 <= value < 1e6 else signed(value, ".2g")
+
+
 def in_hz(band: tuple[float, float]) -> str:
     """Return a band in words."""
     return f"{band[0]:.3g}–{band[1]:.3g} Hz"

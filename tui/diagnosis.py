@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from estimator.wording import ratio
 from tui.text import signed
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def summary(snapshot: Snapshot) -> list[str]:
 def _odd_one(found: Sequence[Advice], names: list[str]) -> str:
     """Say which sensor all pairs that something is wrong with have in common."""
     common = set.intersection(*(set(advice.sensors) for advice in found))
-    at_fault = all(advice.level == "warning" or "gain" in advice.numbers for advice in found)
+    harmless = {"angle_deg", "condition"}  # every sensor may be turned
+    at_fault = not any(harmless & set(advice.numbers) for advice in found)
     if len(common) != 1 or not at_fault:
         return ""
     return f" All of these have {names[common.pop()]} in common: look there first."
@@ -90,22 +92,17 @@ def _bands(snapshot: Snapshot) -> Table:
         table.add_column(name, justify="right")
     for band in snapshot.diagnostics["bands"]:
         known = [float(value) for value in band.snr if math.isfinite(value)]
-        ratio = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
+        statistic = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
         table.add_row(
             f"{band.low:.3g}–{band.high:.3g}",
             f"{band.coherence:.4f}",
             f"{band.condition:.3g}",
             f"{band.dimension:.0f}",
-            f"{_ratio(min(known))}…{_ratio(max(known))}" if known else "?",
-            f"{ratio:.3f}",
+            f"{ratio(min(known))}…{ratio(max(known))}" if known else "?",
+            f"{statistic:.3f}",
             f"{band.test.p_value:.2g}",
         )
     return table
-
-
-def _ratio(value: float) -> str:
-    """Return a ratio to two digits, without an exponent where people need none."""
-    return f"{float(f'{value:.2g}'):.0f}" if 10 <= value < 1e5 else signed(value, ".2g")
 
 
 def _octaves(snapshot: Snapshot) -> Table:
@@ -199,6 +196,16 @@ def _delayed(found: Sequence[Advice], names: list[str]) -> str:
     return f"sensors lag each other: {pairs}: segments then differ at their ends"
 
 
+def _skewed(found: Sequence[Advice], names: list[str]) -> str:
+    pairs = ", ".join(
+        f"{_pair(advice, names)} {advice.numbers['nonorthogonality_deg']:.1f}°" for advice in found
+    )
+    return (
+        f"channels are away from a right angle: {pairs}: no bias, but the noise estimate scatters "
+        "more the more collinear they are"
+    )
+
+
 def _reversed(found: Sequence[Advice], _names: list[str]) -> str:
     pairs = ", ".join(advice.text.split(":")[0] for advice in found)
     return f"{pairs}: no bias, but a sensitivity has the wrong sign"
@@ -222,6 +229,7 @@ _SHORT: dict[str, Callable[[Sequence[Advice], list[str]], str]] = {
     "angle_deg": _turned,
     "gain": _gains,
     "delay_s": _delayed,
+    "nonorthogonality_deg": _skewed,
     "channel": _reversed,
     "swapped": _swapped,
     "condition": _singular,

@@ -105,6 +105,13 @@ def remarks(snapshot: Snapshot) -> list[str]:
             f"octaves below have longer segments, up to {lowest.segment:.4g} s"
             f" ({lowest.n_effective:.0f} effective averages) below {lowest.high:.3g} Hz"
         )
+        disturbed = [
+            f"{octave.left_out['transient']} at {octave.low:.3g}–{octave.high:.3g} Hz"
+            for octave in snapshot.octaves
+            if octave.left_out.get("transient")
+        ]
+        if disturbed:
+            lines.append(f"segments left out that something disturbed: {', '.join(disturbed)}")
     if snapshot.n_dropped:
         lines.append(f"{snapshot.n_dropped} segments left out{left_out(snapshot)}")
     lines += [

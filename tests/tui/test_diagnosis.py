@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from scipy.linalg import block_diag
 
+from daq.estimation import Octave
 from estimator.diagnostics import diagnose
 from estimator.self_noise import Flag
 from tests.tui.made import CHANNELS, SENSORS, SETTINGS, made_snapshot, rotation
@@ -105,6 +106,23 @@ def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> Non
     without = shown(details(diagnosed(dead)))
     assert "How the sensors stand" not in without
     assert "problem: B.Y has no signal" in without
+
+
+def test_octaves_say_what_each_has_left_out() -> None:
+    octaves = (
+        Octave(0.0, 20.0, 20.0, 50, 47.0, {"gap": 1, "transient": 0}),
+        Octave(20.1, 100.0, 10.0, 100, 94.0, {"gap": 2, "transient": 3}),
+    )
+    snapshot = replace(diagnosed(), octaves=octaves)
+    assert "segments left out that something disturbed: 3 at 20.1–100 Hz" in remarks(snapshot)
+    text = " ".join(shown(details(snapshot)).split())
+    assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
+
+
+def test_clipped_channels_are_named() -> None:
+    snapshot = diagnosed()
+    clipped = snapshot.diagnostics | {"clipped": {"B.X": 0.046}}
+    assert any("clipped: B.X (4.6 %)" in x for x in remarks(replace(snapshot, diagnostics=clipped)))
 
 
 def test_a_channel_without_signal_has_no_level() -> None:
