@@ -117,6 +117,18 @@ def test_device_utc_and_host_times_meet_though_the_hosts_utc_is_off(
     assert snapshot.start_utc_ns > 0
 
 
+def test_a_rate_that_is_off_by_one_per_cent_is_followed(tmp_path: Path) -> None:
+    table = free_running(snr=1e4, duration=200.0, seed=8).to_dict()
+    table["sensors"]["B"]["clock"] |= {"ppm": -1e4}
+    scenario = Scenario.from_dict(table)
+    snapshot = estimate([synthesise(tmp_path / "r.h5", scenario, duration=200.0)])
+    assert snapshot.clocks[1].ppm == pytest.approx(-1e4, abs=2.0)  # and a step of 2 ppm
+    assert residuals(snapshot, scenario).max() < 2e-6
+    noise = snapshot.results["three-sensor"].noise_psd
+    band = (snapshot.frequency > 5) & (snapshot.frequency < 88)  # 0.45 of 198 Hz is 89
+    assert noise[band].mean(axis=0) == pytest.approx(1e-13, rel=0.03)
+
+
 def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:
     rows = {row.clocks: row for row in study(tmp_path, snr=0.3, duration=400.0, seed=4)}
     alone, refined = rows["arrival times"], rows["refined"]
