@@ -141,6 +141,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
     named = any("share of frequencies" in a.numbers for a in snapshot.diagnostics.get("advice", ()))
     for method, noise in snapshot.results.items():
         lines += flagged(snapshot, method, besides=_NAMED if named else 0)
+        lines += unresolved(snapshot, method)
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
@@ -195,6 +196,24 @@ def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
             at = "all frequencies" if most == len(flags) else f"{most} of {len(flags)} frequencies"
             lines.append(f"{method}: {names}: {why}, at {at}")
     return lines
+
+
+def unresolved(snapshot: Snapshot, method: str) -> list[str]:
+    """Return where averages are too few for the motion's strength, and what that does."""
+    noise = snapshot.results[method]
+    here = (noise.flags[1:-1] & Flag.UNRESOLVED) != 0
+    left_in = noise.cov[1:-1][here & np.isfinite(noise.cov[1:-1])]
+    if not left_in.size:
+        return []
+    where = here.any(axis=1)
+    frequency = snapshot.frequency[1:-1][where]
+    line = (
+        f"{method}: at {where.sum()} of {len(where)} frequencies ({frequency[0]:.3g} to "
+        f"{frequency[-1]:.3g} Hz) fewer averages than the weak motion there needs: some of it may "
+        f"be left in the noise, by up to about {100 * float(np.median(left_in)):.2g} % of it. "
+        "Record longer to take it out"
+    )
+    return [line]
 
 
 def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:

@@ -119,6 +119,19 @@ def test_octaves_say_what_each_has_left_out() -> None:
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
 
 
+def test_where_averages_are_too_few_for_weak_motion_is_said_with_what_may_be_left_in() -> None:
+    snapshot = diagnosed()
+    noise = snapshot.results["three-sensor"]
+    flags, cov = noise.flags.copy(), noise.cov.copy()
+    flags[20:41] |= Flag.UNRESOLVED
+    cov[20:41] = 0.13
+    results = {"three-sensor": replace(noise, flags=flags, cov=cov)}
+    (line,) = [x for x in remarks(replace(snapshot, results=results)) if "fewer averages" in x]
+    assert "at 21 of 199 frequencies (10 to 20 Hz)" in line
+    assert "up to about 13 %" in line
+    assert not any("fewer averages" in x for x in remarks(snapshot))
+
+
 def test_clipped_channels_are_named() -> None:
     snapshot = diagnosed()
     clipped = snapshot.diagnostics | {"clipped": {"B.X": 0.046}}
