@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -12,65 +12,34 @@ import pytest
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
-from daq.protocols import epson
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
-from sim_devices import launch
+from tests.drivers.modes import CASES, RATE, Served, serving
 from tests.drivers.reading import reading
-from tests.sim_devices.bench import device, sensors, spec
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 
     from daq.bench import Sensor
-    from sim_devices.launch import RunningDevice
 
 SPEED = 4.0
-RATE = 200.0
 N = 150
-XYZ = [{"name": axis, "sensitivity": 1e6} for axis in "xyz"]
-CASES: dict[str, dict[str, Any]] = {
-    "epson": {"sensitivity": epson.COUNTS_PER_UNIT, "settings": {}},
-    "registers": {"sampling_rate": 20.0, "settings": {"address": 0, "timeout": 1.0}},
-    "labjack": {"port": "tcp", "sensors": ["labjack 1", "labjack 2"], "settings": {}},
-    "guralp": {"settings": {"patience": 2.0}},
-    "fifo": {"settings": {}},
-    "text": {"settings": {"columns": [0, 1, 2]}},
-}
-SCHEMES = {"registers": "modbus-tcp", "labjack": "modbus-tcp"}
-
-
-def table(driver: str) -> dict[str, Any]:
-    case = {"sensors": [f"{driver} 1"], "sampling_rate": RATE, **CASES[driver]}
-    channels = [{**c, "sensitivity": case.pop("sensitivity", 1e6)} for c in XYZ[:1]]
-    channels += [{**c, "sensitivity": channels[0]["sensitivity"]} for c in XYZ[1:]]
-    return device("", driver, **case, channels=dict.fromkeys(case["sensors"], channels))
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[dict[str, RunningDevice]]:
-    tables = [table(driver) for driver in CASES]
-    world = spec(*tables, speed=SPEED)
-    for one in tables:
-        for name in one["sensors"]:
-            world["scenario"]["sensors"][name]["sampling_rate"] = one["sampling_rate"]
-    with launch.start(world) as running:
-        yield {one.driver: one for one in running}
-
-
-def connecting(driver: str, one: RunningDevice, **changes: Any) -> list[Sensor]:  # noqa: ANN401
-    settings = {**CASES[driver]["settings"], **one.settings}
-    return sensors(one, table(driver), settings=settings, **changes)
+def served() -> Iterator[Served]:
+    with serving(speed=SPEED) as devices:
+        yield devices
 
 
 def test_no_driver_is_left_out() -> None:
-    assert set(CASES) == set(driver_names())
+    assert {case["driver"] for case in CASES.values()} == set(driver_names())
 
 
-@pytest.mark.parametrize("driver", CASES)
-async def test_blocks_are_in_order_and_whole(served: dict[str, RunningDevice], driver: str) -> None:
-    kind = driver_type(driver)
-    chosen = connecting(driver, served[driver])
+@pytest.mark.parametrize("mode", CASES)
+async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
+    kind = driver_type(CASES[mode]["driver"])
+    chosen = served.sensors(mode)
     wanted = round(N * chosen[0].sampling_rate / RATE)
     by_name = {sensor.name: sensor for sensor in chosen}
     found: dict[str, list[Block]] = {name: [] for name in by_name}
@@ -80,13 +49,16 @@ async def test_blocks_are_in_order_and_whole(served: dict[str, RunningDevice], d
         found = {name: [] for name in by_name}
         async with kind.open(chosen, clock) as session:
             assert [one.sensor for one in session.information] == list(by_name)
-            async for item in session.read():
-                if isinstance(item, Event):
-                    assert item.kind in {"connected", "status"}, item
-                    continue
-                found[item.sensor].append(item)
-                if all(blocks and blocks[-1].end_sample >= wanted for blocks in found.values()):
-                    break
+            assert not any(one.trouble for one in session.information)
+            stream = cast("AsyncGenerator[Block | Event]", session.read())
+            async with contextlib.aclosing(stream) as items:
+                async for item in items:
+                    if isinstance(item, Event):
+                        assert item.kind in {"connected", "status"}, item
+                        continue
+                    found[item.sensor].append(item)
+                    if all(b and b[-1].end_sample >= wanted for b in found.values()):
+                        break
     for name, blocks in found.items():
         first = blocks[0]
         assert first.first_sample == 0
@@ -105,18 +77,22 @@ async def test_blocks_are_in_order_and_whole(served: dict[str, RunningDevice], d
             assert block.received.monotonic_ns >= at
             assert block.instants_ns is None or np.all(np.diff(block.instants_ns) > 0)
             end, at = block.end_sample, block.received.monotonic_ns
-        assert np.concatenate([block.counts for block in blocks]).std(axis=0).min() > 0
+        counts = np.concatenate([block.counts for block in blocks])
+        assert counts.std(axis=0).min() > 0
+        index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
+        served.assert_felt(mode, name, index, counts)
 
 
-@pytest.mark.parametrize("driver", CASES)
-async def test_a_port_that_is_not_there_is_named(
-    served: dict[str, RunningDevice], driver: str
-) -> None:
-    port = f"{SCHEMES.get(driver, 'socket')}://127.0.0.1:1"
-    chosen = connecting(driver, served[driver], port=port)
+@pytest.mark.parametrize("mode", CASES)
+async def test_a_port_that_is_not_there_is_named(served: Served, mode: str) -> None:
+    scheme = served.device(mode).port.partition("://")[0]
+    port = f"{scheme}://127.0.0.1:1" if scheme in {"modbus-tcp", "udp"} else "socket://127.0.0.1:1"
+    if mode == "text udp":  # listens itself, at an address that is not this computer's
+        port = "udp://192.0.2.1:8888"
+    chosen = served.sensors(mode, port=port)
     with pytest.raises(NotConnectedError) as caught:
-        async with reading(driver_type(driver), chosen):
-            pass
+        async with reading(driver_type(CASES[mode]["driver"]), chosen) as items:
+            await anext(items)
     assert port in str(caught.value)
     assert repr(chosen[0].name) in str(caught.value)
 
@@ -139,11 +115,11 @@ async def stranger(garbage: bytes) -> AsyncIterator[int]:
     await asyncio.gather(*filter(None, tasks))
 
 
-async def outcome(driver: str, chosen: list[Sensor]) -> tuple[Exception | None, int]:
+async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, int]:
     """Return how reading ends within a few seconds, and how many blocks came until then."""
-    n_blocks = 0
+    kind, n_blocks = driver_type(CASES[mode]["driver"]), 0
     try:
-        async with asyncio.timeout(4), reading(driver_type(driver), chosen, speed=SPEED) as items:
+        async with asyncio.timeout(4), reading(kind, chosen, speed=SPEED) as items:
             async for item in items:
                 n_blocks += isinstance(item, Block)
     except (DeviceError, RemoteProtocolError, TimeoutError) as error:
@@ -152,43 +128,38 @@ async def outcome(driver: str, chosen: list[Sensor]) -> tuple[Exception | None, 
 
 
 @pytest.mark.parametrize("garbage", [b"", bytes(range(256)) * 3], ids=["silence", "garbage"])
-async def test_strangers_are_no_devices(served: dict[str, RunningDevice], garbage: bytes) -> None:
+async def test_strangers_are_no_devices(served: Served, garbage: bytes) -> None:
+    modes = [mode for mode in CASES if not served.device(mode).port.startswith("udp")]
     async with stranger(garbage) as number:
+        ports = {
+            mode: f"modbus-tcp://127.0.0.1:{number}"
+            if served.device(mode).port.startswith("modbus-tcp")
+            else f"socket://127.0.0.1:{number}"
+            for mode in modes
+        }
         outcomes = await asyncio.gather(
-            *(
-                outcome(
-                    driver,
-                    connecting(
-                        driver,
-                        served[driver],
-                        port=f"{SCHEMES.get(driver, 'socket')}://127.0.0.1:{number}",
-                    ),
-                )
-                for driver in CASES
-            )
+            *(outcome(mode, served.sensors(mode, port=ports[mode])) for mode in modes)
         )
-    for driver, (error, n_blocks) in zip(CASES, outcomes, strict=True):
-        assert not n_blocks, driver
-        assert isinstance(error, (DeviceError, RemoteProtocolError)), (driver, error)
+    for mode, (error, n_blocks) in zip(modes, outcomes, strict=True):
+        assert not n_blocks, mode
+        assert isinstance(error, (DeviceError, RemoteProtocolError)), (mode, error)
 
 
-@pytest.mark.parametrize("driver", CASES)
-async def test_z_a_device_that_vanishes_ends_the_session(
-    served: dict[str, RunningDevice], driver: str
-) -> None:
+@pytest.mark.parametrize("mode", CASES)
+async def test_z_a_device_that_vanishes_ends_the_session(served: Served, mode: str) -> None:
     """Last in this file: it ends the devices."""
-    chosen = connecting(driver, served[driver])
+    chosen = served.sensors(mode)
     error: Exception | None = None
     seen = 0
     try:
         async with (
-            asyncio.timeout(15),
-            reading(driver_type(driver), chosen, speed=SPEED) as items,
+            asyncio.timeout(30),
+            reading(driver_type(CASES[mode]["driver"]), chosen, speed=SPEED) as items,
         ):
             async for item in items:
                 seen += isinstance(item, Block)
                 if seen:
-                    served[driver].process.kill()
+                    served.device(mode).process.kill()
     except (NotConnectedError, NoAnswerError) as came:
         error = came
     assert seen

@@ -1,0 +1,145 @@
+"""Every mode of every driver, its simulated device, and what its sensors felt."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.protocols import epson
+from sim_devices import launch
+from sim_devices.device import Source
+from sim_devices.scenario import Scenario
+from sim_devices.serve import device_spec
+from tests.sim_devices.bench import device, sensors, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from daq.bench import Sensor
+    from sim_devices.launch import RunningDevice
+
+RATE = 200.0
+XYZ = ("x", "y", "z")
+POLLED: dict[str, Any] = {"driver": "registers", "sampling_rate": 20.0}
+LABJACK: dict[str, Any] = {"driver": "labjack", "port": "tcp"}
+CASES: dict[str, dict[str, Any]] = {
+    "epson": {"driver": "epson", "sensitivity": epson.COUNTS_PER_UNIT, "settings": {}},
+    "registers rtu": {**POLLED, "settings": {"address": 0, "timeout": 1.0}},
+    "registers tcp": {**POLLED, "port": "tcp", "settings": {"address": 0, "timeout": 1.0}},
+    "labjack": {**LABJACK, "sensors": ["labjack 1", "labjack 2"], "settings": {}},
+    "labjack polled": {**LABJACK, "settings": {"mode": "command-response"}},
+    "guralp serial": {"driver": "guralp", "settings": {"patience": 2.0}},
+    "scream udp": {"driver": "guralp", "port": "udp", "settings": {"patience": 2.0}},
+    "scream tcp": {
+        "driver": "guralp",
+        "port": "tcp",
+        "settings": {"link": "scream", "patience": 2.0},
+    },
+    "fifo": {"driver": "fifo", "settings": {}},
+    "text serial": {
+        "driver": "text",
+        "settings": {"columns": [1, 2, 3], "counter_column": 0, "baud_rate": 115200},
+    },
+    "text tcp": {"driver": "text", "port": "tcp", "settings": {"time_column": 3}},
+    "text udp": {"driver": "text", "port": "udp", "settings": {"preset": "raspberry-shake"}},
+}
+OFFSETS = {"labjack": 33523}
+"""Counts where a sensor feels nothing."""
+
+
+def table(mode: str) -> dict[str, Any]:
+    """Return the simulated device of a mode."""
+    case = {"sensors": [f"{mode} 1"], "sampling_rate": RATE, **CASES[mode]}
+    sensitivity = case.pop("sensitivity", 1e6)
+    channels = [{"name": axis, "sensitivity": sensitivity} for axis in XYZ]
+    return device("", **case, channels=dict.fromkeys(case["sensors"], channels))
+
+
+@dataclass(frozen=True)
+class Served:
+    """Devices of all modes that run."""
+
+    devices: dict[str, RunningDevice]
+    world: dict[str, Any]
+    log: Path
+
+    def device(self, mode: str) -> RunningDevice:
+        """Return the running device."""
+        return self.devices[mode]
+
+    def sensors(self, mode: str, **changes: Any) -> list[Sensor]:  # noqa: ANN401
+        """Return the sensors of a bench file that connects to it."""
+        one = self.devices[mode]
+        settings = {**CASES[mode]["settings"], **one.settings}
+        return sensors(one, table(mode), settings=settings, **changes)
+
+    def assert_felt(
+        self, mode: str, name: str, index: NDArray[np.int64], counts: NDArray[Any]
+    ) -> None:
+        """See that counts are what the sensor felt: each sample once, and in its place."""
+        driver = CASES[mode]["driver"]
+        felt = self._felt[name] + OFFSETS.get(driver, 0)
+        if driver == "registers":  # each poll is the latest reading
+            apart = np.abs(felt[None] - counts[:, None]).max(axis=2)
+            which = apart.argmin(axis=1)
+            assert apart.min(axis=1).max() <= 0.5
+            assert (np.diff(which) >= 0).all()
+            return
+        start = int(np.abs(felt - counts[0]).max(axis=1).argmin())
+        expected = felt[start + index - index[0]]
+        assert np.abs(expected - counts).max() <= 0.5 + 1e-8 * np.abs(expected).max(), mode
+
+    def remember(self) -> None:
+        """Note what is needed to know what was felt when the devices have ended."""
+        _ = self._felt
+
+    @cached_property
+    def _felt(self) -> _Felt:
+        return _Felt(self.world, self.log)
+
+
+class _Felt(dict[str, "NDArray[np.float64]"]):
+    """What each sensor feels from world time 0 on, in counts, worked out when asked for."""
+
+    SECONDS = 400.0
+
+    def __init__(self, world: dict[str, Any], log: Path) -> None:
+        super().__init__()
+        self._world = world
+        lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+        self._utc_ns = {n: x["utc_ns"] for x in lines if "utc_ns" in x for n in x["sensors"]}
+
+    def __missing__(self, name: str) -> NDArray[np.float64]:
+        one = next(one for one in self._world["devices"] if name in one["sensors"])
+        described = replace(device_spec(one), utc_ns=self._utc_ns[name])
+        rate = described.sampling_rate
+        world = Scenario.from_dict(self._world["scenario"], sampling_rate=rate)
+        source = Source(world, described)
+        if described.driver == "guralp":  # on whole seconds of UTC
+            source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
+        self[name] = source.counts(name, 0, round(self.SECONDS * rate))
+        return self[name]
+
+
+@contextlib.contextmanager
+def serving(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iterator[Served]:
+    """Serve the devices of all modes."""
+    tables = [table(mode) for mode in CASES]
+    world = spec(*tables, speed=speed)
+    for one in tables:
+        for name in one["sensors"]:
+            world["scenario"]["sensors"][name]["sampling_rate"] = one["sampling_rate"]
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "sent"
+        world |= {"faults": faults or [], "sent_log": str(log)}
+        with launch.start(world) as running:
+            yield Served(dict(zip(CASES, running, strict=True)), world, log)
