@@ -40,6 +40,10 @@ def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     assert at[50.0] == pytest.approx(11.95, abs=0.6)
     assert np.all(np.abs(bias(found.noise_psd)[centres <= 20]) < 0.05)
     assert abs(bias(found.noise_psd)[-1]) < 0.20
+    # 24 frequencies of 15 channels a band; the least visible factors are at 3.5 and 7 Hz
+    covered = ((found.low < 1) & (found.high > 1)).reshape(len(centres), -1).mean(axis=1)
+    assert np.all(covered > 0.88)
+    assert covered[1:].mean() > 0.95
     assert choices[0].n_factors == 3
     assert all(choice.accepted for choice in choices)
     assert all(choice.n_factors >= 9 for choice in choices[-2:])
