@@ -18,6 +18,8 @@ import tty
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from sim_devices.errors import ServeError
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -182,13 +184,20 @@ class TcpPort:
         self._listener = listener
         self._scheme = scheme
         self._number = number
+        self._server: asyncio.Server | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._down = False
         self.address = ""
 
     async def open(self) -> None:
         """Listen on a port of this machine."""
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
+        try:
+            self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
+        except OSError as error:
+            raise ServeError(
+                f"port {self._number} of this machine cannot be listened on: {error.strerror};"
+                " give the bench file's port another number, or a host that is not this machine"
+            ) from error
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -234,9 +243,10 @@ class TcpPort:
 
     async def close(self) -> None:
         """Stop listening."""
-        self._server.close()
         self.hang_up()
-        await self._server.wait_closed()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
 
 
 class UdpPort:

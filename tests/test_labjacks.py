@@ -16,6 +16,7 @@ from daq.protocols.block import BlockFlag
 from daq.recording.healing import verify
 from daq.recording.reader import Recording
 from sim_devices import launch
+from sim_devices.errors import ServeError
 from tests.acceptance.running import command
 from tui.devices import connected, specification
 
@@ -134,3 +135,16 @@ def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
             assert gap["missing"] >= 600
             assert [k for k in kinds if k != "late"] == ["connected", "disconnected", "connected"]
             assert (sensor.blocks["flags"] & BlockFlag.CLOCK_RESTART != 0).sum() == 2
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    told = specification(parse(bench_text()), speed=SPEED)
+    number = told["devices"][0]["number"]
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", number))
+        held.listen()
+        with (
+            pytest.raises(ServeError, match=f"port {number} of this machine cannot be listened on"),
+            launch.start({**told, "devices": told["devices"][:1]}),
+        ):
+            pass
