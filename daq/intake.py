@@ -101,6 +101,11 @@ class Intake:
             else:
                 self._connected(item)
 
+    @property
+    def n_written(self) -> int:
+        """Rows of samples in the file, of all sensors: what a commit now would make safe."""
+        return self._writer.n_written
+
     def commit(self) -> Committed:
         """Make it safe."""
         return self._writer.commit()

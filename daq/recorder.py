@@ -4,15 +4,16 @@ Theory of operation
 -------------------
 One task a port (:class:`daq.session.Connection`) puts what comes into one bounded queue; one writer
 takes it from there in batches, places it (:mod:`daq.continuity`) and hands it to the file in a
-thread of its own, so that neither compression nor ``fsync`` delays a port. About twice a second it
-commits, and only then acknowledges. When writing lags, the queue fills, ports wait, and the
-system's buffers hold what comes.
+thread of its own, so that neither compression nor ``fsync`` delays a port. About twice a second,
+and when a whole chunk of samples is written, it commits, and only then acknowledges. When writing
+lags, the queue fills, ports wait, and the system's buffers hold what comes.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import re
 import signal
 from concurrent.futures import ThreadPoolExecutor
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
     from daq.session import Item
 
 QUEUE_LENGTH = 4096
-COMMIT_INTERVAL = 0.5
+COMMIT_INTERVAL, LEAST_COMMIT_INTERVAL = 0.5, 0.25
+"""Between commits, s: the usual one, and the one where a whole chunk of samples waits for it."""
 CANCEL_TIMEOUT = LEAVE_TIMEOUT + 2.0
 """For all connections to end, s."""
 _BATCH_INTERVAL = 0.1
@@ -254,16 +256,18 @@ class _Recorder:
     ) -> None:
         """Take what comes from the queue until it is time to stop."""
         loop = asyncio.get_running_loop()
-        next_commit = loop.time()
+        last_commit, n_committed = -math.inf, 0
         while not self._stop.is_set():
             batch = await self._batch()
             await thread.run(partial(intake.take, batch))
             for task in tasks:
                 if task.done():  # a connection ends only by a fault in the code
                     task.result()
-            if loop.time() >= next_commit:
+            waits = intake.n_written > n_committed
+            if loop.time() >= last_commit + (LEAST_COMMIT_INTERVAL if waits else COMMIT_INTERVAL):
+                n_committed = intake.n_written
                 self._acknowledge(intake, await thread.run(intake.commit))
-                next_commit = loop.time() + COMMIT_INTERVAL
+                last_commit = loop.time()
             elif (sensors := self._with_states(intake)) != self._status.sensors:
                 self._tell(replace(self._status, sensors=sensors))
             if duration is not None and self._is_complete(intake, duration):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from daq.estimation import Snapshot
 
 INTERRUPTED = 130
-INTERVAL = 0.5
+INTERVAL = 0.25
 LONGEST_INTERVAL = 5.0
 BEHIND = 2.0
 """Seconds by which a recording that is looked at may lie behind its sensors, at most."""

@@ -138,6 +138,11 @@ class RecordingWriter:
                 raise
         return writer
 
+    @property
+    def n_written(self) -> int:
+        """Rows of samples in whole chunks, of all sensors, committed or not."""
+        return sum(sensor.samples.n_written for sensor in self._sensors.values())
+
     def append(self, block: Block) -> None:
         """Take a block; it is safe once a later ``commit`` counts it."""
         with self._guarded():
