@@ -1,7 +1,7 @@
 """The estimate from the file: decompression, alignment, spectra, result; and the whole command.
 
 Two kinds of file: as the recorder leaves it, in chunks of one to two seconds, and as it is
-imported, in chunks of 16384 rows. Ratios are of wall times within one run; notes give the
+imported, in chunks of 4096 rows. Ratios are of wall times within one run; notes give the
 processor's time, all threads together, which says more where the machine is shared, and what of
 it no reader can save: zlib's part, and that of the imports.
 """

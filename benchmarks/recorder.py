@@ -1,7 +1,8 @@
 """The largest bench, through real sockets into HDF5: what is lost (nothing), what it costs.
 
 One process plays all devices (Epson accelerometers behind serial-to-network adapters that send
-every 50 ms), another is the recorder, and only that one is measured.
+every 50 ms), another is the recorder, and only that one is measured. A usual bench is also recorded
+and estimated by `huddle run` in a terminal: both of its processes, once they are under way.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
+import pty
 import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +25,11 @@ import numpy as np
 
 from benchmarks.row import Row
 from daq.bench import Bench, Channel, Sensor, parse
+from daq.estimation import Estimation, Settings
 from daq.protocols import epson
 from daq.recorder import run as record
 from daq.recording.healing import verify
+from tui.running import BEHIND, INTERVAL
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,6 +151,87 @@ def case(n_sensors: int, sampling_rate: float, duration: float) -> dict[str, flo
         return found
 
 
+def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float) -> list[Row]:
+    """Record and estimate a bench by `huddle run`; return what that takes after `begin` s."""
+    with tempfile.TemporaryDirectory() as folder, played(n_sensors, sampling_rate) as bench:
+        bench_file, path = Path(folder) / "bench.toml", Path(folder) / "r.h5"
+        bench_file.write_text(bench.text, encoding="utf-8")
+        command = [sys.executable, "-m", "tui", "run", str(bench_file), "--out", str(path)]
+        command += ["--duration", str(begin + duration + 10)]
+        with (
+            _terminal() as screen,
+            subprocess.Popen(command, stdout=screen, stderr=screen) as huddle,
+        ):
+            while not path.exists():
+                time.sleep(INTERVAL)
+            time.sleep(begin)
+            (recorder,) = _children(huddle.pid)
+            processes = (huddle.pid, recorder)
+            before, since = [_work_of(pid) for pid in processes], time.monotonic()
+            delay = _longest_delay(path, until=since + duration)
+            passed = time.monotonic() - since
+            share = [
+                100 * (_work_of(pid) - work) / passed
+                for pid, work in zip(processes, before, strict=True)
+            ]
+            huddle.wait()
+    what = f"{n_sensors} triaxial sensors × {sampling_rate:g} Hz, recorded and estimated"
+    note = f"huddle run {share[0]:.2f} %, its recorder {share[1]:.2f} %"
+    return [
+        Row(f"{what}: one core", sum(share), "%", at_most=5.0, note=note),
+        Row(f"{what}: a segment is there after its end by", delay, "s", at_most=2.0),
+    ]
+
+
+def _longest_delay(path: Path, *, until: float) -> float:
+    """Follow a recording as `huddle run` does; return how late a segment was, at most."""
+    delays: list[float] = []
+    with Estimation([path], Settings()) as estimation:
+        estimation.update()
+        while time.monotonic() < until:
+            time.sleep(max(INTERVAL, estimation.lacking - BEHIND))
+            if estimation.update():
+                estimated = estimation.snapshot()
+                end = estimated.start_utc_ns * 1e-9 + estimated.elapsed
+                delays.append(time.time() - end)
+    return max(delays[1:])  # the first may have waited for those before it
+
+
+@contextlib.contextmanager
+def _terminal() -> Iterator[int]:
+    """Give a terminal, for what is drawn on one; somebody looks at it."""
+    near, far = pty.openpty()
+
+    def look() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(near, 65536):
+                pass
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        yield far
+    finally:
+        os.close(far)
+        looking.join()
+        os.close(near)
+
+
+def _threads(pid: int) -> list[Path]:
+    return list(Path(f"/proc/{pid}/task").iterdir())
+
+
+def _children(pid: int) -> list[int]:
+    return [
+        int(child) for task in _threads(pid) for child in (task / "children").read_text().split()
+    ]
+
+
+def _work_of(pid: int) -> float:
+    """Return the processor time of a process so far, in s."""
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in _threads(pid)) * 1e-9
+
+
 def run() -> list[Row]:
     """Return what the largest and a usual bench take."""
     rows = []
@@ -164,7 +251,7 @@ def run() -> list[Row]:
             Row(f"{what}: memory", found["memory"], "MB"),
             Row(f"{what}: file", per_sample, "bytes/count", note="white noise, 21 bits"),
         ]
-    return rows
+    return [*rows, *live(5, 200.0, begin=15.0, duration=30.0)]
 
 
 if __name__ == "__main__":

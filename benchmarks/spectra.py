@@ -131,9 +131,10 @@ def _live() -> list[Row]:
         rows.append(
             Row(
                 f"live update, five triaxial sensors, {method}",
-                100 * seconds / (LENGTH / RATE),
-                "% of its segment",
+                100 * seconds / (settings.hop / RATE),
+                "% of the time its new samples took",
                 at_most=share,
+                note="all threads together",
             )
         )
     return rows
