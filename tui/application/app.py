@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 from textual import on, work
 from textual.app import App
 from textual.binding import Binding, BindingType
-from textual.reactive import reactive
+from textual.reactive import var
 from textual.widgets import Footer
 
 from daq.errors import HuddleError
@@ -72,11 +72,11 @@ class HuddleApp(App[None]):
         Binding("up", "sensor(-1)", "Sensor", show=False),
     ]
 
-    snapshot: reactive[Snapshot | None] = reactive(None, always_update=True)
-    now: reactive[Now | None] = reactive(None, always_update=True)
-    choice: reactive[view.Choice] = reactive(view.Choice)
-    note: reactive[str] = reactive("")
-    trouble: reactive[str] = reactive("")
+    snapshot: var[Snapshot | None] = var(None, always_update=True)
+    now: var[Now | None] = var(None, always_update=True)
+    choice: var[view.Choice] = var(view.Choice)
+    note: var[str] = var("")
+    trouble: var[str] = var("")
 
     def __init__(
         self, controls: Controls, *, path: Path | None = None, start: bool = False
@@ -141,7 +141,9 @@ class HuddleApp(App[None]):
     @on(Fresh)
     def _on_fresh(self, message: Fresh) -> None:
         self._settings = message.settings
-        before, self.note = self.snapshot, ""
+        before = self.snapshot
+        if message.snapshot.closed:
+            self.note = ""
         if not self.choice.methods:
             names = tuple(name for name in message.settings.methods if name != "all")
             names = names or tuple(message.snapshot.results)
@@ -266,7 +268,9 @@ class HuddleApp(App[None]):
     def _result(self) -> RenderableType:
         if self.snapshot is None or self._settings is None:
             return ""
-        return result(self.snapshot, self._settings, bench=self._controls.bench, path=self._path)
+        return result(
+            self.now, self.snapshot, self._settings, bench=self._controls.bench, path=self._path
+        )
 
     # ------------------------------------------------------------------ controlling
 

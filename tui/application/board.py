@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from textual.events import Resize
 
     from daq.estimation import Settings, Snapshot
+    from tui.bands import BandMeans
     from tui.state import Now
 
 TALL = 34  # rows from which there is room for remarks and air
@@ -70,6 +71,7 @@ class Board(Vertical):
         self._shown: Shown | None = None
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
+        self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
 
     def compose(self) -> ComposeResult:
         """Lay out the screen."""
@@ -120,7 +122,9 @@ class Board(Vertical):
         if choice.clocks:
             table = clocks.clock_table(snapshot, settings, chosen=_sensor(shown), width=width - 1)
         else:
-            table = view.sensor_table(now, snapshot, settings, choice, width=width - 1)
+            table = view.sensor_table(
+                now, snapshot, settings, choice, means=self._noise(shown), width=width - 1
+            )
         self._write("#table", table, n_lines=table.row_count + 1)
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
         progress = view.progress_line(
@@ -128,6 +132,16 @@ class Board(Vertical):
         )
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
         self._write("#advice", view.advice(snapshot, choice))
+
+    def _noise(self, shown: Shown) -> tuple[BandMeans, ...]:
+        """Return the channels' noise, computed once for each snapshot."""
+        snapshot, settings = shown.snapshot, shown.settings
+        if snapshot is None or settings is None:
+            return ()
+        key = (id(snapshot), shown.choice.methods)
+        if self._means[0] != key:
+            self._means = key, view.noise_in_band(snapshot, settings, shown.choice)
+        return self._means[1]
 
     def _write_alerts(self, shown: Shown) -> None:
         alerts = [] if shown.now is None else view.alerts(shown.now)

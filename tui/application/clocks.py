@@ -67,7 +67,7 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
     table.add_column("clock", no_wrap=True)
     wide = width >= 76
-    for title in ("rate, ppm", *(("wander",) if wide else ()), "left", "of noise"):
+    for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "left", "of noise"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("known by", no_wrap=True)
     shares, left = effect(snapshot, settings), residuals(snapshot)
@@ -80,8 +80,8 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
         name = Text(f"━ {clock.sensor}", _colour(number))
         if clock.sensor == chosen:
             name.stylize("reverse", 2)
-        rate = _ppm(clock.ppm) + (f" ±{clock.ppm_std:.2g}" if clock.ppm_std > 0 else "")
-        wander = f"{clock.wander_ppm:.2g} ppm" if clock.wander_ppm > 0 else "–"
+        rate = _ppm(clock.ppm) + (f" ±{_small(clock.ppm_std)}" if clock.ppm_std > 0 else "")
+        wander = _small(clock.wander_ppm) if clock.wander_ppm > 0 else "–"
         style = GOOD if share < HARMLESS else DOUBTFUL if share < MATTERS else BAD
         table.add_row(
             name,
@@ -95,9 +95,14 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
 
 
 def _source(clock: ClockState, *, by_motion: bool) -> str:
-    restarts = f", {clock.n_epochs - 1} restarts" if clock.n_epochs > 1 else ""
-    motion = " and motion" if clock.refined else ", the reference" if by_motion else ""
-    return f"{clock.source}{motion}{restarts}"
+    source = clock.source.replace("arrival times", "arrivals")
+    motion = ", motion" if clock.refined else "; the reference" if by_motion else ""
+    restarts = clock.n_epochs - 1
+    return f"{source}{motion}" + (f"; {restarts} restart{'s' * (restarts > 1)}" * (restarts > 0))
+
+
+def _small(ppm: float) -> str:
+    return "<0.01" if ppm < 0.01 else f"{ppm:.2f}" if ppm < 1 else f"{ppm:.1f}"
 
 
 def drift_title(snapshot: Snapshot) -> str:

@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from tui.application.view import state
+from tui.application.view import alerts, state
 from tui.bands import band_edges
 from tui.diagnosis import details as diagnosis_details
 from tui.diagnosis import summary
@@ -34,10 +34,17 @@ MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
 
 
 def result(
-    snapshot: Snapshot, settings: Settings, *, bench: Bench | None, path: Path | None
+    now: Now | None,
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    bench: Bench | None,
+    path: Path | None,
 ) -> RenderableType:
     """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
-    parts: list[RenderableType] = [*_verdict(snapshot, settings, bench), ""]
+    parts: list[RenderableType] = [*_verdict(snapshot, settings, bench)]
+    parts += ["", *alerts(now)] if now is not None and alerts(now) else []
+    parts.append("")
     if snapshot.results:
         parts += [_channels(snapshot, settings), ""]
     parts += [_item(line) for line in (*remarks(snapshot), *summary(snapshot))]

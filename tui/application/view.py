@@ -77,20 +77,31 @@ def plot_title(snapshot: Snapshot, choice: Choice) -> str:
     return f"{label.sensor} {label.channel}   power spectral density re 1 ({snapshot.unit})²/Hz"
 
 
+def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
+    """Return the mean noise of every channel by the first chosen method; empty before there is."""
+    method = next((m for m in choice.methods[:1] if m in snapshot.results), None)
+    if method is None:
+        return ()
+    band = band_of(settings, snapshot.frequency)
+    return channel_means(snapshot.results[method], snapshot.frequency, settings, band)
+
+
 def sensor_table(
-    now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int
+    now: Now,
+    snapshot: Snapshot,
+    settings: Settings,
+    choice: Choice,
+    *,
+    means: Sequence[BandMeans],
+    width: int,
 ) -> Table:
     """Return a row per sensor: how it is, and the noise of each of its channels in the band.
 
     What there is no room for is left out: rates first, then numbers of samples, then of gaps.
     """
-    method = next((m for m in choice.methods if m in snapshot.results), None)
-    means: tuple[BandMeans, ...] = ()
     band = band_of(settings, snapshot.frequency)
-    if method is not None:
-        means = channel_means(snapshot.results[method], snapshot.frequency, settings, band)
     of_sensor = _columns_of(snapshot)
-    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz"]
+    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
     columns["state"] = [state(sensor) for sensor in now.sensors]
     columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
@@ -162,7 +173,8 @@ def _channel_noise(
     elif means:
         mean, high = float(means[column].mean[0]), float(means[column].high[0])
         if mean > 0:
-            value = f"{decibels(mean):.1f}±{decibels(high) - decibels(mean):.1f}"
+            error = decibels(high) - decibels(mean)
+            value = f"{decibels(mean):.1f}±" + (f"{error:.1f}" if error >= 0.05 else "<.1")
         elif not math.isnan(mean):
             value = "below 0"
     text = Text(f"{name} {value}".replace("-", "−"), style)
@@ -189,8 +201,9 @@ def progress_line(
 
     ``since`` is how many seconds ago the snapshot was made.
     """
-    method = next((m for m in choice.methods if m in snapshot.results), None)
-    cov, target = reached_cov(snapshot, settings, method), settings.target_cov
+    cov, target = math.nan, settings.target_cov
+    if choice.methods and choice.methods[0] in snapshot.results:
+        cov = reached_cov(snapshot, settings, choice.methods[0])
     waits = [sensor.name for sensor in now.sensors if sensor.is_lost] if not now.closed else []
     if snapshot.n_segments == 0:
         text = f"waits for the first {settings.segment:g} s segment"
