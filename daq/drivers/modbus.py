@@ -33,8 +33,11 @@ if TYPE_CHECKING:
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 TCP = "modbus-tcp://"
-LEAST_PATIENCE = 0.05
-"""For a reply, s: an adapter that is polled takes 16 ms each way."""
+LEAST_PATIENCE, LEAST_HURRIED = 0.2, 0.05
+"""For a reply, s: of a device whose replies are known, and where there may be none. With the pause
+after it, a lost reply must not take so long that the port looks stalled."""
+KNOWN_AFTER = 5
+"""Replies."""
 _UNIT = 6
 """Where the unit stands in a frame over TCP."""
 EXCEPTIONS = {
@@ -66,6 +69,14 @@ class Reply:
     received: HostTime
 
 
+@dataclass(slots=True)
+class _Took:
+    """How long a device takes to reply, s, and of how many replies that is known."""
+
+    longest: float = 0.0
+    n_replies: int = 0
+
+
 class ModbusBus:
     """One request at a time on one bus. Made by :func:`open_bus`."""
 
@@ -82,22 +93,31 @@ class ModbusBus:
         self._clock = clock
         self._timeout = timeout
         self._patience = timeout
-        self._longest = 0.0  # time a reply took, s
+        self._hurries = False
+        self._took: dict[int, _Took] = {}  # by device
         self._serial = isinstance(client, AsyncModbusSerialClient)
         self._heard = b""
         client.ctx.trace_packet = self._trace  # what pymodbus would tell its log
 
     @contextlib.contextmanager
     def hurrying(self) -> Iterator[None]:
-        """Wait for replies only as long as others here may take: for who may not be there."""
-        self._wait_for(min(self._timeout, max(LEAST_PATIENCE, 4 * self._longest)))
+        """Wait for replies only as long as those of others take: for who may not be there."""
+        self._hurries = True
         try:
             yield
         finally:
-            self._wait_for(self._timeout)
+            self._hurries = False
 
-    def _wait_for(self, seconds: float) -> None:
-        self._patience = self._client.ctx.comm_params.timeout_connect = seconds
+    def _wait_for(self, device_id: int) -> None:
+        """Wait as long as is due to a device: the others on the bus wait too."""
+        took = self._took.get(device_id)
+        seconds = self._timeout
+        if self._hurries:
+            longest = max((other.longest for other in self._took.values()), default=seconds)
+            seconds = max(LEAST_HURRIED, 4 * longest)
+        elif took is not None and took.n_replies >= KNOWN_AFTER:
+            seconds = max(LEAST_PATIENCE, 4 * took.longest)
+        self._patience = self._client.ctx.comm_params.timeout_connect = min(seconds, self._timeout)
 
     async def read(self, function: int, device_id: int, address: int, count: int) -> Reply:
         """Read registers by function 3 or 4.
@@ -121,8 +141,10 @@ class ModbusBus:
             f" {address + count - 1}",
         )
         received = self._clock.now()
-        took = (received.monotonic_ns - sent.monotonic_ns) * 1e-9 / self._clock.speed
-        self._longest = max(0.99 * self._longest, took)
+        seconds = (received.monotonic_ns - sent.monotonic_ns) * 1e-9 / self._clock.speed
+        took = self._took.setdefault(device_id, _Took())
+        took.longest = max(0.99 * took.longest, seconds)
+        took.n_replies += 1
         return Reply(reply.registers, sent, received)
 
     async def write(self, device_id: int, address: int, value: int) -> None:
@@ -137,6 +159,7 @@ class ModbusBus:
         self, device_id: int, ask: Callable[[], Awaitable[ModbusPDU]], asked: str
     ) -> ModbusPDU:
         self._heard = b""
+        self._wait_for(device_id)
         task = asyncio.current_task()
         n_cancelled = task.cancelling() if task else 0
         try:
@@ -150,6 +173,8 @@ class ModbusBus:
         except ModbusIOException as error:
             if not self._client.connected:
                 raise NotConnectedError(f"{self.label}: the port closed") from error
+            if device_id in self._took:  # it may have become slower
+                self._took[device_id].longest *= 2
             await self.settle()
             instead = self._instead(device_id)
             raise NoAnswerError(

