@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     ComplexArray = NDArray[np.complex128]
     Channels = Sequence[tuple[str, Channel]]
 
+ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
+"""The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
 FEWEST_AVERAGES = 20
 """Of an octave with its own segments: with fewer it goes with the octave above."""
 
@@ -144,7 +146,7 @@ def noise_estimates(
     """
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
-    wanted = tuple(METHODS) if "all" in settings.methods else settings.methods
+    wanted = ALL_METHODS if "all" in settings.methods else settings.methods
     with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
         for method in wanted:
             try:

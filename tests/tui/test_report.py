@@ -227,6 +227,19 @@ def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path)
     assert "FAIL" in (tmp_path / "n.html").read_text(encoding="utf-8")
 
 
+def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
+    reported: Reported,
+) -> None:
+    settings = replace(reported.settings, methods=("all",))
+    report = report_of(
+        estimate([reported.recording], settings), settings, sources([reported.recording])
+    )
+    table, _, methods = tables(report, "Self-noise")
+    assert "by the three-sensor method" in table.title
+    assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
+    assert report.verdict.text.startswith("PASS: all 7 channels")
+
+
 def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
     (table,) = tables(reported.report, "What happened")
     assert [row[0] for row in table.rows] == sorted(row[0] for row in table.rows)

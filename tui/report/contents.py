@@ -15,7 +15,7 @@ from tui.report.evidence import (
 )
 from tui.report.noise import judgements, limits_section, noise_section, verdict
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
-from tui.report.wording import local_time, plain_number, span, utc_time
+from tui.report.wording import is_known, local_time, plain_number, span, utc_time
 from tui.results import band_of
 
 if TYPE_CHECKING:
@@ -77,10 +77,11 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
             (Signatures(("Name", "Date", "Signature")), Signatures(("Remarks",))),
         ),
     ]
+    start = found[0].started
     name = found[0].path.stem if bench is None else bench.name
     return Report(
         title="Calibration report: self-noise",
-        subtitle=f"Huddle test {name}, {utc_time(found[0].started)}",
+        subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(section for section in sections if section is not None),
     )

@@ -337,11 +337,23 @@ def _draw_test(
     failing = ratio > limit
     axes.plot(centre, limit, color=drawing.LIMIT, lw=0.9, dashes=(5, 2), label="1 % limit")
     axes.plot(
-        centre[~failing], ratio[~failing], "o", ms=2.4, color=drawing.NOISE, label="explained"
+        centre[~failing],
+        ratio[~failing],
+        "o",
+        ms=2.4,
+        color=drawing.NOISE,
+        label="explained",
+        clip_on=False,
     )
     if failing.any():
         axes.plot(
-            centre[failing], ratio[failing], "D", ms=2.6, color=drawing.LIMIT, label="not explained"
+            centre[failing],
+            ratio[failing],
+            "D",
+            ms=2.6,
+            color=drawing.LIMIT,
+            label="not explained",
+            clip_on=False,
         )
     finite = np.concatenate([ratio[ratio > 0], limit[np.isfinite(limit)], [1.0]])
     finite = finite[np.isfinite(finite)]

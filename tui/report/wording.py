@@ -26,8 +26,11 @@ def scientific(value: float, digits: int = 3) -> str:
     """Return a number with so many digits, and a power of ten where it is far from one."""
     if not math.isfinite(value):
         return NOTHING
-    if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.{digits}g}".replace("-", "−")
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+        return plain_number(value, f".{places}f")
     mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
     return f"{mantissa}×{power_of_ten(int(exponent))}".replace("-", "−")
 
@@ -76,11 +79,18 @@ def several(count: int, one: str, more: str | None = None) -> str:
 
 def utc_time(moment: datetime) -> str:
     """Return an instant in UTC to the second."""
-    return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC" if is_known(moment) else "not known"
+
+
+def is_known(moment: datetime) -> bool:
+    """Whether an instant is one: files from elsewhere without a time begin at that of computers."""
+    return moment.timestamp() > 366 * 86400
 
 
 def local_time(moment: datetime, bench: Bench | None) -> str:
     """Return an instant in the bench's time zone where its file names one, or this machine's."""
+    if not is_known(moment):
+        return "not known"
     named = bench is not None and bench.schedule.time_zone != "UTC"
     name = bench.schedule.time_zone if bench is not None and named else ""
     local = moment.astimezone(ZoneInfo(name) if name else None)
