@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 from daq.control import ask
 from daq.errors import HuddleError, RecordingError
 from daq.estimation import Estimation
-from daq.recording.reader import Recording
+from daq.recording.reader import Recording, control_address
 from estimator.errors import EstimatorError, InsufficientDataError
 from tui.state import Lookout
 
@@ -72,6 +72,7 @@ def follow(
         with Estimation([path], settings) as estimation:
             (recording,) = estimation.recordings
             lookout = Lookout(recording)
+            states = _RecorderStates(path)
             onlooker.look(lookout.look())
             wanted, n_samples, heard = 0.0, -1, time.monotonic()
             while not recording.closed:
@@ -82,7 +83,10 @@ def follow(
                     onlooker.look(lookout.look_closely())
                     onlooker.snapshot(estimation.snapshot(), estimation.settings)
                 else:
-                    onlooker.look(lookout.look())
+                    now = lookout.look()
+                    if lookout.quiet():
+                        now = lookout.with_states(now, states.ask())
+                    onlooker.look(now)
                 total = sum(sensor.n_samples for sensor in recording.sensors)
                 if total != n_samples:
                     n_samples, heard = total, time.monotonic()
@@ -104,6 +108,25 @@ def follow(
         return
     except (HuddleError, EstimatorError, OSError) as error:
         onlooker.trouble(str(error))
+
+
+class _RecorderStates:
+    """What the recorder says of its sensors: only it knows at once that one is late."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._address: tuple[int, str] | None = None
+
+    def ask(self) -> dict[str, str]:
+        """Return the state of each sensor; nothing if no recorder answers."""
+        try:
+            self._address = self._address or control_address(self._path)
+            if self._address is None:
+                return {}
+            sensors = ask(self._address, "status")["sensors"]
+        except (HuddleError, OSError):
+            return {}
+        return {name: sensor["state"] for name, sensor in sensors.items()}
 
 
 def _progress(onlooker: Onlooker, ended: threading.Event) -> Callable[[int, int], None]:

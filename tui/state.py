@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,8 @@ import numpy as np
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from daq.protocols.block import Event
     from daq.recording.reader import Recording, SensorRecord
 
@@ -105,6 +107,7 @@ class Lookout:
         self._seen = {sensor.name: _Seen(sensor) for sensor in recording.sensors}
         self._events: tuple[Event, ...] = ()
         self._latest: dict[str, Event] = {}
+        self._counts: dict[str, int] = {}
 
     def look(self) -> Now:
         """Return how things are."""
@@ -127,6 +130,32 @@ class Lookout:
                 for record in recording.sensors
             ),
             events=self._events,
+        )
+
+    def quiet(self) -> bool:
+        """Whether a sensor that goes on has sent nothing since this was asked last."""
+        counts = {record.name: record.n_samples for record in self._recording.sensors}
+        before, self._counts = self._counts, counts
+        return any(count and before.get(name) == count for name, count in counts.items())
+
+    def with_states(self, now: Now, states: Mapping[str, str]) -> Now:
+        """Return the same, with sensors late that the recorder says are; the file says it later.
+
+        ``states`` are those of the recorder's status, by sensor.
+        """
+        latest_ns = round(now.elapsed / _NS) + self._recording.created_at.monotonic_ns
+        return replace(
+            now,
+            sensors=tuple(
+                replace(
+                    sensor,
+                    state="late",
+                    since=max(0.0, (latest_ns - self._seen[sensor.name].last_ns) * _NS),
+                )
+                if sensor.state == "live" and states.get(sensor.name) == "late"
+                else sensor
+                for sensor in now.sensors
+            ),
         )
 
     def look_closely(self) -> Now:

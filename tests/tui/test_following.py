@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
 from daq.clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
@@ -123,6 +124,21 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         writer.close()
         states = {name: sensor.state for name, sensor in look().items()}
         assert states == {"A": "ended", "B": "ended", "C": "disconnected"}
+
+
+def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer, Recording.open(path) as recording:
+        bench, lookout = Bench(writer), Lookout(recording)
+        bench.send("ABC", 2)
+        recording.refresh()
+        assert not lookout.quiet()
+        bench.send("AC", 4)
+        recording.refresh()
+        assert lookout.quiet()
+        now = lookout.with_states(lookout.look(), {"A": "recording", "B": "late", "C": "lost"})
+        assert [sensor.state for sensor in now.sensors] == ["live", "late", "live"]
+        assert now.sensors[1].since == pytest.approx(2, abs=0.1)
 
 
 def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -> None:
