@@ -7,7 +7,9 @@ left in configuration mode, quiet. Nothing is written to its flash.
 A device that was lost is left as it is: with the cable out it goes on streaming, and its COUNT goes
 on. Once it is heard again, in the same format and with COUNT where host time says it should be, it
 is taken on as it is, so that what is missing is known exactly. It cannot be asked for its serial
-number while it streams; a stream that goes on like this is taken for its own.
+number while it streams; a stream that goes on like this is taken for its own. Only what is heard
+and does not go on so, or answers because it does not stream, is set up anew; while nothing comes
+nothing but a question is sent, for the cable may be back just when a command to stop arrives.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ STALLED = 1.0
 GATHER = 0.1
 """Frames of so many seconds are decoded together, which is what a row of ``blocks`` holds."""
 LISTEN = 0.5
-"""How long a device that was lost is listened to before it is set up anew, s."""
+"""How long a device that was lost is listened to, s; and again once something is heard."""
 
 
 class EpsonSession:
@@ -153,17 +155,24 @@ class EpsonDriver:
         """Open the port and take on a device that streams on; set it up if it does not."""
         sensor, configuration = _configured(sensors)
         async with _port(sensor, configuration, clock) as stream:
+            device = Device(sensor, stream)
             heard = None
             if isinstance(before, EpsonSession):
                 heard = await _listen(stream, before.decoder)
-            if heard is None or not isinstance(before, EpsonSession):
-                async with _set_up(sensor, configuration, stream) as session:
-                    yield session
-                return
-            async with _left_quiet(Device(sensor, stream), stream):
-                yield EpsonSession(
-                    stream, configuration, before.information[0], before.decoder, heard=heard
-                )
+                if heard is not None and before.decoder.follows(*heard):
+                    async with _left_quiet(device, stream):
+                        yield EpsonSession(
+                            stream,
+                            configuration,
+                            before.information[0],
+                            before.decoder,
+                            heard=heard,
+                        )
+                    return
+            if heard is None and not await device.answers():
+                raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
+            async with _set_up(sensor, configuration, stream) as session:
+                yield session
 
 
 def _configured(sensors: Sequence[Sensor]) -> tuple[Sensor, Configuration]:
@@ -213,16 +222,18 @@ async def _left_quiet(device: Device, stream: ByteStream) -> AsyncIterator[None]
 
 
 async def _listen(stream: ByteStream, decoder: BurstDecoder) -> tuple[bytes, HostTime] | None:
-    """Return what comes if it is the stream that ``decoder`` knows, and it goes on."""
-    heard = b""
+    """Return what comes, as much of it as shows whether ``decoder`` knows it; None if nothing."""
+    try:
+        async with asyncio.timeout(LISTEN):
+            heard, at = await stream.read()
+    except TimeoutError:
+        return None
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(LISTEN):
-            while True:
+            while not decoder.follows(heard, at):
                 received, at = await stream.read()
                 heard += received
-                if decoder.follows(heard, at):
-                    return heard, at
-    return None
+    return heard, at
 
 
 DRIVER = EpsonDriver()

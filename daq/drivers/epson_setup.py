@@ -232,6 +232,15 @@ class Device:
         if failure is not None:
             raise failure
 
+    async def answers(self) -> bool:
+        """Whether a device is there that does not stream; one that does is not disturbed."""
+        await self._stream.write(bytes([epson.DELIMITER]))
+        for _ in range(READ_ATTEMPTS - 1):
+            with contextlib.suppress(NoAnswerError, WrongDeviceError):
+                await self._read(epson.ID)
+                return True
+        return False
+
     async def information(self) -> DeviceInformation:
         """Read what the device says about itself; refuse it if it is not the one expected."""
         await self.wait_clear(epson.GLOB_CMD, epson.NOT_READY, "starting")
