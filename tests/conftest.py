@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import asyncio
 import functools
 import inspect
@@ -37,8 +38,11 @@ def _open_descriptors() -> dict[int, str]:
 
 def _children() -> set[str]:
     """Process numbers of this process's children, ended but unreaped ones included."""
-    lists = Path("/proc/self/task").glob("*/children")
-    return {number for list_ in lists for number in list_.read_text().split()}
+    found: set[str] = set()
+    for children in Path("/proc/self/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # a thread that ended between listing and looking
+            found.update(children.read_text().split())
+    return found
 
 
 @pytest.fixture(autouse=True)
