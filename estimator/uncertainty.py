@@ -79,18 +79,28 @@ def score_interval(
     -------
     low, high : float64, shape (...)
         The values that lie within 1.96 of *their own* standard deviations of the estimate
-        (Wilson's construction), 1.96 being corrected for skewness (Cornish and Fisher): not
-        symmetric, the chi-squared interval where the estimate is a mere PSD, and just as good
-        where it is negative. `high` is infinite where averages are too few to bound it.
+        (Wilson's construction), 1.96 being corrected for skewness (Cornish and Fisher) and for
+        the scatter of the deviation itself: not symmetric, the chi-squared interval where the
+        estimate is a mere PSD, and just as good where it is negative. `high` is infinite where
+        averages are too few to bound it.
+
+    Notes
+    -----
+    ``t2`` has the variance ``4 t4 / n``, of which its dependence on the value sought, above,
+    explains ``4 t3**2 / (t2 n)``. The rest is that of a chi-square of
+    ``nu = n / (2 (t4 / t2**2 - t3**2 / t2**3))`` degrees of freedom, so that 1.96 becomes the
+    quantile of Student's t, ``z + (z**3 + z) / (4 nu)``. For a mere PSD nu is infinite.
     """
     t2, t3, t4 = traces
     certain = t2 <= 0
     t2 = np.where(certain, 1.0, t2)
     slope, curvature = t3 / t2, t4 / t2**2
     skewness = 2 * t3 / np.sqrt(t2**3 * averages)
+    unexplained = np.maximum(t4 / t2**2 - t3**2 / t2**3, 0.0)
+    student = Z95 * (1 + (Z95**2 + 1) * unexplained / (2 * averages))
     ends = []
     for side in (-1, 1):
-        z = Z95 - side * skewness * (Z95**2 - 1) / 6
+        z = student - side * skewness * (Z95**2 - 1) / 6
         kappa = z**2 / averages
         # delta**2 = kappa (t2 + 2 slope delta + curvature delta**2), solved without cancellation
         square = 1 - kappa * curvature

@@ -59,8 +59,8 @@ def test_bias_scatter_and_coverage(n: int, snr: float, n_sensors: int) -> None:
     truth = two_channel(csm[None], dims=dims, n_effective=n)
     np.testing.assert_allclose(relative.std(axis=0), truth.cov[0], rtol=0.06)
     covers = (found.low < noise_psd) & (noise_psd < found.high)
-    # from 20 averages, at high SNR, 92 % measured: the scatter of the scatter itself
-    assert (0.93 if n >= 100 else 0.91) < covers.mean() < 0.97
+    # from 20 averages 93 % at high SNR; 0.2 % standard error, channels being correlated
+    assert (0.94 if n >= 100 else 0.925) < covers.mean() < 0.96
 
 
 def test_mixed_and_dead_channels_are_flagged() -> None:

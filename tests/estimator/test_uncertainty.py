@@ -20,6 +20,18 @@ def test_of_a_mere_psd_it_is_the_chi_squared_interval(n: int) -> None:
     np.testing.assert_allclose([low[0], high[0]], exact, rtol=0.15 / n)
 
 
+def test_where_the_scatter_is_estimated_the_interval_is_student_s() -> None:
+    """Cross-spectrum of two independent channels: symmetric, of n degrees of freedom."""
+    n = 30
+    traces = np.array([[0.5], [0.0], [0.125]])  # eigenvalues +- 1/2 of omega G
+    low, high = score_interval(np.zeros(1), traces, averages=n)
+    assert high[0] == -low[0]
+    quantile = stats.t.ppf(0.975, n)
+    kappa = quantile**2 / n
+    # the variance grows with the value sought: delta**2 = kappa (t2 + t4 / t2**2 delta**2)
+    assert high[0] == pytest.approx(np.sqrt(0.5 * kappa / (1 - 0.5 * kappa)), rel=3e-3)
+
+
 @pytest.mark.parametrize("averages", [0.2, 0.5, 1.0])
 def test_too_few_averages_leave_it_open_above(averages: float) -> None:
     low, high = score_interval(np.ones(1), np.ones((3, 1)), averages=averages)
