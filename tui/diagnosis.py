@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from estimator.advice import Advice
 
 FAILS = "statistic over expectation"
+MOST_PAIRS = 10
+"""Of sensors that are listed in a sentence: all those of five."""
 _LEGEND = (
     "Coherence: the least between like channels. Condition: of the worst pair of sensors, 1 is "
     "best. Dimension: of the motion. SNR: motion over noise, least and most of all channels. Model "
@@ -149,7 +151,8 @@ def _dimensions(snapshot: Snapshot) -> list[str]:
         where = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
         lines.append(f"no dimension that these sensors allow explains {where} Hz")
     if len(unusual) + len(failing) < len(choices):
-        lines.append(f"elsewhere the motion has all {choices[0].usual} dimensions")
+        where = "elsewhere" if lines else "in all bands"
+        lines.append(f"{where} the motion has all {choices[0].usual} dimensions")
     return lines
 
 
@@ -170,12 +173,28 @@ def _fails(found: Sequence[Advice], _names: list[str]) -> str:
     )
 
 
+def _listed(
+    found: Sequence[Advice],
+    names: list[str],
+    number: str,
+    words: Callable[[float], str],
+    *,
+    usual: float = 0.0,
+) -> str:
+    """Return pairs of sensors with a number each; of very many those furthest from the usual."""
+    shown = found
+    if len(found) > MOST_PAIRS:
+        by_size = sorted(found, key=lambda each: abs(each.numbers[number] - usual), reverse=True)
+        shown = by_size[:MOST_PAIRS]
+    text = ", ".join(f"{_pair(each, names)} {words(each.numbers[number])}" for each in shown)
+    left = len(found) - len(shown)
+    return text + (f" and less in {left} more pairs" if left else "")
+
+
 def _turned(found: Sequence[Advice], names: list[str]) -> str:
     horizontal = all(math.isfinite(advice.numbers["horizontal_deg"]) for advice in found)
     which = "horizontal_deg" if horizontal else "angle_deg"
-    pairs = ", ".join(
-        f"{_pair(advice, names)} {degrees(advice.numbers[which])}" for advice in found
-    )
+    pairs = _listed(found, names, which, degrees)
     return (
         f"sensors are turned{' in the horizontal' if horizontal else ''}: {pairs}: no bias in the "
         "three-sensor or maximum likelihood estimate, but a three-channel or two-channel estimate "
@@ -184,22 +203,17 @@ def _turned(found: Sequence[Advice], names: list[str]) -> str:
 
 
 def _gains(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = ", ".join(f"{_pair(advice, names)} {advice.numbers['gain']:.3f}" for advice in found)
+    pairs = _listed(found, names, "gain", lambda gain: f"{gain:.3f}", usual=1.0)
     return f"gains differ: {pairs}: no bias, but a sensitivity is wrong, and the noise with it"
 
 
 def _delayed(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = ", ".join(
-        f"{_pair(advice, names)} {signed(advice.numbers['delay_s'] * 1e3, '.3g')} ms"
-        for advice in found
-    )
+    pairs = _listed(found, names, "delay_s", lambda delay: f"{signed(delay * 1e3, '.3g')} ms")
     return f"sensors lag each other: {pairs}: segments then differ at their ends"
 
 
 def _skewed(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = ", ".join(
-        f"{_pair(advice, names)} {advice.numbers['nonorthogonality_deg']:.1f}°" for advice in found
-    )
+    pairs = _listed(found, names, "nonorthogonality_deg", lambda angle: f"{angle:.1f}°")
     return (
         f"channels are away from a right angle: {pairs}: no bias, but the noise estimate scatters "
         "more the more collinear they are"
