@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 from scipy.linalg import block_diag
 
-from daq.estimation import Octave
+from daq.estimation import ChannelLabel, Octave
+from estimator.advice import Advice
 from estimator.diagnostics import diagnose
 from estimator.self_noise import Flag
 from tests.tui.made import CHANNELS, SENSORS, SETTINGS, made_snapshot, rotation
@@ -142,3 +144,17 @@ def test_a_channel_without_signal_has_no_level() -> None:
     change = np.eye(9)
     change[4, 4] = 0
     assert "no signal" in shown([result_table(diagnosed(change), SETTINGS)])
+
+
+def test_of_very_many_pairs_the_worst_are_listed() -> None:
+    pairs = list(combinations(range(15), 2))
+    advice = tuple(
+        Advice("note", pair, None, "", {"angle_deg": float(n), "horizontal_deg": float("nan")})
+        for n, pair in enumerate(pairs)
+    )
+    channels = tuple(ChannelLabel(f"S{number}", "X", "m/s²") for number in range(15))
+    snapshot = replace(made_snapshot(), channels=channels, diagnostics={"advice": advice})
+    (line,) = [line for line in summary(snapshot) if "turned" in line]
+    assert line.startswith("sensors are turned: S13–S14 104.000°, S12–S14 103.000°")
+    assert "and less in 95 more pairs: no bias" in line
+    assert line.count("°") == 10
