@@ -47,6 +47,11 @@ def summary(snapshot: Snapshot) -> list[str]:
     tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
     if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
         lines.append("model test: one common motion explains what the sensors share, in all bands")
+    if tested and not any(math.isfinite(p_value) for p_value in tested) and "sensors" not in kinds:
+        lines.append(
+            f"model test: none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
+            f"channels ({len(snapshot.channels)})"
+        )
     if "dimension" in snapshot.diagnostics:
         lines += _dimensions(snapshot)
     return lines
@@ -97,14 +102,18 @@ def _bands(snapshot: Snapshot) -> Table:
         statistic = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
         table.add_row(
             f"{band.low:.3g}–{band.high:.3g}",
-            f"{band.coherence:.4f}",
-            f"{band.condition:.3g}",
-            f"{band.dimension:.0f}",
+            _known(band.coherence, ".4f"),
+            _known(band.condition, ".3g"),
+            _known(band.dimension, ".0f"),
             f"{ratio(min(known))}…{ratio(max(known))}" if known else "?",
-            f"{statistic:.3f}",
-            f"{band.test.p_value:.2g}",
+            _known(statistic, ".3f"),
+            _known(band.test.p_value, ".2g"),
         )
     return table
+
+
+def _known(value: float, spec: str) -> str:
+    return "?" if math.isnan(value) else signed(value, spec)
 
 
 def _octaves(snapshot: Snapshot) -> Table:

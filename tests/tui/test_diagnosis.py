@@ -140,6 +140,13 @@ def test_clipped_channels_are_named() -> None:
     assert any("clipped: B.X (4.6 %)" in x for x in remarks(replace(snapshot, diagnostics=clipped)))
 
 
+def test_too_few_averages_for_the_model_test_are_said() -> None:
+    early = diagnosed(n_effective=9.0)
+    assert any("it takes more averages (9 now) than channels (9)" in x for x in summary(early))
+    assert "nan" not in shown(details(early))
+    assert not any("none yet" in line for line in summary(diagnosed()))
+
+
 def test_a_channel_without_signal_has_no_level() -> None:
     change = np.eye(9)
     change[4, 4] = 0
