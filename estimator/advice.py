@@ -6,7 +6,8 @@ show of the misfit is a share ``sqrt((ratio - 1) / (n - d))`` of the noise, with
 before the test sees the rest: computed on true matrices by up to `TYPICAL` times as much for noise
 that channels share, noise of a sensor's own stand, or one more dimension of motion; for waves that
 cross sensors 0.1 m apart by up to `CROSSING` times with four sensors or more, `CROSSING_THREE`
-times with three triaxial ones, and without bound with three sensors of fewer channels.
+times with three triaxial ones, and without bound with three sensors of fewer channels. See
+`docs/decisions/0035`.
 """
 
 from __future__ import annotations
