@@ -85,7 +85,8 @@ async def photograph(recording: Path, out: Path, *, size: tuple[int, int], keys:
         file.flush()
         subprocess.run(["rsvg-convert", file.name, "-o", str(out)], check=True)
     with Image.open(out) as drawn:  # few colours: a third of the size
-        drawn.convert("RGB").quantize(64).save(out, optimize=True)
+        few = drawn.convert("RGB").quantize(128, Image.Quantize.MAXCOVERAGE)
+        few.save(out, optimize=True)
 
 
 def application(folder: Path) -> None:

@@ -191,6 +191,44 @@ async def test_negative_estimates_are_marked_not_hidden(told: Told) -> None:
     assert "▾" in text.replace("(▾ marks", "")
 
 
+async def test_without_colours_everything_is_there(
+    told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        text = screen_text(app)
+        await pilot.press("c")
+        await shown(pilot, app)
+        assert "clock drift" in screen_text(app)
+    for said in ("● live", "○ silent", "no effect on noise", "▲ C is silent", "three-channel"):
+        assert said in text
+
+
+async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Told) -> None:
+    now = made_now()
+    first, second, third = now.sensors
+    worse = replace(
+        now,
+        sensors=(
+            replace(first, clips=True),
+            replace(second, state="disconnected", since=75.0),
+            replace(third, state="live", stuck=("Y",)),
+        ),
+    )
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, Looked(worse), Fresh(made_snapshot(), SETTINGS))
+        text = screen_text(app)
+        assert "▲ B is disconnected for 1:15: check cable and power" in text
+        assert "+2: d" in text
+        assert [word in text for word in ("▲ clips", "○ lost 1:15", "▲ Y still")] == [True] * 3
+        await pilot.resize_terminal(*WIDE)
+        await shown(pilot, app)
+        assert "C.Y stands still: no signal" in screen_text(app)
+
+
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:

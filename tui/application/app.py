@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 from textual import on, work
 from textual.app import App
 from textual.binding import Binding, BindingType
+from textual.filter import Monochrome
 from textual.reactive import var
 from textual.widgets import Footer
 
@@ -18,17 +19,19 @@ from daq.errors import HuddleError
 from tui.application import view
 from tui.application.board import Board, Shown
 from tui.application.messages import Following, Fresh, Looked, Messenger, Progress, Trouble
+from tui.application.plot import PlainMonochrome
 from tui.application.result import details, result
 from tui.application.screens import MarkScreen, ResultScreen, StopScreen, TextScreen, help_text
 from tui.following import follow
 from tui.text import clock_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from rich.console import RenderableType
     from textual.app import ComposeResult
+    from textual.filter import LineFilter
 
     from daq.estimation import Settings, Snapshot
     from tui.application.controls import Controls
@@ -110,6 +113,13 @@ class HuddleApp(App[None]):
     def on_unmount(self) -> None:
         """Let go of the recording; whoever writes it goes on."""
         self._ended.set()
+
+    def get_line_filters(self) -> Sequence[LineFilter]:
+        """Return what colours go through; without colours, plots as well."""
+        return [
+            PlainMonochrome() if isinstance(each, Monochrome) else each
+            for each in super().get_line_filters()
+        ]
 
     # ------------------------------------------------------------------ following
 

@@ -149,7 +149,7 @@ class Board(Vertical):
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1
         if len(alerts) > room:
-            more = f"   and {len(alerts) - room} more: d"
+            more = f"  +{len(alerts) - room}: d"
             alerts = [*alerts[: room - 1], alerts[room - 1].append(more)]
         self.set_class(bool(alerts), "-alert")
         self._write("#alert", Text("\n").join(alerts), n_lines=len(alerts))

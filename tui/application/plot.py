@@ -6,6 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.segment import Segment
+from rich.style import Style
+from textual.filter import Monochrome
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
@@ -14,12 +17,23 @@ from tui.application.curves import level_limits
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from textual.color import Color
+
     from tui.application.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
 LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
 SHORT, LONG = 2.0, 300.0  # minutes: below seconds, above hours
 LARGE = 2000.0  # µs: above milliseconds
+
+
+class PlainMonochrome(Monochrome):
+    """Takes colours away (NO_COLOR); the canvas of plots has pieces without any style."""
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """Return the pieces without colours."""
+        styled = [Segment(text, style or Style.null(), to) for text, style, to in segments]
+        return super().apply(styled, background)
 
 
 class FrequencyAxis(AxisFormatter):
