@@ -129,10 +129,12 @@ def report(
 ) -> None:
     """Write the calibration report of a huddle test, for the screen and for paper.
 
-    Noise of every channel with its uncertainty, pass or fail by the limits of the bench file,
-    alignment, clocks, what happened, and a place to sign. Reports on what there is of a recording
-    that is still being written, too. What is not given here is taken from the bench file inside
-    the recording. Exit code 1 where a limit is not met.
+    Noise of every channel with its uncertainty, pass or fail by the limits
+    of the bench file, alignment, clocks, what happened, a place to sign.
+    A recording that is still being written is reported on as it stands.
+
+    What is not given here is taken from the bench file inside the recording.
+    Ends with 1 where a limit is not met.
     """
     from tui.reporting import report_recordings
 
