@@ -27,6 +27,8 @@ parameters. With more, motion is left in the noise, with less, scatter is taken 
 mean error for three to five sensors of one to three channels, n = 20 to 1080, is least."""
 CERTAIN = 8.0
 """A factor whose strength exceeds this times the root of channels over averages is not tested."""
+CAPTURED = 0.15
+"""Share of a channel outside the factors' space, below which these are tested, strong or not."""
 
 
 def resolved(
@@ -75,12 +77,14 @@ def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArra
 
 
 def _doubtful(maximum: Maximum, n_effective: float) -> BoolArray:
-    """Where a factor may be scatter: it is weak in all channels but the foremost.
+    """Where a factor may be scatter: it is weak, or takes up nearly all of a channel.
 
-    A factor that is fitted to one channel's noise takes up all of it, and looks strong there.
+    A factor that is fitted to one channel's noise looks strong there: its strength is taken
+    without the foremost channel.
     """
     q, p = maximum.n_factors, maximum.psi.shape[1]
-    share = np.max(np.abs(maximum.eigenvectors[:, :, :q]) ** 2, axis=1)
-    strength = ((maximum.eigenvalues[:, :q] - 1) * (1 - share)).min(axis=1)
+    share = np.abs(maximum.eigenvectors[:, :, :q]) ** 2
+    strength = ((maximum.eigenvalues[:, :q] - 1) * (1 - share.max(axis=1))).min(axis=1)
     weak = strength < CERTAIN * np.sqrt(p / n_effective)
-    return np.asarray(~maximum.singular & (weak | maximum.boundary.any(axis=1)))
+    captured = 1 - share.sum(axis=2).max(axis=1) < CAPTURED
+    return np.asarray(~maximum.singular & (weak | captured))
