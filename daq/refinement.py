@@ -21,6 +21,7 @@ recording comparable. The frame's own delay is the one that makes P most nearly 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,7 @@ USABLE = 0.45
 
 _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3
-_FEWEST_SEGMENTS = 12  # in the first batch, per channel of the reference: P is a mean of those
+_FEWEST_SEGMENTS = 6  # in the first batch, per channel of the reference: P is a mean of those
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
 _OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
@@ -192,6 +193,9 @@ class DelayMeter:
         with np.errstate(divide="ignore", invalid="ignore"):
             share = max(1 - spurious / float(informative.mean()), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
+        # What P leaves over is scattered itself: the mean of an inverse Wishart matrix.
+        freedom = max(frame.n_segments - x0.shape[2], 1)
+        std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
 
@@ -259,7 +263,8 @@ def _prediction(frame: _Frame) -> tuple[ComplexArray, ComplexArray]:
     response = np.linalg.solve(reference.transpose(0, 2, 1), frame.crossed.transpose(0, 2, 1))
     response = response.transpose(0, 2, 1)
     left = frame.own - response @ frame.crossed.conj().transpose(0, 2, 1)
-    return np.asarray(response), np.asarray(_ridged(left, frame.own) / frame.n_segments)
+    freedom = max(frame.n_segments - response.shape[2], 1)
+    return np.asarray(response), np.asarray(_ridged(left, frame.own) / freedom)
 
 
 def _ridged(matrix: ComplexArray, scale: ComplexArray | None = None) -> ComplexArray:

@@ -75,12 +75,13 @@ def test_a_clock_that_samples_could_not_refine_is_as_far_off_as_the_arrivals_lea
     told = synchronisation(
         states,
         (True, False, False),
+        np.array([[1e-3, 1e-3, 1e-3 + 12e-6], [0.0, 0.0, -12e-6]]),  # taken by older clocks
         dims=(1, 1, 1),
         frequency=np.empty(0),
         csm=np.empty((0, 3, 3), complex),
         results={},
     )
-    assert told["residual"] == pytest.approx({"A": 0.0, "B": 1e-6, "C": 5e-6})
+    assert told["residual"] == pytest.approx({"A": 0.0, "B": 1e-6, "C": 13e-6})
 
 
 def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 def synchronisation(
     clocks: Sequence[ClockState],
     of_reference: Sequence[bool],
+    moved: FloatArray,
     *,
     dims: tuple[int, ...],
     frequency: FloatArray,
@@ -37,9 +38,10 @@ def synchronisation(
 ) -> dict[str, Any]:
     """Say what is left between the clocks, and what it does to the noise estimate.
 
-    `of_reference` says which sensors run by the clock that others are measured against. A delay
-    that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common motion,
-    and so into its noise.
+    `of_reference` says which sensors run by the clock that others are measured against; `moved`,
+    shape (n_segments, n_sensors), by how much clocks differ from those that segments were taken by.
+    A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common
+    motion, and so into its noise.
     """
     residual = np.array([state.residual for state in clocks])
     refined = np.array([state.refined for state in clocks], dtype=bool)
@@ -47,6 +49,9 @@ def synchronisation(
         reference = np.array(of_reference, dtype=bool)
         residual = np.where(refined, residual, np.hypot(residual, residual[reference].max()))
         residual[reference] = 0.0
+    if len(moved):
+        first = list(of_reference).index(True)
+        residual = np.hypot(residual, (moved - moved[:, [first]]).std(axis=0))
     found: dict[str, Any] = {
         "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
     }

@@ -56,6 +56,7 @@ _REVIEW = 1.25  # growth after which that is looked at
 _FIRST_REVIEW = 8  # segments
 _RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
 _MOST_PASSES = 4
+_MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
 
 
 class Estimation:
@@ -145,12 +146,15 @@ class Estimation:
             each.advance()
         seen = self.n_seen
         if seen >= self._next_review:
-            self._next_review = math.ceil(_REVIEW * seen)
             for each in self._passes:
-                each.set_clocks()
-                if each.is_outdated(_LIVE_TOLERANCE):
+                for _ in range(_MOST_LIVE_PASSES):
+                    each.set_clocks()
+                    if not each.is_outdated(_LIVE_TOLERANCE):
+                        break
                     each.restart()
                     each.advance()
+            awaited = [each.awaited for each in self._passes if each.awaited > seen]
+            self._next_review = min([math.ceil(_REVIEW * seen), *awaited])
         return seen > before
 
     def finish(self, progress: Progress | None = None) -> Snapshot:
@@ -214,6 +218,7 @@ class Estimation:
             "synchronisation": synchronisation(
                 last.aligned.clocks,
                 last.aligned.of_reference,
+                last.moved(),
                 dims=dims,
                 frequency=frequency,
                 csm=csm,

@@ -196,6 +196,22 @@ class Pass:
             found |= (before >= 0) & (position < last)
         return found
 
+    @property
+    def awaited(self) -> int:
+        """Segments with which delays could be measured first; 0 where they are, or need not be."""
+        return 0 if self._meter is None or self._meter.has_frame else self._meter.fewest
+
+    def moved(self) -> FloatArray:
+        """Return by how much clocks, as known now, differ from those that segments were taken by.
+
+        In seconds, shape (n_segments, n_sensors); what all sensors have in common is left out.
+        """
+        if not self.taken_at:
+            return np.empty((0, len(self.aligned.dims)))
+        before = np.concatenate(self.taken_at)
+        moved = self._positions(np.arange(len(before))) - before
+        return np.asarray(moved - moved.mean(axis=1, keepdims=True))
+
     def set_clocks(self) -> None:
         """Set the clocks by what the segments taken say."""
         if self._meter is not None:
@@ -211,9 +227,7 @@ class Pass:
             return False
         if self._meter is not None and not self._meter.has_frame:
             return self.n_seen >= self._meter.fewest
-        before = np.concatenate(self.taken_at)
-        moved = self._positions(np.arange(len(before))) - before
-        moved -= moved.mean(axis=1, keepdims=True)  # all sensors alike: no delay between them
+        moved = self.moved()
         constant = moved.mean(axis=0)
         varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
         return varying > tolerance or bool(
