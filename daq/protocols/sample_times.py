@@ -11,10 +11,10 @@ written. A time
   as many as fit. Where times are written to half a period or finer their number is exact. Where
   one time stands for many samples, only its first occurrence is looked at, and the number may be
   wrong by one;
-- that came before, or lies before one that came, belongs to a sample that is known (a datagram
-  that came twice or too late). Where times are written more coarsely than half a period, only a
-  message that repeats the one before to the letter is taken for a repetition, and where they are
-  coarser than a period none is;
+- that lies before one that came belongs to a sample that is known (a datagram that came twice or
+  too late), and so does a message that repeats the one before to the letter, unless times are
+  coarser than a period. The same time with other samples is of the next: the device's clock is
+  coarser than it writes;
 - further ahead than host time allows, or long past when nothing else has come for a while, is
   *doubtful*: damaged on the way, or somebody set the device's clock. The next one tells: if it
   goes on from there, it was the clock.
@@ -35,6 +35,7 @@ SLACK_NS = 1_000_000_000
 LATE_NS = 2_000_000_000
 """Nothing comes later than this after what was sent behind it."""
 HOUR_NS = 3600 * 10**9
+_COARSE = 2.0
 GAIN = 0.05
 """Of the average that follows a drifting clock, a message."""
 
@@ -73,6 +74,7 @@ class SampleTimes:
         self._next = 0  # index the next sample should have
         self._offset: float | None = 0.0  # of times and indices, in periods
         self._n_seen = 0
+        self._least_width = 0.0  # in periods, of the times as they turn out
         self._latest_ns = 0  # the last time that was believed
         self._at_ns = 0  # when it came
         self._lag_ns = 0.0  # least time between a sample and its arrival, but for a constant
@@ -108,7 +110,7 @@ class SampleTimes:
         alike : bool
             Whether the message is the one before, to the letter.
         """
-        width = resolution_ns * 1e-9 * self._rate
+        width = max(self._least_width, resolution_ns * 1e-9 * self._rate)
         if self._origin_ns is None:
             self._begin(time_ns, at, width=width)
             return self._take(time_ns, n_samples, at, 0, is_exact=True)
@@ -118,8 +120,11 @@ class SampleTimes:
         if time_ns < self._latest_ns:
             return Place("known")
         if time_ns == self._latest_ns:
-            if width <= 0.5 or (width <= 1 and alike):
+            if width <= 1 and alike:
                 return Place("known")
+            if width <= 0.5:  # written finely, and coarse all the same
+                self._least_width = _COARSE
+                self._offset = None if self._n_seen == 1 else self._offset
             return self._take(time_ns, n_samples, at, 0, is_exact=True)
         ahead = self._ahead(time_ns)
         if self._offset is None:  # the first time that says when it began

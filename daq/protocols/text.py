@@ -92,7 +92,7 @@ class TextDecoder:
         self._times = SampleTimes(sampling_rate)
         self._packets = Packets(format_.channel_names)
         self._doubtful: Group | None = None
-        self._latest = b""  # the last row
+        self._latest = b""  # the last row that was taken
         self._n_known = self._n_unreadable = self._n_given_up = 0
         self._finest_ns: int | None = None  # how finely times are written
         delimiter = format_.delimiter.strip()
@@ -197,10 +197,7 @@ class TextDecoder:
             yield from self._counted(rows, at)
         elif self._format.time_column is not None:
             groups = [Group(row.time_ns, row.counts[None], at, row.resolution_ns) for row in rows]
-            before = [self._latest, *(row.message for row in rows)]
-            self._latest = before.pop()
-            alike = [row.message == one for row, one in zip(rows, before, strict=True)]
-            yield from self._timed(zip(groups, alike, strict=True))
+            yield from self._timed(zip(groups, (row.message for row in rows), strict=True))
         else:
             yield self._block(np.stack([row.counts for row in rows]), None, at)
 
@@ -242,18 +239,19 @@ class TextDecoder:
             return
         self._n_known += self._packets.add(name, values, time_ns, at, resolution_ns)
         for group in self._packets.ready(self._times):
-            yield from self._timed([(group, False)])
+            yield from self._timed([(group, b"")])
         for text in self._packets.dropped(at):
             yield Event(self._sensor, "overflow", _cut(text), at)
 
     # --- placed by their time ----------------------------------------------------------------
 
-    def _timed(self, groups: Iterable[tuple[Group, bool]]) -> Iterator[Block | Event]:
-        """Yield what follows one another together; with each whether it repeats the one before."""
+    def _timed(self, groups: Iterable[tuple[Group, bytes]]) -> Iterator[Block | Event]:
+        """Yield what follows one another together; with each row comes its message."""
         together: list[Group] = []
-        for group, alike in groups:
-            place = self._place(group, alike=alike)
+        for group, message in groups:
+            place = self._place(group, alike=bool(message) and message == self._latest)
             if place.kind == "next" and not place.missing and self._doubtful is None:
+                self._latest = message
                 together.append(group)
                 continue
             yield from self._joined(together)
@@ -265,6 +263,7 @@ class TextDecoder:
                 yield self._out_of_time(self._doubtful, group.received)
             self._doubtful = group if place.kind == "doubtful" else None
             if place.kind == "next":
+                self._latest = message
                 self._skip(place.missing, "time step", is_exact=place.is_exact)
                 together.append(group)
             elif place.kind == "known":

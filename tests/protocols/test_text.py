@@ -189,13 +189,18 @@ def test_a_clock_that_drifts_and_times_that_jitter_lose_nothing() -> None:
     assert not events
 
 
-def test_times_that_stand_for_many_rows() -> None:
-    """Ten rows a second with whole seconds: 23 of them lost are noticed at the next second."""
+@pytest.mark.parametrize("written", ["{}", "{}.000"])
+def test_times_that_stand_for_many_rows(written: str) -> None:
+    """Ten rows a second with whole seconds, however they are written.
+
+    That 23 of them are lost is noticed at the next second.
+    """
     decoder = TextDecoder("A", TIMED, sampling_rate=10.0)
     found: list[Block | Event] = []
     for i in range(103, 400):
         if not 215 <= i < 238:
-            found += decoder.receive(f"{1000 + i // 10},{i}\n".encode(), at(i / 10))
+            time = written.format(1000 + i // 10)
+            found += decoder.receive(f"{time},{i}\n".encode(), at(i / 10))
     index, rows, events = split(found)
     assert not events
     by_index = {row[0] - 103: k for k, row in zip(index, rows, strict=True)}
