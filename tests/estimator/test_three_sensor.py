@@ -171,6 +171,21 @@ def test_uncorrected_bias_is_minus_d_over_n(d: int) -> None:
     assert np.all(np.abs(relative.mean(axis=0) - 1 + d / 20) < 4.5 * error)
 
 
+@pytest.mark.parametrize("snr", [0.1, 0.5])
+def test_motion_left_in_by_few_averages_is_that_of_decision_33(snr: float) -> None:
+    """One channel a sensor: rho (1 - g)**n, exactly; 4.5 standard errors of heavy tails."""
+    n, n_draws = 20, 40_000
+    csm = np.full((3, 3), snr, dtype=np.complex128) + np.eye(3)
+    sample = wishart(csm, n, np.random.default_rng(8), n_draws=n_draws)
+    found = three_sensor(sample, dims=(1, 1, 1), n_effective=n).noise_psd.mean(axis=1)
+    coherence = (snr / (1 + snr)) ** 2
+    rest = snr / (1 + 2 * snr)  # of the motion, when both other sensors have predicted it
+    error = found.std() / np.sqrt(n_draws)
+    left = rest * (1 - coherence) ** n
+    assert left > 2 * error
+    assert abs(found.mean() - 1 - left) < 4.5 * error
+
+
 @pytest.mark.parametrize("overlap", [0.5, 0.75])
 def test_overlapping_segments_are_worth_n_effective_for_the_bias_too(overlap: float) -> None:
     # method.md: d = 3, 20 segments, Hann, 75 %: -0.273 uncorrected, -0.281 predicted
