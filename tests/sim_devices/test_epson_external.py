@@ -21,7 +21,7 @@ from tests.drivers.reading import record
 from tests.sim_devices.bench import device, sensors, spec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,22 +50,28 @@ def world() -> dict[str, Any]:
     return told
 
 
-SPEC = world()
+class Running(dict[str, "RunningDevice"]):
+    """The devices of a world that began when they did, by sensor."""
+
+    def __init__(self, spec: dict[str, Any], devices: Sequence[RunningDevice]) -> None:
+        super().__init__({one.sensors[0]: one for one in devices})
+        self.spec = spec
+
+    def source(self, name: str) -> Source:
+        """What a sensor of it reads."""
+        return Source(Scenario.from_dict(self.spec["scenario"]), device_spec(TABLES[name]))
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[dict[str, RunningDevice]]:
-    with launch.start(SPEC) as devices:
-        yield {one.sensors[0]: one for one in devices}
+def running() -> Iterator[Running]:
+    spec = world()
+    with launch.start(spec) as devices:
+        yield Running(spec, devices)
 
 
-def connecting(running: dict[str, RunningDevice], name: str, **changes: Any) -> Sensor:  # noqa: ANN401
+def connecting(running: Running, name: str, **changes: Any) -> Sensor:  # noqa: ANN401
     (sensor,) = sensors(running[name], TABLES[name], **changes)
     return sensor
-
-
-def source(name: str) -> Source:
-    return Source(Scenario.from_dict(SPEC["scenario"]), device_spec(TABLES[name]))
 
 
 async def mismatch(sensor: Sensor, truth: Source) -> float:
@@ -75,44 +81,42 @@ async def mismatch(sensor: Sensor, truth: Source) -> float:
     ends = [0, *(block.end_sample for block in blocks)]
     assert [block.first_sample for block in blocks] == ends[:-1]
     counts: NDArray[Any] = np.concatenate([block.counts for block in blocks])[:800]
-    taken = truth.counts(sensor.name, 0, round(200 * truth.sampling_rate))
+    taken = truth.counts(sensor.name, 0, round(600 * truth.sampling_rate))
     start = int(np.argmin(np.abs(taken - counts[0]).max(axis=1)))
     return float(np.abs(taken[start : start + 800] - counts).max())
 
 
 @pytest.mark.parametrize("edge", ["rising", "falling"])
-async def test_samples_are_in_step_with_the_seconds(
-    running: dict[str, RunningDevice], edge: str
-) -> None:
+async def test_samples_are_in_step_with_the_seconds(running: Running, edge: str) -> None:
     sensor = connecting(running, "pps", settings={"external": f"pps-{edge}"})
-    whole_seconds = -utc_of(SPEC["epoch_ns"]) % 10**9 / 1e9
+    whole_seconds = -utc_of(running.spec["epoch_ns"]) % 10**9 / 1e9
     # The system's UTC at world time 0 is known to some µs, and is another one here and there.
-    truth = source("pps").disciplined(whole_seconds)
-    alone = await mismatch(sensor, source("pps"))
+    truth = running.source("pps").disciplined(whole_seconds)
+    alone = await mismatch(sensor, running.source("pps"))
     assert await mismatch(sensor, truth) < 0.02 * alone
 
 
 async def test_without_pps_a_device_samples_by_its_own_clock(
-    running: dict[str, RunningDevice],
+    running: Running,
 ) -> None:
     sensor = connecting(running, "none", settings={"external": "pps-rising"})
-    assert await mismatch(sensor, source("none")) <= 0.5
+    assert await mismatch(sensor, running.source("none")) <= 0.5
 
 
-async def test_every_trigger_makes_a_sample(running: dict[str, RunningDevice]) -> None:
+async def test_every_trigger_makes_a_sample(running: Running) -> None:
     settings = {"external": "trigger-falling"}
     sensor = connecting(running, "trigger", settings=settings, sampling_rate=100.0)
-    truth = source("trigger").at_rate(100.0).disciplined(0.0)
+    truth = running.source("trigger").at_rate(100.0).disciplined(0.0)
     assert await mismatch(sensor, truth) <= 0.5
 
 
-async def test_without_a_trigger_there_is_no_sample(running: dict[str, RunningDevice]) -> None:
+async def test_without_a_trigger_there_is_no_sample(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "trigger-rising"})
     with pytest.raises(NoAnswerError, match="one for each trigger: is there a signal at EXT"):
         await record(DRIVER, sensor, 1, speed=SPEED)
 
 
-async def test_a_model_without_pps_is_named(running: dict[str, RunningDevice]) -> None:
+async def test_a_model_without_pps_is_named(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "pps-rising"})
     with pytest.raises(WrongDeviceError, match="this model does not have that setting"):
         await record(DRIVER, sensor, 1, speed=SPEED)
@@ -128,9 +132,7 @@ async def test_a_model_without_pps_is_named(running: dict[str, RunningDevice]) -
         ("pps-falling", 0b101),
     ],
 )
-async def test_the_register_says_so(
-    running: dict[str, RunningDevice], external: str, bits: int
-) -> None:
+async def test_the_register_says_so(running: Running, external: str, bits: int) -> None:
     """MSC_CTRL: bit 6 EXT_SEL, bit 5 EXT_POL; 1PPS is code 4 or 5 in bits 7:5."""
     sensor = connecting(running, "pps", settings={"external": external})
     async with DRIVER.open([sensor], SystemClock(SPEED)):

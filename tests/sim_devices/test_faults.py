@@ -199,7 +199,7 @@ async def test_every_sample_that_came_has_its_place(tmp_path: Path) -> None:
         for row, counts in enumerate(block.counts[:, :3].tolist())
     }
     assert len(found) == sum(block.n_samples for block in blocks)  # none twice
-    truth = np.rint(scenario("A").samples("A", 0, 200 * 200) * epson.COUNTS_PER_UNIT)
+    truth = np.rint(scenario("A").samples("A", 0, 600 * 200) * epson.COUNTS_PER_UNIT)
     place = {tuple(row): index for index, row in enumerate(truth.astype(int).tolist())}
     begin = place[found[0]]
     assert {place.get(counts, -1) - index for index, counts in found.items()} == {begin}

@@ -143,16 +143,18 @@ async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path)
                     if back_at and len(blocks["B"]) > back_at + 5:
                         break
                     continue
-                events.append(item)
-                if item.kind == "connected" and events[0].kind == "stalled":
-                    back_at = len(blocks["B"])
-    n_lost = sum(e.kind == "stalled" and e.sensor == "B" for e in events)
+                if item.sensor == "B":  # the other may miss a poll of a busy host
+                    events.append(item)
+                    if item.kind == "connected":
+                        back_at = len(blocks["B"])
+    lost = [event for event in events if event.kind == "stalled"]
+    n_lost = len(lost)
     assert n_lost >= 3
-    said = re.search(r"no answer in (\S+) s to device 81, function 3", events[0].text)
+    said = re.search(r"no answer in (\S+) s to device 81, function 3", lost[0].text)
     assert said
     assert float(said[1]) < 1.0, "no longer than its replies may take: the others wait"
-    assert f"({n_lost} so far)" in [e.text for e in events if e.sensor == "B"][n_lost - 1]
-    assert "answers again, after" in events[-1].text
+    assert f"({n_lost} so far)" in lost[-1].text
+    assert "answers again, after" in next(e.text for e in events if e.kind == "connected")
     gap = blocks["B"][back_at]
     assert 7.0 * 50 < gap.first_sample - blocks["B"][back_at - 1].end_sample < 24.0 * 50
     # the other was polled on meanwhile; how often, a busy host says
