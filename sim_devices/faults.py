@@ -82,6 +82,7 @@ Kind: TypeAlias = Literal[
     "reset", "wrap", "overflow",
 ]  # fmt: skip
 DELAYS = ("jitter", "latency", "batching")
+LASTING = (*DELAYS, "stall", "disconnect")
 UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
 SAMPLE_KINDS = ("clip", "dead", "spike")
 PATIENCE = 1.0
@@ -208,7 +209,8 @@ class LineFaults:
         self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
         for index, fault in enumerate(faults):
             if fault.kind not in (*SAMPLE_KINDS, "silent", "wrap"):
-                times = fault.times(begin)
+                # what lasts may have begun before the device was there
+                times = fault.times(begin - fault.duration * (fault.kind in LASTING))
                 first = next(times, None)
                 if first is not None:
                     self._schedule.append((first, index, fault, times))

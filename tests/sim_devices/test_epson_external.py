@@ -58,7 +58,7 @@ class Running(dict[str, "RunningDevice"]):
         self.spec = spec
 
     def source(self, name: str) -> Source:
-        """What a sensor of it reads."""
+        """Return what a sensor of it reads."""
         return Source(Scenario.from_dict(self.spec["scenario"]), device_spec(TABLES[name]))
 
 

@@ -102,6 +102,14 @@ def test_what_was_due_before_the_device_was_there_is_left_out() -> None:
     assert LineFaults(script, "A", begin=6.0).next_due() == 7.0
 
 
+def test_what_lasts_may_have_begun_before_the_device_was_there() -> None:
+    script = parse([{"kind": "stall", "at": 0.0, "duration": 5.0}])
+    for begin, sent in ((4.0, []), (6.0, [UNIT])):
+        faults = LineFaults(script, "A", begin=begin)
+        faults.act(begin)
+        assert faults.send([UNIT], begin) == sent
+
+
 def test_the_same_script_does_the_same() -> None:
     script = {"kind": "corrupt", "count": 5}
     assert strike(**script) == strike(**script) != strike(**script, seed=1)
