@@ -23,12 +23,14 @@ class Curve:
 
     ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; ``negative`` says
     where it is known not to be. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
-    bound is not positive, and throughout for a curve without one.
+    bound is not positive, and throughout for a curve without one. ``marker`` stands on the curve
+    here and there, so that it is known without its colour; empty for none.
     """
 
     label: str
     style: str
     band_style: str
+    marker: str
     log_frequency: FloatArray
     level_db: FloatArray
     low_db: FloatArray
@@ -62,6 +64,7 @@ def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: 
         label="data",
         style=style,
         band_style=style,
+        marker="",
         log_frequency=_centres(frequency, edges),
         level_db=decibels(mean),
         low_db=nothing,
@@ -80,6 +83,7 @@ def noise_curve(
     label: str,
     style: str,
     band_style: str,
+    marker: str,
 ) -> Curve:
     """Return a self-noise estimate as a curve with the 95 % interval of each of its points."""
     edges = log_edges(frequency, n_points)
@@ -88,6 +92,7 @@ def noise_curve(
         label=label,
         style=style,
         band_style=band_style,
+        marker=marker,
         log_frequency=_centres(frequency, edges),
         level_db=decibels(means.mean),
         low_db=decibels(means.low),

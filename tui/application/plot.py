@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tui.application.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
+MARKED = 12  # points from one mark of a curve to the next
 LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
 SHORT, LONG = 2.0, 300.0  # minutes: below seconds, above hours
 LARGE = 2000.0  # µs: above milliseconds
@@ -170,6 +171,15 @@ class PsdPlot(FullPlot):
                 curve.level_db,
                 line_style=curve.style,
                 hires_mode=HiResMode.BRAILLE,
+                label=None if curve.marker else curve.label,
+            )
+        for number, curve in enumerate(curve for curve in curves if curve.marker):
+            chosen = slice((1 + number) * MARKED // 3, None, MARKED)
+            self.scatter(
+                curve.log_frequency[chosen],
+                curve.level_db[chosen],
+                marker=curve.marker,
+                marker_style=curve.style,
                 label=curve.label,
             )
 

@@ -13,7 +13,7 @@ from rich.text import Text
 from estimator.self_noise import Flag
 from tui.application.curves import data_curve, noise_curve
 from tui.results import band_of, channel_means, correlation_of, reached_cov
-from tui.text import clock_time, decibels, time_left
+from tui.text import clock_time, decibels, several, time_left
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 DATA_STYLE = "#7d8799"
 STYLES = {
-    "three-sensor": ("#4cc9f0", "#1d6f8c"),
-    "three-channel": ("#f4a261", "#8a5a34"),
-    "maximum-likelihood": ("#c297ff", "#5f4890"),
-    "two-channel": ("#e9d86b", "#7f7638"),
+    "three-sensor": ("#4cc9f0", "#1d6f8c", "●"),
+    "three-channel": ("#f4a261", "#8a5a34", "×"),
+    "maximum-likelihood": ("#c297ff", "#5f4890", "◆"),
+    "two-channel": ("#e9d86b", "#7f7638", "+"),
 }
-"""Colours of each method: of its curve and of its 95 % band."""
+"""Colours of each method, of its curve and of its 95 % band, and what marks the curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: 
         if method not in snapshot.results:
             continue
         noise = snapshot.results[method]
-        style, band_style = STYLES[method]
+        style, band_style, marker = STYLES[method]
         shown.append(
             noise_curve(
                 frequency,
@@ -66,6 +66,7 @@ def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: 
                 label=method,
                 style=style,
                 band_style=band_style,
+                marker=marker,
             )
         )
     return shown
@@ -210,7 +211,7 @@ def progress_line(
         if snapshot.n_dropped:
             text += f" without gaps; {snapshot.n_dropped} left out"
         return Text(text, "#9aa5b8")
-    parts = [f"{snapshot.n_segments} segments"]
+    parts = [several(snapshot.n_segments, "segment")]
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} left out")
     if not math.isnan(cov):
