@@ -54,6 +54,10 @@ def field_faults(
             yield Fault(key, _ABSENT, f"is missing; expected {wanted}")
         elif kind == "extra_forbidden":
             yield Fault(key, value, f"unknown key; {_expected(str(location[-1]), tuple(known))}")
+        elif kind == "string_too_short":
+            field = known.get(str(location[-1]))
+            wanted = field.description if field is not None and field.description else "a word"
+            yield Fault(key, value, f"expected {wanted}")
         elif kind == "too_short":
             # Entries that are wrong do not count for pydantic; they are reported themselves.
             if not any(

@@ -29,8 +29,8 @@ _PART = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.ASCII)
 _EXPECTED = 'expected a positive duration such as "10s", "90 min", "3h" or "1d 12h"'
 
 
-def parse_duration(value: str | float) -> float:
-    """Return a duration in seconds; a bare number is seconds.
+def parse_duration(value: str | float, *, zero: bool = False) -> float:
+    """Return a duration in seconds; a bare number is seconds. None at all is one where `zero`.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def parse_duration(value: str | float) -> float:
     """
     numeric = isinstance(value, (int, float)) and not isinstance(value, bool)
     seconds = float(value) if numeric else _parse_text(str(value))
-    if not (math.isfinite(seconds) and seconds > 0):
+    if not (math.isfinite(seconds) and (seconds > 0 or (zero and seconds == 0))):
         raise ValueError(_EXPECTED)
     return seconds
 

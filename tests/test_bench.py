@@ -140,6 +140,10 @@ psd = [[1, 2], [3, 4]]
             '[estimate]\nsegment = "fast"\n',
             'estimate.segment = "fast": expected a positive duration',
         ),
+        (
+            sensor_text("d").replace("/dev/d", ""),
+            'sensors["d"].port = "": expected a port, such as /dev/ttyUSB0',
+        ),
         ('[estimate]\nwindow = "han"\n', "(did you mean 'hann'?)"),
         ('[estimate]\nmethod = "three_sensor"\n', "(did you mean 'three-sensor'?)"),
         (
@@ -327,6 +331,10 @@ def test_durations_come_back(seconds: float) -> None:
 )
 def test_durations(text: str | float, seconds: float) -> None:
     assert parse_duration(text) == pytest.approx(seconds)
+
+
+def test_no_time_at_all_is_a_duration_where_that_makes_sense() -> None:
+    assert parse_duration("0s", zero=True) == 0
 
 
 @pytest.mark.parametrize("text", ["", "s", "-1s", "1h 30", "3 parsecs", "0", "1 2", True])

@@ -15,6 +15,7 @@ from daq.errors import NoAnswerError
 from daq.probe import discover, probe_bench
 from tui.output import console, for_people, write_json
 from tui.results import plain
+from tui.text import signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -153,7 +154,8 @@ def _remarks(entry: SensorCheck) -> Iterator[str]:
         noise = entry.signal_to_noise_db
         yield (
             f"polling leaves {entry.bandwidth:.3g} Hz of bandwidth and {1e3 * entry.jitter:.2g} ms"
-            " of jitter" + ("" if noise is None else f" (SNR {noise:.0f} dB at the edge of it)")
+            " of jitter"
+            + ("" if noise is None else f" (SNR {signed(noise, '.0f')} dB at its edge)")
         )
     for text, times in Counter(entry.events).items():
         yield text if times == 1 else f"{text} ({times} times)"
@@ -165,9 +167,9 @@ def _channel_table(found: Sequence[SensorCheck]) -> Table:
         for channel in entry.channels:
             table.add_row(
                 f"{entry.information.sensor}.{channel.name}",
-                f"{channel.mean:.4g}",
-                f"{channel.rms:.3g}",
-                f"{channel.least:.4g} … {channel.largest:.4g}",
+                signed(channel.mean, ".4g"),
+                signed(channel.rms, ".3g"),
+                f"{signed(channel.least, '.4g')} … {signed(channel.largest, '.4g')}",
                 channel.unit,
                 "stuck: nothing connected?" if channel.is_stuck else "",
             )

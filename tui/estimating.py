@@ -171,7 +171,7 @@ def _instant(text: str | None, created: datetime) -> datetime | None:
     if text is None:
         return None
     try:
-        return created + timedelta(seconds=parse_duration(text))
+        return created + timedelta(seconds=parse_duration(text, zero=True))
     except ValueError:
         pass
     try:

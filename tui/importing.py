@@ -10,7 +10,7 @@ from rich.table import Table
 from daq.bench import parse
 from daq.formats.import_ import import_files
 from tui.output import for_people, write_json
-from tui.text import utc
+from tui.text import several, utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,7 @@ def import_recording(
             f"{entry.sampling_rate:g} Hz",
             utc(entry.start_utc_ns),
             str(entry.n_samples),
-            f"{entry.n_gaps} ({entry.missing} samples)" if entry.n_gaps else "none",
+            f"{entry.n_gaps} ({several(entry.missing, 'sample')})" if entry.n_gaps else "none",
         )
     screen = for_people(json)
     screen.print(table)

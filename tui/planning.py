@@ -12,6 +12,7 @@ from estimator.planning import plan, planned_csm
 from estimator.spectra import WelchSettings
 from tui.devices import scenario_of
 from tui.output import for_people, write_json
+from tui.text import signed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -86,6 +87,6 @@ def _row(entry: Plan) -> tuple[str, str, str, str]:
     return (
         format_duration(duration),
         f"{segments:.0f}",
-        "none" if none else f"{low:+.0%} to {high:+.0%}",
+        "none" if none else f"{signed(low, '+.0%')} to {signed(high, '+.0%')}",
         f"{entry.efficiency.min():.0%}" if none else "",
     )

@@ -10,7 +10,7 @@ from daq.bench import load
 from daq.clock import SystemClock
 from daq.recorder import recording_path, run
 from tui.output import notices, write_json
-from tui.text import clock_time
+from tui.text import clock_time, several
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,7 +46,7 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
 def _line(status: Status) -> str:
     sensors = "  ".join(
         f"{name} {sensor.samples}"
-        + (f" ({sensor.gaps} gaps, {sensor.missing} missing)" if sensor.gaps else "")
+        + (f" ({several(sensor.gaps, 'gap')}, {sensor.missing} missing)" if sensor.gaps else "")
         + (f" {sensor.state}" if sensor.state in {"late", "lost"} else "")
         for name, sensor in status.sensors.items()
     )

@@ -14,7 +14,7 @@ from rich.table import Table
 from estimator.self_noise import Flag
 from estimator.windows import get_window
 from tui.bands import band_edges, band_means, bin_correlation
-from tui.text import clock_time, level, level_with_error, utc
+from tui.text import clock_time, level, level_with_error, several, utc
 
 if TYPE_CHECKING:
     from daq.estimation import Settings, Snapshot
@@ -96,7 +96,9 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
 
 def remarks(snapshot: Snapshot) -> list[str]:
     """Return what must be said beside the numbers, in plain words."""
-    taken = f"{snapshot.n_segments} segments ({snapshot.n_effective:.0f} effective averages)"
+    taken = (
+        f"{several(snapshot.n_segments, 'segment')} ({snapshot.n_effective:.0f} effective averages)"
+    )
     lines = [f"{taken} from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"]
     if snapshot.octaves:
         lowest, highest = snapshot.octaves[0], snapshot.octaves[-1]
@@ -113,9 +115,10 @@ def remarks(snapshot: Snapshot) -> list[str]:
         if disturbed:
             lines.append(f"segments left out that something disturbed: {', '.join(disturbed)}")
     if snapshot.n_dropped:
-        lines.append(f"{snapshot.n_dropped} segments left out{left_out(snapshot)}")
+        lines.append(f"{several(snapshot.n_dropped, 'segment')} left out{left_out(snapshot)}")
     lines += [
-        f"{sensor.name}: {sensor.n_gaps} gaps, {sensor.n_missing} samples missing"
+        f"{sensor.name}: {several(sensor.n_gaps, 'gap')}, "
+        f"{several(sensor.n_missing, 'sample')} missing"
         for sensor in snapshot.sensors
         if sensor.n_gaps
     ]

@@ -64,3 +64,8 @@ def interval(low: float, high: float) -> str:
 def signed(value: float, spec: str) -> str:
     """Return a number with the minus sign of typography."""
     return f"{value:{spec}}".replace("-", "−")
+
+
+def several(count: int, one: str, more: str | None = None) -> str:
+    """Return a count with its noun."""
+    return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")

@@ -57,6 +57,12 @@ def test_angles_have_the_minus_of_typography_and_pairs_are_put_together() -> Non
     assert "−5.000°" in shown(details(diagnosed(other_way)))
 
 
+def test_one_gap_is_a_gap() -> None:
+    snapshot = made_snapshot()
+    once = tuple(replace(each, n_gaps=1, n_missing=1) for each in snapshot.sensors)
+    assert "A: 1 gap, 1 sample missing" in remarks(replace(snapshot, sensors=once))
+
+
 def test_what_is_wrong_with_one_sensor_names_it() -> None:
     change = np.eye(9)
     change[5, 5] = -1

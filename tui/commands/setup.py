@@ -79,7 +79,11 @@ def devices(
     speed: SpeedOption = None,
     faults: Annotated[
         Path | None,
-        typer.Option("--faults", metavar="FILE", help="What goes wrong, as [[faults]] in TOML."),
+        typer.Option(
+            "--faults",
+            metavar="FILE",
+            help="What goes wrong, and when: a TOML file (docs/simulation.md).",
+        ),
     ] = None,
     log: Annotated[
         Path | None,

@@ -16,12 +16,11 @@ from tui.report.wording import (
     plain_number,
     probability,
     scientific,
-    several,
     share,
     span,
 )
 from tui.results import band_of, left_out
-from tui.text import utc
+from tui.text import several, utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

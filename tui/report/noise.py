@@ -11,9 +11,9 @@ from tui.bands import band_edges
 from tui.limits import judged
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import noise_plots
-from tui.report.wording import decibel, plain_number, scientific, several, span
+from tui.report.wording import decibel, plain_number, scientific, span
 from tui.results import band_of, channel_means, flagged
-from tui.text import decibels
+from tui.text import decibels, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -72,11 +72,6 @@ def span(low: float, high: float) -> str:
     return f"{low:.3g}–{high:.3g} Hz"
 
 
-def several(count: int, one: str, more: str | None = None) -> str:
-    """Return a count with its noun."""
-    return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")
-
-
 def utc_time(moment: datetime) -> str:
     """Return an instant in UTC to the second."""
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC" if is_known(moment) else "not known"
