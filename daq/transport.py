@@ -51,17 +51,24 @@ class ByteStream:
         self._failure: str | None = None
         self._waiter: asyncio.Future[None] | None = None
         self._paused = False
+        self._expected = 1  # bytes, as every wire begins
         self._wire: Wire
 
-    def expect(self, n_frames: int, size: int = 1) -> None:
+    def expect(self, n_frames: int, size: int = 1, *, begun: int = 0) -> None:
         """Wake only when so many frames of ``size`` bytes are there, instead of at every byte.
+
+        ``begun`` bytes of the first came already: without them each wake would be amid a frame,
+        long after the last whole one came. To be said again when that changes.
 
         The kernel does the waiting, so that the time at which the last byte came is no less exact.
         A serial port counts to 255 bytes at the most, which are then fewer frames. A hang-up is
         still seen at once.
         """
         most = max(1, self._wire.most_expected // size)
-        self._wire.expect(max(1, min(n_frames, most) * size))
+        n_bytes = max(1, min(n_frames, most) * size - begun)
+        if n_bytes != self._expected:
+            self._expected = n_bytes
+            self._wire.expect(n_bytes)
 
     async def read(self) -> tuple[bytes, HostTime]:
         """Return all that has come, at least one byte, and when the last of it came.

@@ -200,17 +200,22 @@ class _ThreadWire:
         self._thread.start()
 
     def _read(self) -> None:
+        received = b""
         while not self._closing:
             if not self._running.wait(_POLL):
                 continue
+            wanted = self._expected - len(received)
             try:
-                received = self._port.read(max(self._expected, self._port.in_waiting))
+                piece = self._port.read(max(1, wanted, self._port.in_waiting))
             except OSError as error:
                 if not self._closing:
                     self._loop.call_soon_threadsafe(self._stream.lost, why(error))
                 return
-            if received:
+            received += piece
+            # one that only timed out says nothing of when the last byte came
+            if received and (len(piece) >= wanted or not piece):
                 self._loop.call_soon_threadsafe(self._stream.feed, received, self._clock.now())
+                received = b""
 
     async def write(self, payload: bytes) -> None:
         await self._loop.run_in_executor(None, self._port.write, payload)

@@ -86,8 +86,8 @@ class EpsonSession:
             for item in self.decoder.receive(*self._heard):
                 yield item
         n_frames = round(GATHER * configuration.sampling_rate)
-        self._stream.expect(n_frames, configuration.burst.size)
         while True:
+            self._stream.expect(n_frames, configuration.burst.size, begun=self.decoder.begun)
             try:
                 async with asyncio.timeout(patience):
                     received, at = await self._stream.read()

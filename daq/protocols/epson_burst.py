@@ -76,6 +76,11 @@ class BurstDecoder:
         self._counts = dict.fromkeys(("checksum", "resynchronised", "repeated"), 0)
         self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
 
+    @property
+    def begun(self) -> int:
+        """Bytes of a frame that are here while the rest is on its way."""
+        return len(self._left)
+
     def follows(self, data: bytes, at: HostTime) -> bool:
         """Whether ``data``, heard on a new connection, is the stream of before, gone on meanwhile.
 

@@ -5,15 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import threading
 import tty
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
+from daq.bench import Channel, Sensor
 from daq.clock import SystemClock
+from daq.drivers.base import DeviceInformation
+from daq.drivers.epson import EpsonSession
+from daq.drivers.epson_setup import Configuration
 from daq.drivers.registry import driver_type
 from daq.errors import NotConnectedError
+from daq.protocols import epson
+from daq.protocols.block import Block
 from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
@@ -164,6 +172,61 @@ async def test_a_terminal_that_cannot_count_so_far_wakes_at_the_end_of_a_frame()
         assert not done
         far.send(bytes(1))
         assert len((await reading)[0]) == 200
+
+
+async def test_what_came_of_a_frame_already_is_not_waited_for_again() -> None:
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(2, 100, begun=30)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(169))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 170
+
+
+async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() -> None:
+    """Else every block's time is late by most of a sample period, until the host is late once."""
+    channels = tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz")
+    sensor = Sensor(name="A", driver="epson", port="x", sampling_rate=50.0, channels=channels)
+    configuration = Configuration.of(sensor)
+    zeros = np.zeros(20, np.int32)
+    sent = epson.encode_bursts(configuration.burst, x=zeros, y=zeros, z=zeros, count=np.arange(20))
+    cut = 7
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        decoder = configuration.decoder("A")
+        session = EpsonSession(stream, configuration, DeviceInformation("A"), decoder)
+        items = session.read()
+
+        async def block() -> Block:
+            while not isinstance(item := await anext(items), Block):
+                pass
+            return item
+
+        reading = asyncio.create_task(block())
+        await far.arrived(1)  # it is told to begin
+        size = configuration.burst.size
+        far.send(sent[cut : cut + 5 * size])  # its first frame lacks its start
+        assert ((await reading).n_samples, decoder.begun) == (4, cut)
+        reading = asyncio.create_task(block())
+        far.send(sent[cut + 5 * size : 10 * size])
+        async with asyncio.timeout(0.9):  # sooner than the driver's own patience
+            second = await reading
+        assert (second.first_sample, second.n_samples, decoder.begun) == (4, 5, 0)
+
+
+async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience() -> None:
+    async with open_port("loop://", SystemClock()) as stream:
+        stream.expect(10)
+        await stream.write(bytes(1))  # for the read that is under way
+        await stream.read()
+        reading = asyncio.create_task(stream.read())
+        for _ in range(10):  # they take three times as long as a read waits
+            await stream.write(bytes(1))
+            await asyncio.to_thread(threading.Event().wait, 0.03)
+        assert len((await reading)[0]) == 10
 
 
 async def test_discard_forgets_what_was_not_read() -> None:
