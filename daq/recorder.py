@@ -89,11 +89,19 @@ def run(
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            with contextlib.suppress(NotImplementedError):  # Windows: KeyboardInterrupt instead
+            try:
                 loop.add_signal_handler(number, stop.set)
+            except NotImplementedError:  # Windows
+                signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
         return await record(bench, path, duration=duration, stop=stop, acknowledged=acknowledged)
 
-    return asyncio.run(main())
+    runner = asyncio.Runner()
+    try:
+        return runner.run(main())
+    finally:
+        # Closing waits for ever for a driver that does not end, and no signal would help.
+        if not asyncio.all_tasks(runner.get_loop()):
+            runner.close()
 
 
 async def record(

@@ -519,6 +519,44 @@ def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
     assert not report.closed
 
 
+STUBBORN = """
+import asyncio, functools, signal, sys
+from daq import recorder, session
+from tests.devices import PlayedDevice, PlayedDriver, bench
+
+def interrupt(status):
+    if not status.closed:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+session.LEAVE_TIMEOUT, recorder.CANCEL_TIMEOUT = 0.1, 0.3
+if "windows" in sys.argv:
+    def not_here(*_):
+        raise NotImplementedError
+    asyncio.SelectorEventLoop.add_signal_handler = not_here
+device = PlayedDevice(may_end=asyncio.Event() if "stubborn" in sys.argv else None)
+driver = PlayedDriver({"a": device})
+recorder.record = functools.partial(recorder.record, drivers=driver.find)
+print(recorder.run(bench("a"), sys.argv[1], acknowledged=interrupt).closed, flush=True)
+"""
+
+
+@pytest.mark.parametrize("how", ["stubborn", "windows"])
+def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
+    tmp_path: Path, how: str
+) -> None:
+    path = tmp_path / "r.h5"
+    said = subprocess.run(
+        [sys.executable, "-c", STUBBORN, str(path), how],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert (said.returncode, said.stdout) == (0, "True\n"), said.stderr
+    assert verify(path).closed
+
+
 def test_the_usual_path() -> None:
     path = recording_path(bench("a"), ManualClock(0).now())
     assert path.as_posix() == "recordings/played-bench-20010909T014640Z.h5"
