@@ -8,7 +8,8 @@ they exceed one, and what is left of -2/n times the log likelihood ratio is twic
 
 which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
 eigendecomposition, negative curvature turned round, steps kept in a trust region, every
-frequency at its own pace, and those that have arrived left out.
+frequency at its own pace, and those that have arrived left out. A channel that falls towards zero
+noise, where Newton's steps in ln psi become one each, is put there at once if that is better.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ BOUNDARY = 1e-6
 _MAX_STEP = 2.0  # in ln psi, the first trust region
 _MIN_RADIUS = 1e-9
 _MIN_CURVATURE = 1e-9
+_CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
+_FALLING = np.log(0.1 / BOUNDARY)
+"""A channel that falls further from less than this above its boundary is tried there at once: on
+its way the likelihood grows ever less, and ln psi by one a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +207,12 @@ def maximise(
     if usable.any():
         partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
         lowest = np.log(partial * BOUNDARY)
+        start = partial * (1 - n_factors / (2 * p))
+        if n_factors == 0 and penalty is None:  # then that is the maximum
+            start = np.real(np.einsum("fii->fi", csm[usable]))
         _search(
             precision[usable],
-            np.log(partial * (1 - n_factors / (2 * p))),
+            np.log(start),
             lowest=lowest,
             rounding=rounding[usable],
             found=found,
@@ -245,6 +253,7 @@ def _search(
     penalty = found.penalty
     best = _evaluate(precision, x0, q)
     gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
+    falling = _falling(best.x, step, lowest)
     radius = np.full(n, _MAX_STEP)
     iterations = np.ones(n, np.int64)
     converged = decrement < DECREMENT
@@ -252,18 +261,19 @@ def _search(
     for _ in range(MAX_ITERATIONS):
         if not len(going):
             break
-        size = np.abs(step[going]).max(axis=1)
+        size = np.abs(np.where(falling[going], 0.0, step[going])).max(axis=1)
         shrink = np.minimum(1.0, radius[going] / np.maximum(size, _MIN_RADIUS))
-        trial_step = step[going] * shrink[:, None]
-        trial = _evaluate(
-            precision[going], np.maximum(best.x[going] + trial_step, lowest[going]), q
-        )
+        goal = best.x[going] + step[going] * shrink[:, None]
+        goal = np.where(falling[going], lowest[going], np.maximum(goal, lowest[going]))
+        trial = _evaluate(precision[going], goal, q)
         iterations[going] += 1
         expected = decrement[going] * shrink * (1 - shrink / 2)
         gain = best.discrepancy[going] - trial.discrepancy
         gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
         accept = gain >= 1e-4 * expected - rounding[going]
         poor = gain < 0.25 * expected - rounding[going]
+        poor &= ~falling[going].any(axis=1)  # then the fall was too far, not the step
+        falling[going] = False
         radius[going] = np.where(
             poor,
             0.25 * np.minimum(size, radius[going]),
@@ -275,6 +285,7 @@ def _search(
         gradient[moved], step[moved], decrement[moved], at_boundary[moved] = _newton(
             point, lowest[moved], q, penalty
         )
+        falling[moved] = _falling(point.x, step[moved], lowest[moved])
         converged[moved] = decrement[moved] < DECREMENT
         stuck = radius < _MIN_RADIUS
         going = np.flatnonzero(~converged & ~stuck)
@@ -287,6 +298,11 @@ def _search(
     found.gradient_norm[where] = np.abs(np.where(at_boundary, 0.0, gradient)).max(axis=1)
     found.converged[where] = converged
     found.boundary[where] = at_boundary
+
+
+def _falling(x: FloatArray, step: FloatArray, lowest: FloatArray) -> BoolArray:
+    """Channels on their way to zero noise, near it already and still at a full step."""
+    return np.asarray((x > lowest) & (x < lowest + _FALLING) & (step < -0.5))
 
 
 def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
@@ -327,12 +343,35 @@ def _newton(
     i = np.arange(w.shape[1])
     hessian[:, i, i] += at_boundary
     downhill = np.where(free, gradient, 0.0)
+    step = np.zeros_like(downhill)
+    convex = _least_pivot(hessian) > _CONVEX
+    step[convex] = -np.linalg.solve(hessian[convex], downhill[convex, :, None])[:, :, 0]
+    if not convex.all():
+        step[~convex] = _turned(hessian[~convex], downhill[~convex])
+    return gradient, step, -(step * downhill).sum(axis=1), at_boundary
+
+
+def _least_pivot(matrices: FloatArray) -> FloatArray:
+    """Least pivot of Gaussian elimination, shape (n,): positive if all eigenvalues are.
+
+    All matrices at once, none beyond a pivot under `_CONVEX`: a tenth of the time of eigenvalues.
+    """
+    left = np.moveaxis(matrices, 0, 2).copy()  # the matrices' own axis last: contiguous
+    least = left[0, 0].copy()
+    for k in range(1, len(left)):
+        pivot = np.where(least > _CONVEX, left[k - 1, k - 1], np.inf)
+        left[k:, k:] -= left[k:, k - 1, None] * (left[k - 1, k:] / pivot)
+        least = np.minimum(least, left[k, k])
+    return np.asarray(least, np.float64)
+
+
+def _turned(hessian: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Newton step with negative curvature turned round."""
     curvature, axes = np.linalg.eigh(hessian)
     floor = _MIN_CURVATURE * np.maximum(curvature[:, -1:], 1.0)
     curvature = np.maximum(np.abs(curvature), floor)
     along = np.einsum("fik,fi->fk", axes, downhill)
-    step = -np.einsum("fik,fk->fi", axes, along / curvature)
-    return gradient, step, (along**2 / curvature).sum(axis=1), at_boundary
+    return np.asarray(-np.einsum("fik,fk->fi", axes, along / curvature))
 
 
 def _hessian(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:

@@ -126,6 +126,21 @@ def test_second_order_means_few_iterations() -> None:
     assert found.gradient_norm.max() < 1e-4
 
 
+@pytest.mark.parametrize(("n_factors", "most"), [(0, 1), (1, 8), (3, 12)])
+def test_noise_that_falls_to_zero_takes_few_iterations(n_factors: int, most: int) -> None:
+    """Weak motion and few averages: nearly every frequency has such a channel, or several."""
+    draws = wishart(
+        equal_noise(9, dims=(3, 3, 3), snr=0.1), 20, np.random.default_rng(9), n_draws=200
+    )
+    found = maximise(draws, n_factors)
+    assert found.converged.all()
+    assert found.iterations.mean() <= most
+    if n_factors == 3:
+        assert found.boundary.any(axis=1).mean() > 0.8
+        assert found.psi[found.boundary].max() < 1e-5
+        assert found.gradient_norm.max() < 1e-3
+
+
 def test_a_maximum_at_zero_noise_is_reported_as_such() -> None:
     noise_psd = np.array([1.0, 1, 1e4, 1e4, 1e4, 1e4])
     csm = common_motion(planar_sensors(10), noise_psd, snr=1e4)
