@@ -45,11 +45,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int64]
 
 _NANO = 1e-9
 _NODE = 10.0  # seconds of arrival times that make one observation
 _MOST_NODES = 3000
+_FEW = 4  # nodes
 _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
@@ -263,6 +265,9 @@ class ArrivalTimes:
         duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
         node = max(_NODE, duration / _MOST_NODES)
         kept = _earliest(self._index, left, self._epoch, self.sampling_rate * node)
+        begins = np.diff(self._index // (self.sampling_rate * node), prepend=-1.0) != 0
+        begins |= np.diff(self._epoch, prepend=-1) != 0
+        scatter = _scatter_of_least(left, left[kept], begins)
         index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
         variance = np.zeros(len(index))
         if measured is not None:
@@ -288,8 +293,10 @@ class ArrivalTimes:
         step = self._polls.step(slope)
         beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
         hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
-        smoothed = smooth(observations, least_noise=hidden)
+        smoothed = smooth(observations, least_noise=max(hidden, scatter))
         residual = smoothed.varying
+        if len(kept) < _FEW:  # hardly more than the line itself, which nothing checks
+            residual = math.hypot(residual, 2 * scatter)
         refined = bool(observations.from_samples.any())
         known_to = float(np.sqrt(np.mean(smoothed.std**2)))
         if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
@@ -340,6 +347,18 @@ def _earliest(index: IntArray, late: FloatArray, epoch: IntArray, length: float)
     kept = np.ones(len(order), dtype=bool)
     kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)
     return order[kept]
+
+
+def _scatter_of_least(late: FloatArray, least: FloatArray, begins: BoolArray) -> float:
+    """Return by how much the least lateness of groups must scatter, in s, by the others' lateness.
+
+    The least of n scatters by an n-th of what one does, if lateness is exponential; a few groups
+    that happen to lie on a line do not show it. `begins` says which rows begin a group.
+    """
+    others = max(len(late) - len(least) - 1, 1)  # one more lies on the line that was taken out
+    above = late - least[np.cumsum(begins) - 1]
+    # Known from few, it may be too little by as much.
+    return float(above.sum() / others * (1 + 3 / others) * len(least) / len(late))
 
 
 def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:

@@ -13,6 +13,10 @@ most likely pair is smoothed backwards (Rauch, Tung, Striebel 1965). An innovati
 standard deviations counts as four: an outlier cannot pull, a change that stays is followed.
 A restart of the device's clock forgets the lateness and keeps the rate.
 
+Arrivals alone do not tell a clock that wanders from a host whose shortest latency does. So the
+clock is smoothed twice: with the most likely walk, and with one that oscillators have at a steady
+temperature. By how much both differ is part of what is stated.
+
 Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model.md.
 """
 
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
 
 _WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
+_STEADY = 1e-8  # the walk of an oscillator that is left in peace: 0.25 ppm in ten minutes
 _START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
 _RESTART_RATE = 1e-6
 _HUBER = 4.0
@@ -74,7 +79,8 @@ class Smoothed:
         Standard deviation in s of the lateness; of that with the constant where samples were
         observed.
     varying : float
-        The same in s rms, of what is not constant.
+        The same in s rms, of what is not constant; where only arrivals were observed, with what
+        may be their wander.
     constant : float
         By how much observations from the samples lie above those from arrivals, in s.
     walk, noise : float
@@ -104,28 +110,33 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     noises = np.maximum(noises, least_noise)
     likelihood = _filter(observations, walks, noises, None)
     best = int(np.argmax(likelihood))
-    walk, noise = float(walks[best]), float(noises[best])
-    track = _Track.empty(len(observations.seconds))
-    _filter(observations, walks[best : best + 1], noises[best : best + 1], track)
-    state, covariance = _backwards(track)
+    steady = int(np.argmax(np.where(np.isclose(walks, _STEADY), likelihood, -np.inf)))
+    both = [best, steady]
+    track = _Track.empty(len(observations.seconds), len(both))
+    _filter(observations, walks[both], noises[both], track)
+    states, covariances = _backwards(track)
+    state, covariance = states[:, 0], covariances[:, 0]
     variance = alone = covariance[:, 0, 0]
+    wander = 0.0
     if observations.from_samples.any():
         variance = alone + 2 * covariance[:, 0, 2] + covariance[:, 2, 2]
+    else:
+        wander = float(np.std(states[:, 0, 0] - states[:, 1, 0]))
     return Smoothed(
         lateness=state[:, 0],
         rate=state[:, 1],
         std=np.sqrt(np.maximum(variance, 0.0)),
         # Whatever constant is taken out, what varies is no more than is left.
-        varying=math.sqrt(max(min(alone.mean(), variance.mean()), 0.0)),
+        varying=math.hypot(math.sqrt(max(min(alone.mean(), variance.mean()), 0.0)), wander),
         constant=float(state[-1, 2]),
-        walk=walk,
-        noise=noise,
+        walk=float(walks[best]),
+        noise=float(noises[best]),
     )
 
 
 @dataclass(slots=True, eq=False)
 class _Track:
-    """Predicted and filtered states of one run of the filter."""
+    """Predicted and filtered states, shape (n, n_pairs, 3), of runs of the filter."""
 
     predicted: FloatArray
     predicted_covariance: FloatArray
@@ -134,17 +145,17 @@ class _Track:
     transition: FloatArray
 
     @classmethod
-    def empty(cls, n: int) -> _Track:
-        square = (n, 3, 3)
+    def empty(cls, n: int, n_pairs: int) -> _Track:
+        line, square = (n, n_pairs, 3), (n, n_pairs, 3, 3)
         return cls(
-            np.empty((n, 3)), np.empty(square), np.empty((n, 3)), np.empty(square), np.empty(square)
+            np.empty(line), np.empty(square), np.empty(line), np.empty(square), np.empty((n, 3, 3))
         )
 
 
 def _filter(
     observations: Observations, walks: FloatArray, noises: FloatArray, track: _Track | None
 ) -> FloatArray:
-    """Return the log-likelihood of every pair; `track` takes the states of the first."""
+    """Return the log-likelihood of every pair; `track` takes their states."""
     n_pairs = len(walks)
     power, arrival = walks**2, noises**2
     x = np.zeros((3, n_pairs))
@@ -179,8 +190,8 @@ def _filter(
             p[1, 0], p[2, 0] = p[0, 1], p[0, 2]
         p[1, 1] += power * step
         if track is not None:
-            track.predicted[number] = x[:, 0]
-            track.predicted_covariance[number] = p[:, :, 0]
+            track.predicted[number] = x.T
+            track.predicted_covariance[number] = p.T
             track.transition[number] = transition
             transition[0, 0] = 1.0
         # Update.
@@ -193,18 +204,20 @@ def _filter(
         p -= weight[:, None] * gain[None, :]
         likelihood -= 0.5 * (np.log(spread) + innovation**2 / spread)
         if track is not None:
-            track.filtered[number] = x[:, 0]
-            track.filtered_covariance[number] = p[:, :, 0]
+            track.filtered[number] = x.T
+            track.filtered_covariance[number] = p.T
     return likelihood
 
 
 def _backwards(track: _Track) -> tuple[FloatArray, FloatArray]:
     """Rauch-Tung-Striebel: what later observations say about earlier states."""
     state, covariance = track.filtered.copy(), track.filtered_covariance.copy()
+    crossed = track.transition[1:, None] @ covariance[:-1]
+    gains = np.linalg.solve(track.predicted_covariance[1:], crossed).swapaxes(-1, -2)
     for number in range(len(state) - 2, -1, -1):
-        following = track.predicted_covariance[number + 1]
-        crossed = track.transition[number + 1] @ track.filtered_covariance[number]
-        gain = np.linalg.solve(following, crossed).T
-        state[number] += gain @ (state[number + 1] - track.predicted[number + 1])
-        covariance[number] += gain @ (covariance[number + 1] - following) @ gain.T
+        gain, after = gains[number], number + 1
+        ahead = state[after] - track.predicted[after]
+        state[number] += (gain @ ahead[:, :, None])[:, :, 0]
+        known = covariance[after] - track.predicted_covariance[after]
+        covariance[number] += gain @ known @ gain.swapaxes(-1, -2)
     return state, covariance

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 _BLOCKS = 64  # in a window: few enough for little drift, many enough for clusters to show
+_FEWEST_BLOCKS = 24  # while there is no whole window yet
 _MOST_WINDOWS = 32
 _CLUSTERED = 15.0  # usual gaps in the largest one; 6 where latencies are independent
 
@@ -66,8 +67,11 @@ class Polls:
             Lateness per sample that is the clock's own, in s.
         """
         largest, usual = [], []
-        for index, late in self._windows:
-            gaps = np.diff(np.sort(late - slope * index)[: _BLOCKS // 2 + 1])
+        windows = self._windows
+        if not windows and len(self._index) >= _FEWEST_BLOCKS:
+            windows = [(self._index, self._late)]
+        for index, late in windows:
+            gaps = np.diff(np.sort(late - slope * index)[: len(index) // 2 + 1])
             largest.append(float(gaps.max()))
             usual.append(float(np.median(gaps)))
         if not largest:

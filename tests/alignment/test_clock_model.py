@@ -234,3 +234,42 @@ def test_what_polls_hide_of_a_clock_is_not_claimed(n_blocks: int) -> None:
             covered.append(np.std(clock.at(index) - taken) < 2 * clock.state.residual)
             assert clock.state.residual < 5e-3
     assert np.mean(covered) >= 0.9
+
+
+def error_over_stated(rows: np.ndarray, taken: np.ndarray) -> float:
+    """Return what is left of a clock (rms about its mean), in units of what is stated."""
+    clock = solved(rows)
+    error = clock.at(BLOCK * np.arange(1.0, len(rows) + 1) - 1) - taken
+    return float(error.std() / clock.state.residual)
+
+
+def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_does() -> None:
+    rng = np.random.default_rng(10)
+    taken = last_samples(9000, 10.0)  # a quarter of an hour
+    ratios, quiet = [], []
+    for _ in range(8):
+        step = 10 * np.sqrt(2 * 0.1 / 100.0)  # forgets within 100 s
+        busy = np.zeros(len(taken))
+        for number, kick in enumerate(rng.normal(0, 40e-6 * step, len(taken) - 1), 1):
+            busy[number] = busy[number - 1] * (1 - 0.1 / 100.0) + kick
+        late = 5e-3 + busy + rng.exponential(1e-3, len(taken))
+        ratios.append(error_over_stated(block_rows(np.maximum.accumulate(taken + late)), taken))
+        rows = block_rows(np.maximum.accumulate(taken + rng.exponential(1e-3, len(taken))))
+        quiet.append(solved(rows).state.residual)
+    assert max(ratios) < 2.0
+    assert np.median(quiet) < 6e-6  # nothing is taken back where latencies are independent
+
+
+@pytest.mark.parametrize("seconds", [5, 10, 20, 60])
+@pytest.mark.parametrize("polled", [False, True])
+def test_the_first_seconds_do_not_state_what_they_cannot_know(seconds: int, polled: bool) -> None:
+    rng = np.random.default_rng(11 + seconds)
+    ratios = []
+    for _ in range(40):
+        taken = last_samples(10 * seconds, rng.uniform(-40, 40))
+        late = rng.exponential(1e-3, len(taken))
+        if polled:
+            phase = rng.uniform(0, 16e-3)
+            late = (phase - taken) % 16e-3 + rng.exponential(5e-5, len(taken))
+        ratios.append(error_over_stated(block_rows(np.maximum.accumulate(taken + late)), taken))
+    assert np.mean(np.array(ratios) < 2.0) >= 0.9
