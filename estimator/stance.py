@@ -106,7 +106,11 @@ def stance(
             band,
             f"{own[off]} reads {response.gains[off]:.3f} times what {like[off]} would: no bias, "
             "but one of the two sensitivities is wrong, and with it the noise in physical units.",
-            {"gain": float(response.gains[off])},
+            {
+                "gain": float(response.gains[off]),
+                "of channel": float(sum(dims[: pair[1]]) + off),
+                "against channel": float(sum(dims[: pair[0]]) + off),
+            },
             "Look at the sensitivities in the bench file.",
         )
     samples = response.delay * 2 * nyquist

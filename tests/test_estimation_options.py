@@ -141,6 +141,25 @@ def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -
     assert "clipped" not in estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics
 
 
+@pytest.mark.parametrize(("reject", "duration"), [(None, 5), (True, 5), (True, 30)])
+def test_a_channel_that_was_dead_for_a_while_is_named_and_its_sensitivity_is_not_blamed(
+    tmp_path: Path, reject: bool | None, duration: int
+) -> None:
+    sensors = bench()
+    sensors["b"].counts[3000 : 3000 + 100 * duration, 1] = 7
+    sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 3e4)  # coarse, often at rest
+    sensors["c"].counts[:, 0] = 5  # dead throughout is said elsewhere
+    found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, reject=reject))
+    blamed = [each.text for each in found.diagnostics["advice"] if "gain" in each.numbers]
+    assert not any("b.c1" in text for text in blamed)
+    if reject and duration == 5:  # all of it is left out; what lasts is taken for a new level
+        assert "stood_still" not in found.diagnostics
+        assert found.left_out["transient"] >= 9
+    else:
+        assert set(found.diagnostics["stood_still"]) == {"b.c1"}
+        assert found.diagnostics["stood_still"]["b.c1"] == pytest.approx(duration, abs=1)
+
+
 def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_path: Path) -> None:
     snapshot = estimate(
         [write(tmp_path / "r.h5", bench(n_samples=60_000))], replace(SETTINGS, octaves=True)

@@ -129,13 +129,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
         worst = max(left[clock.sensor] for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
-    clipped = snapshot.diagnostics.get("clipped")
-    if clipped:
-        names = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in clipped.items())
-        lines.append(
-            f"clipped: {names} of the samples stand at the largest or smallest count there is: the "
-            "noise of these channels comes out too high. Use a larger range, or less motion"
-        )
+    lines += faulty_channels(snapshot)
     if "two-channel" in snapshot.results:
         lines.append(
             "two-channel: takes like channels to point the same way, and their gains as given "
@@ -152,6 +146,27 @@ def remarks(snapshot: Snapshot) -> list[str]:
                 "zero, and are kept so"
             )
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
+    return lines
+
+
+def faulty_channels(snapshot: Snapshot) -> list[str]:
+    """Return which channels are cut off, or were dead for a while, and what to do."""
+    lines = []
+    clipped = snapshot.diagnostics.get("clipped")
+    if clipped:
+        names = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in clipped.items())
+        lines.append(
+            f"clipped: {names} of the samples stand at the largest or smallest count there is: the "
+            "noise of these channels comes out too high. Use a larger range, or less motion"
+        )
+    still = snapshot.diagnostics.get("stood_still")
+    if still:
+        names = ", ".join(f"{name} (for {seconds:.2g} s)" for name, seconds in still.items())
+        lines.append(
+            f"dead for a while: {names} stood at one count and moved otherwise: the motion missing "
+            "there counts as noise. Leave that time out (--reject; --start and --end for minutes), "
+            "and look at cable and supply"
+        )
     return lines
 
 

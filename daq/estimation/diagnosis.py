@@ -11,12 +11,13 @@ from estimator.diagnostics import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
     from daq.bench_model import Channel
     from daq.clock_model import ClockState
+    from estimator.advice import Advice
     from estimator.multiresolution import Band
     from estimator.self_noise import SelfNoise
 
@@ -81,9 +82,16 @@ def vertical_channel(channels: Sequence[Channel]) -> int | None:
 
 
 def diagnosis(
-    bands: Sequence[Band], dims: tuple[int, ...], channels: Sequence[tuple[str, Channel]]
+    bands: Sequence[Band],
+    dims: tuple[int, ...],
+    channels: Sequence[tuple[str, Channel]],
+    *,
+    faulty: Collection[str] = (),
 ) -> dict[str, Any]:
     """Diagnose the test.
+
+    Of `faulty` channels (such as ``A.X``) it is known that they are cut off, or were dead for a
+    while: no sensitivity of theirs is called wrong.
 
     Returns
     -------
@@ -118,6 +126,7 @@ def diagnosis(
             found.append(diagnostics)
     if not found:
         return {}
+    labels = [f"{sensor}.{channel.name}" for sensor, channel in channels]
     clearest = max(found, key=lambda each: sum(r.coherence for r in each.responses))
     return {
         "bands": tuple(band for each in found for band in each.bands),
@@ -126,7 +135,8 @@ def diagnosis(
             advice
             for each in found
             for advice in each.advice
-            if each is clearest or not advice.sensors
+            if (each is clearest or not advice.sensors)
+            and not _is_explained(advice, labels, faulty)
         ),
         "pairs": tuple((sensors[j], sensors[k]) for j, k in found[0].pairs),
         "per_frequency": {
@@ -140,3 +150,11 @@ def diagnosis(
             },
         },
     }
+
+
+def _is_explained(advice: Advice, labels: Sequence[str], faulty: Collection[str]) -> bool:
+    """Whether a gain is off because a channel is faulty."""
+    if "gain" not in advice.numbers:
+        return False
+    concerned = {labels[int(advice.numbers[key])] for key in ("of channel", "against channel")}
+    return not concerned.isdisjoint(faulty)

@@ -39,7 +39,7 @@ from daq.estimation.snapshot import ChannelLabel, Octave, SensorState, Snapshot
 from daq.recording.reader import Recording
 from daq.units import canonical
 from estimator.errors import InsufficientDataError
-from estimator.rejection import Reason
+from estimator.rejection import Reason, RejectionSettings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -228,8 +228,9 @@ class Estimation:
         if estimates.dimensions is not None and estimates.dimensions.chosen:
             diagnostics["dimension"] = estimates.dimensions.chosen
         if final:
-            diagnostics |= diagnosis(bands, dims, channels)
-            diagnostics |= self._clipped()
+            faulty = self._clipped() | self._dead_for_a_while()
+            diagnostics |= diagnosis(bands, dims, channels, faulty=set().union(*faulty.values()))
+            diagnostics |= faulty
         return Snapshot(
             frequency=frequency,
             csm=csm,
@@ -296,6 +297,24 @@ class Estimation:
                         label = f"{record.name}.{channel}"
                         shares[label] = max(share, shares.get(label, 0.0))
         return {"clipped": shares} if shares else {}
+
+    def _dead_for_a_while(self) -> dict[str, dict[str, float]]:
+        """Return which channels stood still for a while in segments that count, and how long.
+
+        Rejection leaves such segments out, but takes what lasts for a change for good.
+        """
+        welch = self._passes[0].welch
+        lasting = RejectionSettings().start_up * welch.hop / welch.sampling_rate
+        least = lasting if self.settings.reject else 0.0
+        seconds = sum(each.stillness.for_a_while() for each in self._passes)
+        found = {
+            f"{sensor}.{channel.name}": float(still)
+            for (sensor, channel), still in zip(
+                self._passes[0].aligned.channels, np.atleast_1d(seconds), strict=True
+            )
+            if still > least
+        }
+        return {"stood_still": found} if found else {}
 
     def _left_out(self) -> dict[str, int]:
         counts: Counter[Reason] = Counter()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from daq.alignment import AlignedRecording
+from daq.estimation.stillness import Stillness, stands_still
 from daq.protocols.block import BlockFlag
 from daq.refinement import DelayMeter
 from estimator.multiresolution import MultiResolution
@@ -35,7 +36,6 @@ _VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
 _READERS = 2  # pieces being read while one is worked on
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
-_STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 
 
@@ -84,6 +84,7 @@ class Pass:
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()
+        self.stillness = Stillness(self.welch.hop, self.n_channels, self.welch.sampling_rate)
         self.taken_at: list[FloatArray] = []
         self.aligned.forget()
         self._meter: DelayMeter | None = None
@@ -135,6 +136,7 @@ class Pass:
             starts = np.arange(count) * hop
             usable = valid & self._finite(samples)
             self._silence(samples)
+            self.stillness.add(samples[: count * hop], usable[: count * hop])
             clipped = self._clipped(first * hop, len(samples))
             starts = np.arange(count) * hop
             whole = _whole(usable, starts, length)
@@ -164,8 +166,8 @@ class Pass:
         if self.welch.detrend == "none":
             return
         rows = samples[:: max(1, len(samples) // 4)]
-        for column in np.flatnonzero(_stands_still(rows)):
-            if _stands_still(samples[:, column]):
+        for column in np.flatnonzero(stands_still(rows)):
+            if stands_still(samples[:, column]):
                 samples[:, column] = 0.0
 
     def _finite(self, samples: FloatArray) -> NDArray[np.bool_]:
@@ -269,10 +271,6 @@ def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) ->
     """Return which segments have usable samples only."""
     missing = np.concatenate([[0], np.cumsum(~usable)])
     return np.asarray(missing[starts + length] == missing[starts])
-
-
-def _stands_still(samples: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.ptp(samples, axis=0) <= _STILL * np.abs(samples[0]))
 
 
 def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:

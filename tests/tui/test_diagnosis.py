@@ -144,6 +144,10 @@ def test_clipped_channels_are_named() -> None:
     snapshot = diagnosed()
     clipped = snapshot.diagnostics | {"clipped": {"B.X": 0.046}}
     assert any("clipped: B.X (4.6 %)" in x for x in remarks(replace(snapshot, diagnostics=clipped)))
+    still = snapshot.diagnostics | {"stood_still": {"B.Y": 30.0}}
+    (line,) = [x for x in remarks(replace(snapshot, diagnostics=still)) if "dead for a while" in x]
+    assert "B.Y (for 30 s)" in line
+    assert "--reject" in line
 
 
 def test_too_few_averages_for_the_model_test_are_said() -> None:

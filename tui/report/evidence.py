@@ -19,7 +19,7 @@ from tui.report.wording import (
     share,
     span,
 )
-from tui.results import band_of, left_out
+from tui.results import band_of, faulty_channels, left_out
 from tui.text import several, utc
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
 
 def advice_section(snapshot: Snapshot) -> Section:
     """Return what to know and to do, in plain words."""
-    lines = summary(snapshot)
+    lines = [*faulty_channels(snapshot), *summary(snapshot)]
     if not lines:
         return Section("Advice", (Paragraph("Nothing to remark."),))
     return Section("Advice", (Items(tuple(Paragraph(_sentence(line)) for line in lines)),))
