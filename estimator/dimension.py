@@ -18,7 +18,7 @@ from estimator.factor_analysis import max_factors, maximise, testable
 from estimator.likelihood import standard_error
 from estimator.model_test import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.presence import presence
-from estimator.prior import expected_noise, maximise_expecting
+from estimator.prior import expected_noise, kinds, maximise_expecting
 
 if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray, IntArray
@@ -181,6 +181,7 @@ def choose_dimension(
     if frequency.shape != (len(csm),):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
     there = presence(given, dims)
+    kind = kinds(given, dims)[list(there.channels)]
     given, n_channels = given.part(list(there.channels)), len(there.channels)
     if len(there.sensors) < 3:
         raise InsufficientDataError(
@@ -200,7 +201,14 @@ def choose_dimension(
     most = most if len(there.sensors) > 3 else min(usual, most)
     stride = {int(b): -(-int(np.sum(number == b)) // MOST_BINS) for b in np.unique(number)}
     taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])
-    search = _Search(matrix[taken], given.psd[taken], number[taken], there.dims, n_effective)
+    search = _Search(
+        matrix[taken],
+        given.psd[taken],
+        number=number[taken],
+        usual=usual,
+        kind=kind,
+        n_effective=n_effective,
+    )
     r = HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
     tried: dict[int, list[BandTest]] = {b: [] for b in open_bands}
@@ -264,28 +272,31 @@ class _Search:
         self,
         matrix: ComplexArray,
         psd: FloatArray,
+        *,
         number: IntArray,
-        dims: tuple[int, ...],
+        usual: int,
+        kind: IntArray,
         n_effective: float,
     ) -> None:
         self._matrix = matrix
         self._psd = psd
         self._number = number
-        self._dims = dims
+        self._usual = usual
+        self._kind = kind
         self._n_effective = n_effective
         self._expected = 1 / psd  # in units of the coherency matrix
 
     def fit(self, q: int, some: list[int]) -> _Fit:
         """Maximise the likelihood of q factors in some bands."""
         rows = np.flatnonzero(np.isin(self._number, some))
-        if q <= max(self._dims):
+        if q <= self._usual:
             maximum = maximise(self._matrix[rows], q)
         else:
             maximum = maximise_expecting(
                 self._matrix[rows],
                 q,
                 self._expected[rows],
-                dims=self._dims,
+                kind=self._kind,
                 n_effective=self._n_effective,
             )
         error = standard_error(maximum, n_effective=self._n_effective)
@@ -299,4 +310,4 @@ class _Search:
     def expect(self, fit: _Fit, open_bands: list[int]) -> None:
         """Take the noise of the bands that are explained for what to expect of the others."""
         usual = ~np.isin(self._number, open_bands)
-        self._expected = expected_noise(fit.psi * self._psd, usual, self._dims) / self._psd
+        self._expected = expected_noise(fit.psi * self._psd, usual, self._kind) / self._psd

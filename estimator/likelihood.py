@@ -10,7 +10,7 @@ from estimator import fisher
 from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError
 from estimator.factor_analysis import Maximum, check_factors, max_factors, maximise
-from estimator.prior import NOISE_SPREAD, expected_noise, maximise_expecting
+from estimator.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
 from estimator.resolution import resolved
 from estimator.self_noise import Flag, SelfNoise
 
@@ -98,6 +98,7 @@ def maximum_likelihood(
     check_factors(int(factors.max()), p)
     matrix, absent = _without_dead_and_copies(given)
     few = factors > max_factors(p - absent.sum(axis=1))
+    kind = kinds(given, dims)
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
@@ -109,9 +110,9 @@ def maximum_likelihood(
             fits = _expecting(
                 matrix[rows],
                 (int(q), int(min(q + BEYOND, max_factors(p - absent[rows].sum(axis=1)).min()))),
-                expected_noise(noise_psd * given.psd, factors <= max(dims), dims)[rows]
+                expected_noise(noise_psd * given.psd, factors <= max(dims), kind)[rows]
                 / given.psd[rows],
-                dims=dims,
+                kind=kind,
                 n_effective=n_effective,
                 spread=noise_spread,
             )
@@ -161,7 +162,7 @@ def _expecting(
     n_factors: tuple[int, int],
     expected: FloatArray,
     *,
-    dims: tuple[int, ...],
+    kind: IntArray,
     n_effective: float,
     spread: float,
 ) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
@@ -171,7 +172,7 @@ def _expecting(
     is shared out among the noise of channels in ways that the fit itself thinks are certain.
     """
     fit, wider = (
-        maximise_expecting(matrix, q, expected, dims=dims, n_effective=n_effective, spread=spread)
+        maximise_expecting(matrix, q, expected, kind=kind, n_effective=n_effective, spread=spread)
         for q in n_factors
     )
     error, beyond = (standard_error(each, n_effective=n_effective) for each in (fit, wider))

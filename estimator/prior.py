@@ -18,23 +18,44 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.factor_analysis import Maximum, maximise
+from estimator.presence import presence
 
 if TYPE_CHECKING:
-    from estimator.arrays import BoolArray, ComplexArray, FloatArray
+    from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+    from estimator.coherency import Coherency
 
 NOISE_SPREAD = 0.5
 NEAREST = 32
 """Frequencies from which ratios are taken."""
 
 
-def alike(dims: tuple[int, ...]) -> FloatArray:
-    """Return the projector, shape (n_channels, n_channels), on differences of like channels."""
+def kinds(given: Coherency, dims: tuple[int, ...]) -> IntArray:
+    """Say which channels are alike: those of one number in their sensors.
+
+    Parameters
+    ----------
+    given : Coherency
+    dims : tuple of int
+        Channels of each sensor.
+
+    Returns
+    -------
+    int64, shape (n_channels,)
+        Equal for like channels; a channel that takes no part (`estimator.presence`) is like none.
+    """
     position = np.concatenate([np.arange(d) for d in dims])
-    same = (position[:, None] == position[None, :]).astype(np.float64)
-    return np.asarray(np.eye(len(position)) - same / same.sum(axis=1))
+    absent = np.ones(len(position), np.bool_)
+    absent[list(presence(given, dims).channels)] = False
+    return np.where(absent, max(dims) + np.arange(len(position)), position)
 
 
-def expected_noise(noise_psd: FloatArray, usual: BoolArray, dims: tuple[int, ...]) -> FloatArray:
+def alike(kind: IntArray) -> FloatArray:
+    """Return the projector, shape (n_channels, n_channels), on differences of like channels."""
+    same = (kind[:, None] == kind[None, :]).astype(np.float64)
+    return np.asarray(np.eye(len(kind)) - same / same.sum(axis=1))
+
+
+def expected_noise(noise_psd: FloatArray, usual: BoolArray, kind: IntArray) -> FloatArray:
     """Noise PSD to expect of every channel, up to a factor common to like channels.
 
     Parameters
@@ -43,15 +64,15 @@ def expected_noise(noise_psd: FloatArray, usual: BoolArray, dims: tuple[int, ...
         Estimates, unit**2/Hz; used at the frequencies of `usual` only.
     usual : bool, shape (n_freqs,)
         Where these came from no more factors than a sensor has channels.
-    dims : tuple of int
-        Channels of each sensor.
+    kind : int64, shape (n_channels,)
+        From `kinds`.
 
     Returns
     -------
     float64, shape (n_freqs, n_channels)
         Ratios, averaged over the `NEAREST` usual frequencies; 1 if there is none.
     """
-    within = np.eye(noise_psd.shape[1]) - alike(dims)  # mean over like channels
+    within = np.eye(noise_psd.shape[1]) - alike(kind)  # mean over like channels
     known = np.flatnonzero(usual & np.isfinite(noise_psd).all(axis=1))
     mean = np.maximum(noise_psd[known] @ within, np.finfo(np.float64).tiny)
     ratios = noise_psd[known] / mean
@@ -69,7 +90,7 @@ def maximise_expecting(
     n_factors: int,
     expected: FloatArray,
     *,
-    dims: tuple[int, ...],
+    kind: IntArray,
     n_effective: float,
     spread: float = NOISE_SPREAD,
 ) -> Maximum:
@@ -82,8 +103,8 @@ def maximise_expecting(
     n_factors : int
     expected : float64, shape (n_freqs, n_channels)
         Positive, up to a factor common to like channels.
-    dims : tuple of int
-        Channels of each sensor.
+    kind : int64, shape (n_channels,)
+        From `kinds`.
     n_effective : float
         Averages.
     spread : float
@@ -97,6 +118,6 @@ def maximise_expecting(
     found = maximise(
         csm * scale[:, :, None] * scale[:, None, :],
         n_factors,
-        penalty=alike(dims) / (spread**2 * n_effective),
+        penalty=alike(kind) / (spread**2 * n_effective),
     )
     return replace(found, psi=found.psi * expected)

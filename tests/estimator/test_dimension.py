@@ -100,10 +100,11 @@ def test_ratios_come_from_the_nearest_frequencies() -> None:
     noise_psd[100:, 1] = 0.25
     usual = np.arange(200) % 100 >= 60
     noise_psd[~usual] = np.nan
-    expected = expected_noise(noise_psd, usual, (1, 1, 1))
+    kind = np.zeros(3, np.int64)
+    expected = expected_noise(noise_psd, usual, kind)
     np.testing.assert_allclose(expected[70, 1] / expected[70, 0], 4)
     np.testing.assert_allclose(expected[190, 1] / expected[190, 0], 0.25)
-    np.testing.assert_array_equal(expected_noise(noise_psd, usual & False, (1, 1, 1)), 1)
+    np.testing.assert_array_equal(expected_noise(noise_psd, usual & False, kind), 1)
 
 
 def test_three_sensors_have_no_room_and_say_so() -> None:
@@ -181,6 +182,28 @@ def test_a_dead_sensor_is_none() -> None:
     csm[:, 6:, :] = csm[:, :, 6:] = 0
     with pytest.raises(InsufficientDataError, match="2 sensors have a signal of their own"):
         choose_dimension(csm, frequency, dims=(3,) * 4, n_effective=1080)
+
+
+def test_channels_stay_with_their_like_when_one_is_dead() -> None:
+    """Channels x are twelve times noisier than y: who compares one sensor's y with x is misled."""
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 24), 20 * np.linspace(0.95, 1.05, 24)])
+    band = np.repeat([0, 1], 24)
+    noise_psd = np.tile([12.0, 1, 1], 5)
+    csm = plane_waves(frequency, pentagon(), snr=400.0) + np.diag(noise_psd - 1)
+    averages = wishart(csm, 60, np.random.default_rng(4))[0]
+    averages[:, 0] = averages[:, :, 0] = 0
+    found = []
+    for unit in (1.0, 1e-10):  # the one in which a dead channel's stand-in has noise of one, or not
+        n_factors, (_, choice) = choose_dimension(
+            averages * unit, frequency, dims=FIVE, n_effective=60, band=band
+        )
+        result = maximum_likelihood(averages * unit, dims=FIVE, n_effective=60, n_factors=n_factors)
+        assert choice.n_factors > 3
+        found.append(np.append(result.noise_psd[band == 1][:, 1:].mean(axis=0) / unit, choice.cov))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+    # the median c.o.v. is 0.34; four standard errors of a mean over 24 frequencies
+    np.testing.assert_allclose(found[0][:-1], noise_psd[1:], rtol=4 * 0.34 / np.sqrt(24))
+    assert choice.cov < 0.4
 
 
 def test_bands_are_third_octaves_of_enough_frequencies() -> None:
