@@ -15,6 +15,8 @@ written. A time
   too late), and so does a message that repeats the one before to the letter, unless times are
   coarser than a period. The same time with other samples is of the next: the device's clock is
   coarser than it writes;
+- that goes on after such earlier ones, which came as their times say and not at once, tells that
+  they were no repetitions: the device's clock was set back, and they are missing;
 - further ahead than host time allows, or long past when nothing else has come for a while, is
   *doubtful*: damaged on the way, or somebody set the device's clock. The next one tells: if it
   goes on from there, it was the clock.
@@ -48,8 +50,8 @@ class Place:
     ----------
     kind
         "next": after ``missing`` others; "known": they came before; "doubtful": their time says
-        nothing yet; "reset": the device's clock was set, and the doubtful ones before these come
-        first, after ``missing`` others by host time.
+        nothing yet; "reset": the device's clock was set; first come the doubtful ones before these,
+        if there are any, after ``missing`` others; these are to be placed again.
     is_exact
         Whether ``missing`` is.
     """
@@ -79,6 +81,7 @@ class SampleTimes:
         self._at_ns = 0  # when it came
         self._lag_ns = 0.0  # least time between a sample and its arrival, but for a constant
         self._doubtful: tuple[int, int, HostTime] | None = None  # time, samples, arrival
+        self._again: tuple[int, int, int] | None = None  # what was known: first time, arrival; last
 
     def missing(self, time_ns: int) -> int:
         """Return how many samples lie between those known and these."""
@@ -90,7 +93,10 @@ class SampleTimes:
         """Return whether samples of this time came before, or come too late."""
         if self._origin_ns is None or self._is_doubtful(time_ns, at, resolution_ns):
             return False
-        return time_ns <= self._latest_ns
+        if time_ns > self._latest_ns:
+            return False
+        self._came_again(time_ns, at)
+        return True
 
     def place(
         self, time_ns: int, n_samples: int, at: HostTime, *, resolution_ns: int, alike: bool = False
@@ -117,11 +123,14 @@ class SampleTimes:
         if self._is_doubtful(time_ns, at, resolution_ns):
             return self._doubt(time_ns, n_samples, at, resolution_ns)
         self._doubtful = None
-        if time_ns < self._latest_ns:
+        is_same = time_ns == self._latest_ns
+        if time_ns < self._latest_ns or (is_same and width <= 1 and alike):
+            self._came_again(time_ns, at)
             return Place("known")
-        if time_ns == self._latest_ns:
-            if width <= 1 and alike:
-                return Place("known")
+        if (n_dropped := self._set_back(time_ns, at)) > 0:
+            self._begin(time_ns, at, width=width)
+            return Place("reset", n_dropped, is_exact=False)
+        if is_same:
             if width <= 0.5:  # written finely, and coarse all the same
                 self._least_width = _COARSE
                 self._offset = None if self._n_seen == 1 else self._offset
@@ -142,14 +151,32 @@ class SampleTimes:
         self._origin_ns, self._next, self._n_seen = time_ns, 0, 1
         self._offset = 0.0 if width <= 1 else None
         self._lag_ns = at.monotonic_ns - time_ns
+        self._again = None
 
     def _take(
         self, time_ns: int, n_samples: int, at: HostTime, missing: int, *, is_exact: bool
     ) -> Place:
         self._next += missing + n_samples
+        self._again = None
         self._lag_ns = min(self._least_lag(at), at.monotonic_ns - time_ns)
         self._latest_ns, self._at_ns = time_ns, at.monotonic_ns
         return Place("next", missing, is_exact)
+
+    def _came_again(self, time_ns: int, at: HostTime) -> None:
+        if self._again is None or time_ns < self._again[2]:
+            self._again = time_ns, at.monotonic_ns, time_ns
+        else:
+            self._again = *self._again[:2], time_ns
+
+    def _set_back(self, time_ns: int, at: HostTime) -> int:
+        """Return how many samples were dropped as known that were not, before these."""
+        if self._again is None:
+            return 0
+        first_ns, came_ns, last_ns = self._again
+        span_ns, waited_ns = time_ns - first_ns, at.monotonic_ns - came_ns
+        goes_on = 2 * (time_ns - last_ns) <= span_ns  # after two messages at least
+        as_they_say = span_ns <= 2 * waited_ns <= 3 * span_ns
+        return round(span_ns * 1e-9 * self._rate) if goes_on and as_they_say else 0
 
     def _least_lag(self, at: HostTime) -> float:
         return self._lag_ns + CLOCK_TOLERANCE * (at.monotonic_ns - self._at_ns)

@@ -234,7 +234,9 @@ def test_one_damaged_time_is_one_row_lost() -> None:
         assert "(1 unreadable so far)" in events[0].text
 
 
-@pytest.mark.parametrize(("step", "n_dropped"), [(90_000.0, 0), (30.0, 0), (-20.0, 20)])
+@pytest.mark.parametrize(
+    ("step", "n_dropped"), [(90_000.0, 0), (30.0, 0), (-20.0, 20), (-1.0, 10), (-0.3, 3)]
+)
 def test_a_clock_that_is_set_begins_anew(step: float, n_dropped: int) -> None:
     """Set back by less than an hour, it may be rows that come again: those of 2 s are dropped."""
     arrivals = [i / 10 for i in range(100)]
@@ -247,6 +249,19 @@ def test_a_clock_that_is_set_begins_anew(step: float, n_dropped: int) -> None:
     assert [e.text for e in events if e.kind == "reset"] == ["the device's clock was set"]
     (block,) = [b for b in found[1:] if isinstance(b, Block) and b.flags]
     assert block.flags & BlockFlag.CLOCK_RESTART
+
+
+def test_packets_of_a_clock_that_is_set_back_leave_a_gap_where_they_were_dropped() -> None:
+    """By 1 s: four packets seem to come again, and were no repetitions."""
+    decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
+    found: list[Block | Event] = []
+    for packet in range(40):
+        said = packet if packet < 20 else packet - 4
+        for channel in SHAKE.channel_names:
+            found += decoder.receive_datagram(datacast(channel, said), at(packet / 4))
+    index, _, events = split(found)
+    assert index == [i for i in range(1000) if not 500 <= i < 600]
+    assert [e.kind for e in events].count("reset") == 1
 
 
 def test_a_counter_makes_gaps_exact() -> None:
