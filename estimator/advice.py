@@ -80,6 +80,7 @@ def advise(
         *_sensor_space(bands, dims),
         *_dimensions(bands, presence(given, dims).dims, n_effective),
         *_weak_motion(bands),
+        *_left_in(bands, max(dims), n_effective),
         *(
             advice
             for response in responses
@@ -311,4 +312,43 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
             "most): the spectra are nearly the noise itself, and neither alignment nor method "
             "matters much.",
             {"SNR": snr},
+        )
+
+
+def left_in(d: int, n_effective: float) -> float:
+    """Return how much of weak motion the triad methods leave in at worst, as a share of the noise.
+
+    Parameters
+    ----------
+    d : int
+        Dimensions of the motion.
+    n_effective : float
+
+    Returns
+    -------
+    float
+        The largest over the SNR s of ``ρ (1 − g)^(n / d)``, with ``ρ = s / (1 + 2 s)`` what two
+        like sensors do not predict and ``g = (s / (1 + s))²`` their coherence: exact for d = 1
+        (`docs/decisions/0033`), and for d = 2 and 3 no less than was measured there.
+    """
+    s = np.geomspace(1e-4, 10, 501)
+    return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())
+
+
+def _left_in(bands: tuple[BandDiagnosis, ...], d: int, n_effective: float) -> Iterator[Advice]:
+    """Weak motion of most channels: of all is not asked, as some SNR is far too high by scatter."""
+    share = left_in(d, n_effective)
+    if share < LITTLE_OFF:
+        return
+    for run in _runs(bands, lambda b: bool((b.snr < 1).sum() > np.isfinite(b.snr).sum() / 2)):
+        yield Advice(
+            "note",
+            (),
+            _span(run),
+            f"At {in_hz(_span(run))} the motion is too weak for {n_effective:.0f} averages to "
+            "find: three-sensor and three-channel estimates may be up to about "
+            f"{percent(share)} too high, by motion that is left in them; maximum likelihood by "
+            "less.",
+            {"left in": share},
+            "Record longer to take it out.",
         )

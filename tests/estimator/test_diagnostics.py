@@ -12,6 +12,7 @@ from estimator.diagnostics import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import maximise
 from estimator.model_test import model_test
+from estimator.three_sensor import three_sensor
 from tests.estimator.models import pentagon, plane_waves, random_bench, wishart
 
 if TYPE_CHECKING:
@@ -120,6 +121,26 @@ def test_noise_alone_is_said_to_be_so() -> None:
     csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
     found = of(averages(csm))
     assert any("weaker than the noise" in advice.text for advice in found.advice)
+    assert not any("left in" in advice.numbers for advice in found.advice)  # too many averages
+
+
+@pytest.mark.parametrize("snr", [0.1, 0.3])
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_motion_left_in_by_few_averages_is_no_silent_bias(d: int, snr: float) -> None:
+    """What is said of twenty averages holds, and is no more than twice as much at its worst."""
+    rng = np.random.default_rng(d)
+    csm = random_bench(rng, dims=(d,) * 3, snr=snr, noise_psd=np.ones(3 * d))
+    found = of(averages(csm, n=20), dims=(d,) * 3, n=20)
+    said = [advice for advice in found.advice if "left in" in advice.numbers]
+    covered = sum(a.band[0] <= f <= a.band[1] for a in said if a.band for f in FREQUENCY)
+    assert covered > 0.8 * len(FREQUENCY)
+    assert "too high" in said[0].text
+    draws = wishart(csm, 20, rng, n_draws=8000)
+    noise = three_sensor(draws, dims=(d,) * 3, n_effective=20).noise_psd
+    bias = noise.mean() - 1
+    error = noise.mean(axis=1).std() / np.sqrt(len(draws))
+    assert bias > 5 * error
+    assert bias - 3 * error < said[0].numbers["left in"] < 2 * bias
 
 
 def test_a_lagging_sensor() -> None:
