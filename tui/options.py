@@ -104,7 +104,13 @@ DurationOption: TypeAlias = Annotated[
     typer.Option("--duration", "-d", metavar="TIME", parser=duration, help="As in 90s, 20min, 3h."),
 ]
 MethodOption: TypeAlias = Annotated[
-    Method | None, typer.Option("--method", "-m", help="Self-noise method.")
+    Method | None,
+    typer.Option(
+        "--method",
+        "-m",
+        metavar="METHOD",
+        help="two-channel, three-channel, three-sensor, maximum-likelihood, or all.",
+    ),
 ]
 SegmentOption: TypeAlias = Annotated[
     float | None,
@@ -118,7 +124,10 @@ WindowOption: TypeAlias = Annotated[
     str | None, typer.Option("--window", metavar="NAME", help="Any window of scipy.")
 ]
 DetrendOption: TypeAlias = Annotated[
-    Detrend | None, typer.Option("--detrend", help="Taken out of each segment.")
+    Detrend | None,
+    typer.Option(
+        "--detrend", metavar="HOW", help="Taken out of each segment: none, constant, linear."
+    ),
 ]
 NoCorrectionOption: TypeAlias = Annotated[
     bool, typer.Option("--no-correction", help="Leave the small-sample bias in.")
@@ -127,8 +136,9 @@ ClocksOption: TypeAlias = Annotated[
     Clocks | None,
     typer.Option(
         "--clocks",
-        help="Set by arrival times and the common motion (refined), by arrival times alone, "
-        "or not at all: samples at face value (nominal).",
+        metavar="HOW",
+        help="Set by arrival times and the common motion (refined), by arrival times alone "
+        "(arrivals), or not at all: samples at face value (nominal).",
     ),
 ]
 StartOption: TypeAlias = Annotated[

@@ -102,11 +102,14 @@ def remarks(snapshot: Snapshot) -> list[str]:
     lines = [f"{taken} from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"]
     if snapshot.octaves:
         lowest, highest = snapshot.octaves[0], snapshot.octaves[-1]
-        lines[0] += f" above {highest.low:.3g} Hz"
-        lines.append(
-            f"octaves below have longer segments, up to {lowest.segment:.4g} s"
-            f" ({lowest.n_effective:.0f} effective averages) below {lowest.high:.3g} Hz"
-        )
+        if lowest is highest:
+            lines.append("octaves: too few segments as yet for longer ones at lower frequencies")
+        else:
+            lines[0] += f" above {highest.low:.3g} Hz"
+            lines.append(
+                f"octaves below have longer segments, up to {lowest.segment:.4g} s"
+                f" ({lowest.n_effective:.0f} effective averages) below {lowest.high:.3g} Hz"
+            )
         disturbed = [
             f"{octave.left_out['transient']} at {octave.low:.3g}–{octave.high:.3g} Hz"
             for octave in snapshot.octaves

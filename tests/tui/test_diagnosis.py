@@ -125,6 +125,8 @@ def test_octaves_say_what_each_has_left_out() -> None:
     assert "segments left out that something disturbed: 3 at 20.1–100 Hz" in remarks(snapshot)
     text = " ".join(shown(details(snapshot)).split())
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
+    alone = remarks(replace(snapshot, octaves=octaves[1:]))
+    assert not any("octaves below" in line or "above 20.1 Hz" in line for line in alone)
 
 
 def test_where_averages_are_too_few_for_weak_motion_is_said_with_what_may_be_left_in() -> None:
