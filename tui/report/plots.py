@@ -371,7 +371,7 @@ def _draw_drift(seconds: FloatArray, left: FloatArray, names: list[str], axes: A
     time = seconds / one
     unit, size = ("ms", 1e3) if largest >= 1e-3 else ("µs", 1e6)
     for number, (column, name) in enumerate(zip(left.T, names, strict=True)):
-        dashes = [(), (4, 1.5), (1, 1)][number // len(drawing.LINES) % 3]
+        dashes = [(), (4, 1.5), (1, 1)][number % 3]  # told apart without colours, too
         colour = drawing.LINES[number % len(drawing.LINES)]
         axes.plot(time, size * column, color=colour, dashes=dashes or (None, None), label=name)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 1.5, 2, 3, 5, 6, 10]))
