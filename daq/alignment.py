@@ -21,7 +21,7 @@ import numpy as np
 
 from daq.clock_model import Clock, ClockState, from_instants, nominal
 from daq.errors import CannotAlignError
-from daq.resampling import SPAN, reach, resample
+from daq.resampling import SPAN, USABLE, reach, resample
 from daq.sensor_source import Learnt, SensorSource, main_columns
 
 if TYPE_CHECKING:
@@ -127,6 +127,12 @@ class AlignedRecording:
         return self._start is None or all(
             self._passes(source) and not source.offset_in_doubt for source in self._sources
         )
+
+    @property
+    def usable(self) -> float:
+        """Frequency in Hz up to which samples on the grid are what sensors read."""
+        untouched = self._start is None or all(map(self._passes, self._sources))
+        return (0.5 if untouched else USABLE) * self.sampling_rate
 
     def delays(self, at: FloatArray) -> FloatArray:
         """Return how far each sensor's count of time lags the grid, by the clocks as known now.

@@ -28,15 +28,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
+from daq.resampling import USABLE
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
     ComplexArray = NDArray[np.complex128]
-
-USABLE = 0.45
-"""Share of the sampling rate up to which the resampler is flat."""
 
 _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3

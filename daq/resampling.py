@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
+USABLE = 0.45
+"""Share of the lower rate up to which samples keep what they are."""
 HALF_WIDTH = 40
 """Samples the kernel reaches to either side, at the lower of the two rates."""
 SPAN = 896

@@ -10,11 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.clock_model import ClockState
-from daq.estimation import estimate
+from daq.estimation import Settings, estimate
 from daq.estimation.diagnosis import synchronisation
 from sim_devices.scenario import Scenario
 from tui.clock_study import Latency, free_running, residuals, study, synthesise
 from tui.command import app
+from tui.results import remarks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -135,3 +136,25 @@ def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> N
     alone, refined = rows["arrival times"], rows["refined"]
     assert np.all(refined.residual_us < alone.residual_us + 1.0)
     assert np.abs(refined.against_oracle).max() < np.abs(alone.against_oracle).max() + 1e-3
+
+
+def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
+    scenario = free_running(snr=1e4, duration=200.0, seed=1)
+    table = scenario.to_dict()
+    fourth = {"ppm": 7.0, "wander": 0.2, "offset": 0.011}
+    table["sensors"]["D"] = table["sensors"]["C"] | {"clock": fourth}  # so that there is a test
+    path = synthesise(
+        tmp_path / "r.h5", Scenario.from_dict(table, sampling_rate=200.0), duration=200.0
+    )
+    snapshot = estimate([path])
+    beyond = snapshot.frequency > 90.0  # 0.45 of 200 Hz
+    noise = snapshot.results["three-sensor"].noise_psd
+    assert np.isnan(noise[beyond]).all()
+    assert np.isfinite(noise[1:][~beyond[1:]]).all()
+    said = "\n".join(remarks(snapshot))
+    assert "above 90 Hz nothing can be said" in said
+    assert "not finite" not in said
+    highest = snapshot.diagnostics["bands"][-1]
+    assert highest.test.p_value > 1e-3
+    as_it_is = estimate([path], Settings(clocks="nominal"))  # nothing is resampled
+    assert np.isfinite(as_it_is.csm).all()

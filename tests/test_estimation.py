@@ -49,7 +49,9 @@ def huddle(
 
 def same(one: Snapshot, other: Snapshot) -> None:
     assert one.n_segments == other.n_segments
-    np.testing.assert_allclose(one.csm, other.csm, rtol=1e-9, atol=1e-9 * np.abs(one.csm).max())
+    np.testing.assert_allclose(
+        one.csm, other.csm, rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(one.csm))
+    )
     for method, result in one.results.items():
         np.testing.assert_allclose(
             result.noise_psd, other.results[method].noise_psd, rtol=1e-9, atol=0

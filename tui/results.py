@@ -132,6 +132,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
         worst = max(left[clock.sensor] for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
+    if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
+        lines.append(f"above {limit:.4g} Hz nothing can be said: samples have been resampled")
     lines += faulty_channels(snapshot)
     if "two-channel" in snapshot.results:
         lines.append(
@@ -189,6 +191,12 @@ def left_out(snapshot: Snapshot) -> str:
 _NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # with its advice, once for all methods
 
 
+def highest_known(snapshot: Snapshot) -> float:
+    """Return the frequency in Hz above which clocks that ran freely leave nothing to be said."""
+    known = np.isfinite(snapshot.csm).any(axis=(1, 2))
+    return float(snapshot.frequency[known].max(initial=0.0))
+
+
 def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
     """Return which channels have frequencies at which nothing can be said, and why.
 
@@ -203,7 +211,8 @@ def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
         Flag.NO_COUNTERPART: "the other sensors have too few channels to compare with",
         Flag.NOT_CONVERGED: "the iteration did not reach the maximum",
     }
-    flags = snapshot.results[method].flags[1:-1] & ~besides
+    flags = snapshot.results[method].flags[snapshot.frequency <= highest_known(snapshot)]
+    flags = flags[1:-1] & ~besides
     lines = []
     for flag, why in words.items():
         counts = ((flags & flag) != 0).sum(axis=0)

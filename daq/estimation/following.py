@@ -32,6 +32,7 @@ from daq.estimation.results import (
     known_gains,
     noise_estimates,
     time_left,
+    up_to,
 )
 from daq.estimation.segments import Pass
 from daq.estimation.settings import Settings
@@ -204,7 +205,10 @@ class Estimation:
     def _snapshot(self, *, final: bool) -> Snapshot:
         first, last = self._passes[0], self._passes[-1]
         dims, channels = first.aligned.dims, first.aligned.channels
-        bands = tuple(in_units(band, channels, self._unit) for band in averages(self._passes))
+        usable = min(each.aligned.usable for each in self._passes)
+        bands = tuple(
+            in_units(up_to(band, usable), channels, self._unit) for band in averages(self._passes)
+        )
         if bands:
             frequency = np.concatenate([band.frequencies for band in bands])
             csm = np.concatenate([band.csm for band in bands])

@@ -84,6 +84,16 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
     return (Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective),)
 
 
+def up_to(band: Band, usable: float) -> Band:
+    """Return averages of which nothing is known above `usable` Hz."""
+    beyond = band.frequencies > usable
+    if not beyond.any():
+        return band
+    csm = band.csm.copy()
+    csm[beyond] = np.nan
+    return replace(band, csm=csm)
+
+
 def in_units(band: Band, channels: Channels, unit: str) -> Band:
     """Return averages in ``unit**2/Hz``, the channels' responses taken out."""
     frequency = band.frequencies
