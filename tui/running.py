@@ -20,6 +20,7 @@ from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
 from tui.estimating import LIMIT_NOT_MET, check_gains, chosen, show_result
 from tui.output import for_people, notices
+from tui.patience import patience
 from tui.recorder_process import RecorderProcess
 from tui.reporting import checked, write_report
 from tui.results import reached_cov, result_arrays
@@ -81,27 +82,32 @@ def run_test(
         snapshot, interrupted = follow_to_end(
             recorder, settings, duration=duration, until_cov=until_cov
         )
-        met = show_result(
-            snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
-        )
-        try:
-            finish_recording(out, snapshot)
-        finally:
-            recorder.check()  # its trouble says more than what follows from it
+        with patience(spent=interrupted) as interruption:
+            met = show_result(
+                snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
+            )
+            try:
+                finish_recording(out, snapshot)
+            finally:
+                recorder.check()  # its trouble says more than what follows from it
+            if report is not None:
+                write_report(
+                    snapshot,
+                    report,
+                    recordings=[out],
+                    settings=settings,
+                    screen=for_people(json, csv),
+                )
     except BaseException:
         recorder.request_stop()
         raise
     finally:
         recorder.close()
-    if report is not None:
-        write_report(
-            snapshot, report, recordings=[out], settings=settings, screen=for_people(json, csv)
-        )
-    else:
+    if report is None:
         notices().print(
             f"[dim]for a report of it: huddle report {escape(str(out))}", soft_wrap=True
         )
-    if interrupted:
+    if interruption.pressed:
         raise typer.Exit(INTERRUPTED)
     if not met:
         raise typer.Exit(LIMIT_NOT_MET)
@@ -152,8 +158,10 @@ def follow_to_end(
                 heal(recorder.out)
             except HuddleError as error:  # a full disk; the file can be read all the same
                 notices().print(f"[red]{error}")
-    with Estimation([recorder.out], settings) as estimation:
-        return estimation.finish(), interrupted
+    with patience(spent=interrupted) as interruption:
+        with Estimation([recorder.out], settings) as estimation:
+            snapshot = estimation.finish()
+        return snapshot, interruption.pressed
 
 
 def finish_recording(path: Path, snapshot: Snapshot) -> None:
