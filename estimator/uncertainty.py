@@ -127,21 +127,49 @@ def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
     Returns
     -------
     SelfNoise
-        There with the c.o.v. and the width of the interval times the root of two: in the
-        logarithm where all of the interval is above zero, as of a chi-square.
+        There with the c.o.v. times the root of two and the interval for half as many averages:
+        in the logarithm where it is more symmetric there, as that of a chi-square.
 
     Notes
     -----
     A Fourier coefficient of a real series has no imaginary part at these frequencies. The
     small-sample bias is the same: a dimension of the motion takes one average of n in either case.
     """
-    root = np.sqrt(2)
-    noise, low, high = (values[real] for values in (found.noise_psd, found.low, found.high))
-    above = (low > 0) & (noise > 0)
-    below = np.where(above, low / np.where(above, noise, 1.0), 1.0)
-    beyond = np.where(above, high / np.where(above, noise, 1.0), 1.0)
-    cov, lows, highs = (values.copy() for values in (found.cov, found.low, found.high))
-    cov[real] *= root
-    lows[real] = np.where(above, noise * below**root, noise + root * (low - noise))
-    highs[real] = np.where(above, noise * beyond**root, noise + root * (high - noise))
-    return replace(found, cov=cov, low=lows, high=highs)
+    noise, cov, low, high = (
+        part[real] for part in (found.noise_psd, found.cov, found.low, found.high)
+    )
+    above = (low > 0) & (noise > 0) & np.isfinite(high)  # else there is no logarithm
+    unit, least, most = (np.where(above, part, 1.0) for part in (noise, low, high))
+    ends, logs = (noise - low, high - noise), (np.log(unit / least), np.log(most / unit))
+    in_log = above & (_skew(*logs) < _skew(*ends))
+    linear, log = _doubled(*ends, cov * np.abs(noise)), _doubled(*logs, cov)
+    lows, highs, covs = found.low.copy(), found.high.copy(), found.cov.copy()
+    down, up = (np.exp(np.where(in_log, reach, 0.0)) for reach in log)
+    lows[real] = np.where(in_log, noise / down, noise - linear[0])
+    highs[real] = np.where(in_log, noise * up, noise + linear[1])
+    covs[real] *= np.sqrt(2)
+    return replace(found, cov=covs, low=lows, high=highs)
+
+
+def _skew(down: FloatArray, up: FloatArray) -> FloatArray:
+    total = np.where(np.isfinite(up), up + down, 0.0)
+    unequal = np.where(total > 0, up, 0.0) - np.where(total > 0, down, 0.0)
+    return np.asarray(np.abs(unequal) / np.where(total > 0, total, 1.0))
+
+
+def _doubled(
+    down: FloatArray, up: FloatArray, deviation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Reach of an interval both ways for half the averages.
+
+    In 1.96 deviations grow with the root of two; what is added to them, and skewness, with two.
+    """
+    known = np.isfinite(up) & np.isfinite(deviation) & (deviation > 0)
+    reach = np.where(known, up, 0.0)
+    skew = np.where(known, reach - down, 0.0)
+    normal = np.sqrt(2) * Z95 * np.where(known, deviation, 0.0)
+    half = np.maximum(np.sqrt(2) * (reach + down) - normal, normal)  # 1 + 2 e for 1 + e
+    return (
+        np.where(known, half - skew, np.sqrt(2) * down),
+        np.where(known, half + skew, np.sqrt(2) * up),
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from estimator.methods import self_noise
+from estimator.methods import METHODS, self_noise
 from estimator.spectra import WelchSettings
 from estimator.uncertainty import score_interval
 from tests.estimator.models import common_motion
@@ -39,7 +39,7 @@ def test_too_few_averages_leave_it_open_above(averages: float) -> None:
     assert np.isinf(high[0])
 
 
-@pytest.mark.parametrize("method", ["three-channel", "three-sensor", "maximum-likelihood"])
+@pytest.mark.parametrize("method", METHODS)
 def test_where_spectra_are_real_they_scatter_twice_as_much(method: str) -> None:
     """Averages of squares of real amplitudes, as at 0 Hz and the Nyquist frequency."""
     n, n_draws = 100, 3000
@@ -51,10 +51,13 @@ def test_where_spectra_are_real_they_scatter_twice_as_much(method: str) -> None:
     found = self_noise(method, sample, dims=(2, 2, 2), n_effective=n, real=real)
     scatter = found.noise_psd.std(axis=0)
     # a deviation of 3000 draws has 1.5 % standard error
-    np.testing.assert_allclose(np.nanmedian(found.cov[real], axis=0), scatter, rtol=0.06)
-    np.testing.assert_allclose(np.nanmedian(found.cov[~real], axis=0), scatter / 2**0.5, rtol=0.06)
+    deviation = found.cov * np.abs(found.noise_psd)
+    np.testing.assert_allclose(np.nanmedian(deviation[real], axis=0), scatter, rtol=0.06)
+    np.testing.assert_allclose(np.nanmedian(deviation[~real], axis=0), scatter / 2**0.5, rtol=0.06)
     covers = (found.low < 1) & (found.high > 1)
     assert 0.93 < covers[real].mean() < 0.97
+    assert (found.low[real] >= 1).mean() < 0.035
+    assert (found.high[real] <= 1).mean() < 0.035
     assert covers[~real].mean() < 0.90
     error = scatter / np.sqrt(n_draws)
     assert np.all(np.abs(found.noise_psd.mean(axis=0) - 1) < 4 * error)
@@ -69,7 +72,12 @@ def test_a_real_spectrum_widens_an_interval_that_reaches_below_zero_too() -> Non
     )
     wide, usual = (found.noise_psd[row, 0] - found.low[row, 0] for row in (0, 1))
     assert found.low[1, 0] < 0
-    assert wide == pytest.approx(np.sqrt(2) * usual)
+    assert np.sqrt(2) * usual < wide < 2 * usual
+    open_above = self_noise(
+        "three-channel", csm, dims=(1, 1, 1), n_effective=1.5, real=np.array([True, False])
+    )
+    assert np.all(np.isinf(open_above.high))
+    assert np.all(open_above.low < open_above.noise_psd)
 
 
 @pytest.mark.parametrize(("length", "n_real"), [(64, 2), (63, 1), (1999, 1), (2000, 2)])
