@@ -155,6 +155,9 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     assert "above 90 Hz nothing can be said" in said
     assert "not finite" not in said
     highest = snapshot.diagnostics["bands"][-1]
+    assert highest.high == pytest.approx(90.0)
     assert highest.test.p_value > 1e-3
+    assert len(snapshot.diagnostics["per_frequency"]["p_value"]) == len(snapshot.frequency)
+    assert "singular" not in said
     as_it_is = estimate([path], Settings(clocks="nominal"))  # nothing is resampled
     assert np.isfinite(as_it_is.csm).all()

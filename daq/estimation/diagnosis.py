@@ -108,12 +108,13 @@ def diagnosis(
     }
     vertical = verticals.pop() if len(verticals) == 1 else None
     found: list[Diagnostics] = []
+    known = [_n_known(band) for band in bands]
     with np.errstate(invalid="ignore", divide="ignore"):
-        for band in bands:
+        for band, count in zip(bands, known, strict=True):
             try:
                 diagnostics = diagnose(
-                    band.csm,
-                    band.frequencies,
+                    band.csm[:count],
+                    band.frequencies[:count],
                     dims=dims,
                     n_effective=band.n_effective,
                     neighbours=neighbours(band),
@@ -141,11 +142,11 @@ def diagnosis(
         "pairs": tuple((sensors[j], sensors[k]) for j, k in found[0].pairs),
         "per_frequency": {
             **{
-                name: np.concatenate([getattr(each, name) for each in found])
+                name: _over(bands, [getattr(each, name) for each in found])
                 for name in ("coherence", "condition", "dimension", "snr")
             },
             **{
-                name: np.concatenate([getattr(each.model, name) for each in found])
+                name: _over(bands, [getattr(each.model, name) for each in found])
                 for name in ("statistic", "degrees", "p_value")
             },
         },
@@ -158,3 +159,18 @@ def _is_explained(advice: Advice, labels: Sequence[str], faulty: Collection[str]
         return False
     concerned = {labels[int(advice.numbers[key])] for key in ("of channel", "against channel")}
     return not concerned.isdisjoint(faulty)
+
+
+def _n_known(band: Band) -> int:
+    """Return how many frequencies there are up to the last of which something is known."""
+    known = np.flatnonzero(np.isfinite(band.csm).any(axis=(1, 2)))
+    return int(known[-1]) + 1 if known.size else len(band.frequencies)
+
+
+def _over(bands: Sequence[Band], parts: Sequence[FloatArray]) -> FloatArray:
+    """Return parts one after the other, each NaN beyond what is known of its band."""
+    whole = []
+    for band, part in zip(bands, parts, strict=True):
+        shape = (len(band.frequencies) - len(part), *part.shape[1:])
+        whole += [part, np.full(shape, np.nan)]
+    return np.concatenate(whole)
