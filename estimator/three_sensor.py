@@ -88,8 +88,11 @@ def estimate(
         given.block(slice(low, low + FREQUENCIES)) for low in range(0, len(given.psd), FREQUENCIES)
     ]
     of_block = functools.partial(_estimate, dims=dims, n_effective=n_effective, correct=correct)
-    with ThreadPoolExecutor(min(THREADS, len(blocks))) as pool:
-        found = list(pool.map(of_block, blocks))
+    if len(blocks) == 1:
+        found = [of_block(given)]
+    else:
+        with ThreadPoolExecutor(min(THREADS, len(blocks))) as pool:
+            found = list(pool.map(of_block, blocks))
     noise, deviation, low, high, flags = (
         np.concatenate(parts) for parts in zip(*found, strict=True)
     )

@@ -366,3 +366,23 @@ def test_what_makes_no_sense_is_refused(method: str) -> None:
 def test_an_unknown_method_is_named_with_those_there_are() -> None:
     with pytest.raises(UnknownMethodError, match=r"'magic'.*three-sensor"):
         self_noise("magic", spoilt("nan"), dims=(3, 3, 3), n_effective=60)
+
+
+def test_blocks_on_two_threads_give_what_one_block_gives() -> None:
+    """The same bits each time, no warning, and an error comes through from a block's thread."""
+    dims = (3,) * 4
+    csm = wishart(bench(dims, 10)[0], 40, np.random.default_rng(6), n_draws=300)
+    csm[[3, 299]] = np.nan
+    csm[140, 2] = csm[140, :, 2] = 0  # dead
+    csm[150] = 1  # every channel the same
+    csm[160, 0:3, 3:6] = csm[160, 3:6, 0:3] = 0  # singular
+    csm[170] *= 1e-280
+    together, again = (three_sensor(csm, dims=dims, n_effective=40) for _ in range(2))
+    for first in range(0, 300, 100):
+        alone = three_sensor(csm[first : first + 100], dims=dims, n_effective=40)
+        for name in ("noise_psd", "cov", "low", "high", "flags"):
+            part = getattr(together, name)[first : first + 100]
+            np.testing.assert_allclose(getattr(alone, name), part, rtol=1e-9)
+            np.testing.assert_array_equal(getattr(again, name), getattr(together, name))
+    with pytest.raises(InsufficientDataError, match="averages"):
+        three_sensor(csm, dims=dims, n_effective=3)
