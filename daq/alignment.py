@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.clock_model import Clock, ClockState, from_instants, nominal
+from daq.clock_model import ClockState, nominal
 from daq.errors import CannotAlignError
 from daq.resampling import SPAN, USABLE, reach, resample
 from daq.sensor_source import Learnt, SensorSource, main_columns
@@ -226,7 +226,7 @@ class AlignedRecording:
             first = first_of.setdefault(source.clock_name, source)
             measured = None if source is reference else source.measured(reference.known_clock)
             if source.polled:
-                source.clock = self._polled(source)
+                source.clock = source.by_instants()
             elif first is not source and not source.device_utc:
                 source.share(first, measured)
             elif together:
@@ -347,15 +347,6 @@ class AlignedRecording:
             if source.device_utc:
                 return number
         return 0
-
-    def _polled(self, source: SensorSource) -> Clock:
-        instants = source.record.instants_ns(0, source.runs[-1].last_row)
-        return from_instants(
-            source.record.name,
-            np.asarray((instants - self._origin[0]) * 1e-9, dtype=np.float64),
-            sampling_rate=source.record.sampling_rate,
-            runs=[(run.first_sample, run.first_row, run.n_samples) for run in source.runs],
-        )
 
     def _set_start(self) -> None:
         start_utc_ns, end_utc_ns = self._wanted

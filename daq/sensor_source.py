@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.arrival_times import ArrivalTimes, MeasuredDelays
+from daq.clock_model import from_instants
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 
@@ -138,6 +139,17 @@ class SensorSource:
         if self.clock is None:
             raise CannotAlignError(f"sensor {self.record.name!r}: no block recorded yet")
         return self.clock
+
+    def by_instants(self) -> Clock:
+        """Return the clock of a polled sensor: every sample has its instant."""
+        instants_ns = self.record.instants_ns(0, self.runs[-1].last_row)
+        elapsed_ns = instants_ns - self.arrivals.origin_monotonic_ns
+        return from_instants(
+            self.record.name,
+            np.asarray(elapsed_ns * 1e-9, dtype=np.float64),
+            sampling_rate=self.record.sampling_rate,
+            runs=[(run.first_sample, run.first_row, run.n_samples) for run in self.runs],
+        )
 
     def measured(self, reference: Clock) -> MeasuredDelays | None:
         """Return when samples were taken, from the delays learnt against the reference."""
