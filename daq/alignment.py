@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 _GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
+_FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
+_ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
 _SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
 
 
@@ -255,7 +257,10 @@ class AlignedRecording:
             source.refresh()
         n_samples = sum(source.end_sample for source in self._sources)
         n_runs = sum(len(source.runs) for source in self._sources)
-        if n_runs > self._set_at[1] or n_samples > (1 + _GROWTH) * self._set_at[0]:
+        before, runs_before = self._set_at
+        enough = _ENOUGH * sum(source.record.sampling_rate for source in self._sources)
+        growth = max(_GROWTH * before, min(_FIRST_GROWTH * before, enough))
+        if n_runs > runs_before or n_samples > before + growth:
             self._set_at = (n_samples, n_runs)
             self.set_clocks()
         else:
