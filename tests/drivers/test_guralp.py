@@ -170,9 +170,11 @@ async def unreliable(target: int, n_refused: int) -> AsyncIterator[int]:
 async def test_recovery_that_failed_is_tried_again() -> None:
     """Packets are lost every second; the server's TCP port lets nobody in at first."""
     drops = [{"kind": "drop", "at": 5.5, "every": 0.9}]
-    with launch.start(spec(TABLES[3], speed=SPEED) | {"faults": drops}) as (one,):
+    streams = {"streams": ["D000Z2", "D000N2", "D000E2"]}  # known: one link from the beginning
+    served = table("D", port="udp", settings=streams)
+    with launch.start(spec(served, speed=SPEED) | {"faults": drops}) as (one,):
         async with unreliable(one.settings["recovery_port"], 2) as port:
-            (chosen,) = sensors(one, TABLES[3], settings={"recovery_port": port})
+            (chosen,) = sensors(one, served, settings={**streams, "recovery_port": port})
             blocks: list[Block] = []
             said: list[str] = []
             async with (
