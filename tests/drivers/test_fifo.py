@@ -106,7 +106,8 @@ async def test_an_overflow_is_told_and_the_gap_estimated(
     assert gap.reason == "FIFO full"
     assert gap.flags == BlockFlag.MISSING_ESTIMATED
     assert gap.first_sample - before.end_sample > 300
-    # by the host, all samples of the time are there or missing, to what the host may be late by
+    # by the host, all samples of the time are there or missing, to what the host may be late by:
+    # without the gap 600 would be missing
     elapsed = (blocks[-1].received.monotonic_ns - blocks[0].received.monotonic_ns) * 1e-9 * RATE
     assert blocks[-1].end_sample - blocks[0].end_sample == pytest.approx(elapsed, abs=500)
 
