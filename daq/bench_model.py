@@ -202,10 +202,6 @@ class Sensor(Table):
     clock: Name | None = None
     """Sensors of one clock name are sampled by one clock."""
 
-    def parsed_settings(self, driver: DriverType) -> BaseModel:
-        """Return the driver's own settings."""
-        return driver.settings.model_validate(self.settings)
-
     def clock_name(self, driver: DriverType) -> str:
         """Return the name of the clock that samples this sensor."""
         return self.clock or (self.port if driver.shares_clock else self.name)

@@ -148,7 +148,8 @@ def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:
         return "?"
     rate = sensor.sampling_rate * (1 + clock.ppm * 1e-6)
     error = sensor.sampling_rate * clock.ppm_std * 1e-6
-    return f"{rate:.6f} ±{error:.6f}" if clock.ppm_std > 0 else f"{rate:.6f}"
+    # rounded up: nothing is certain to the last digit
+    return f"{rate:.6f} ±{max(error, 1e-6):.6f}" if clock.ppm_std > 0 else f"{rate:.6f}"
 
 
 def _channel_rows(sensor: RecordedSensor) -> list[tuple[str, ...]]:

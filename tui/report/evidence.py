@@ -294,7 +294,7 @@ def _clock_row(clock: ClockState, effect: float, snapshot: Snapshot) -> tuple[st
         + (f", {several(clock.n_epochs - 1, 'restart')}" if clock.n_epochs > 1 else ""),
         plain_number(clock.offset * 1e3, ".3f"),
         plain_number(clock.ppm, "+.3f"),
-        plain_number(clock.ppm_std, ".3f"),
+        f"{clock.ppm_std:.2g}",
         scientific(clock.wander_ppm, 2),
         plain_number(clock.residual * 1e6, ".2f"),
         refined,
