@@ -224,7 +224,7 @@ class AlignedRecording:
         together = together and len({source.record.sampling_rate for source in sources}) == 1
         reference = sources[self._reference]
         first_of: dict[str, SensorSource] = {}
-        for source in [reference, *sources]:
+        for source in [reference, *(each for each in sources if each is not reference)]:
             first = first_of.setdefault(source.clock_name, source)
             measured = None if source is reference else source.measured(reference.known_clock)
             if source.polled:
@@ -242,7 +242,10 @@ class AlignedRecording:
                     ppm_std=ppm_std,
                 )
             else:
-                source.clock = source.arrivals.solve(source.record.name, measured)
+                clock = source.arrivals.solve(source.record.name, measured)
+                if clock.state.refined:  # against the reference, whose rate is not certain either
+                    clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
+                source.clock = clock
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""

@@ -122,6 +122,11 @@ class Clock:
         """Time of the last sample."""
         return self.epochs[-1].end
 
+    def rate_known_to(self, ppm_std: float) -> Clock:
+        """Return the same clock, its rate no better known than to this besides, in ppm."""
+        total = float(np.hypot(self.state.ppm_std, ppm_std))
+        return replace(self, state=replace(self.state, ppm_std=total))
+
     def at(self, index: FloatArray) -> FloatArray:
         """Return the time in seconds of (fractional) sample indices."""
         starts = [epoch.first_sample for epoch in self.epochs[1:]]

@@ -52,6 +52,17 @@ def test_the_command_takes_samples_at_face_value_only_if_told(tmp_path: Path) ->
     assert np.abs(drift[0] - [0.0, 6.42, 11.46]).max() < 1.0  # 32.1 and 57.3 ms, and latency
 
 
+def test_a_refined_rate_is_known_no_better_than_the_reference(tmp_path: Path) -> None:
+    """The motion tells rates against each other; against the host's clock, arrivals do."""
+    scenario = free_running(snr=1e4, duration=300.0, seed=6)
+    path = synthesise(tmp_path / "r.h5", scenario, duration=300.0)
+    states = estimate([path], Settings()).clocks
+    least = min(state.ppm_std for state in states if not state.refined)
+    assert sum(state.refined for state in states) == 2
+    for state in states:
+        assert state.ppm_std >= least > 0
+
+
 def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> None:
     scenario = free_running(snr=1e4, duration=400.0, seed=5)
     path = synthesise(tmp_path / "r.h5", scenario, duration=400.0)
