@@ -152,7 +152,6 @@ class PseudoTerminal:
     def hang_up(self) -> None:
         """Pull the cable of a USB adapter: the port goes away."""
         self._destroy()
-        Path(self.address).unlink()
 
     def restore(self) -> None:
         """Plug it in again: whoever had the port open must open it anew."""
@@ -165,6 +164,9 @@ class PseudoTerminal:
             self._look.cancel()
         if self._open:
             self._nobody()
+        # First: the system gives the terminal's number to the next one that is made anywhere, and
+        # the address would lead whoever tries it again to a device of somebody else's.
+        Path(self.address).unlink()
         os.close(self._master)
         self._master = -1
 

@@ -176,11 +176,11 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
             record(bench, tmp_path / "r.h5", clock=clock, stop=stop, acknowledged=news.put_nowait)
         )
         before = (await until(1000, "recording")).sensors["A"].samples
+        link.unlink()  # else it leads to the next terminal made here, of whatever test runs now
         first.process.send_signal(signal.SIGKILL)
         await until(before, "lost")
         lost_for = clock.now().monotonic_ns
         async with started(only_a) as (again,):
-            link.unlink()
             link.symlink_to(again.port)
             await until(before + 1000, "recording")
             lost_for = clock.now().monotonic_ns - lost_for
