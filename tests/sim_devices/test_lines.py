@@ -29,7 +29,7 @@ async def test_the_address_goes_before_the_terminal(monkeypatch: pytest.MonkeyPa
     """The number of a closed terminal is given to the next one made, by whatever process."""
     line = PseudoTerminal(Deaf())
     await line.open()
-    assert os.path.lexists(line.address)
+    assert os.path.lexists(line.address)  # noqa: ASYNC240 - at once, by intent
     there: list[bool] = []
     close = os.close
 
@@ -42,7 +42,7 @@ async def test_the_address_goes_before_the_terminal(monkeypatch: pytest.MonkeyPa
         line.hang_up()
     assert there == [False]  # the terminal's own end, and nothing before it
     line.restore()
-    assert os.path.lexists(line.address)
+    assert os.path.lexists(line.address)  # noqa: ASYNC240 - at once, by intent
     with monkeypatch.context() as patched:
         patched.setattr("sim_devices.lines.os.close", watched)
         await line.close()
