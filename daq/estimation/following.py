@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daq.recording.reader import SensorRecord
     from estimator.multiresolution import Band
 
 Progress = Callable[[int, int], None]
@@ -257,12 +256,12 @@ class Estimation:
                 taken=n_segments * first.welch.hop / first.welch.sampling_rate,
             ),
             start_utc_ns=first.aligned.start_utc_ns,
-            sensors=tuple(_sensor_state(record) for record in self._recordings[-1].sensors),
+            sensors=tuple(SensorState.of(record) for record in self._recordings[-1].sensors),
             clocks=last.aligned.clocks,
             drift=last.drift(),
             closed=all(recording.closed for recording in self._recordings),
             left_out=self._left_out(),
-            octaves=tuple(_octave(band) for band in bands) if self.settings.octaves else (),
+            octaves=tuple(map(Octave.of, bands)) if self.settings.octaves else (),
             diagnostics=diagnostics,
         )
 
@@ -399,26 +398,3 @@ def _labels(each: Pass) -> list[tuple[str, str, str]]:
 def _described(each: Pass) -> str:
     names = ", ".join(f"{sensor} {channel} in {unit}" for sensor, channel, unit in _labels(each))
     return f"{names} at {each.welch.sampling_rate:g} Hz"
-
-
-def _octave(band: Band) -> Octave:
-    return Octave(
-        low=float(band.frequencies[0]),
-        high=float(band.frequencies[-1]),
-        segment=band.settings.segment_length / band.settings.sampling_rate,
-        n_segments=band.n_segments,
-        n_effective=band.n_effective,
-        left_out={reason.value: count for reason, count in band.left_out.items()},
-    )
-
-
-def _sensor_state(record: SensorRecord) -> SensorState:
-    blocks = record.blocks
-    return SensorState(
-        name=record.name,
-        sampling_rate=record.sampling_rate,
-        n_samples=record.n_samples,
-        n_gaps=len(record.gaps),
-        n_missing=int(record.gaps["missing"].sum()),
-        last_seen=float(blocks["utc_ns"][-1]) * 1e-9 if len(blocks) else float("nan"),
-    )

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.clock_model import ClockState
+    from daq.recording.reader import SensorRecord
+    from estimator.multiresolution import Band
     from estimator.self_noise import SelfNoise
 
     FloatArray = NDArray[np.float64]
@@ -38,6 +40,19 @@ class SensorState:
     last_seen: float
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
+    @classmethod
+    def of(cls, record: SensorRecord) -> SensorState:
+        """Return the state of a sensor of a recording."""
+        blocks = record.blocks
+        return cls(
+            name=record.name,
+            sampling_rate=record.sampling_rate,
+            n_samples=record.n_samples,
+            n_gaps=len(record.gaps),
+            n_missing=int(record.gaps["missing"].sum()),
+            last_seen=float(blocks["utc_ns"][-1]) * 1e-9 if len(blocks) else float("nan"),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Octave:
@@ -51,6 +66,18 @@ class Octave:
     n_effective: float
     left_out: dict[str, int] = field(default_factory=dict)
     """Its segments that do not count: "gap" (or clipped), and "transient"."""
+
+    @classmethod
+    def of(cls, band: Band) -> Octave:
+        """Return what the frequencies of a band rest on."""
+        return cls(
+            low=float(band.frequencies[0]),
+            high=float(band.frequencies[-1]),
+            segment=band.settings.segment_length / band.settings.sampling_rate,
+            n_segments=band.n_segments,
+            n_effective=band.n_effective,
+            left_out={reason.value: count for reason, count in band.left_out.items()},
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
