@@ -51,7 +51,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Wait for a command; return exit code, standard output and standard error."""
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=110)
     return process.returncode, out, err
 
 

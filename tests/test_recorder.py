@@ -173,7 +173,7 @@ async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(
 ) -> None:
     monkeypatch.setattr("daq.overdue.LATENESS", 5.0)  # however busy the machine is
     run = Run(tmp_path / "r.h5", "a")
-    async with asyncio.timeout(10), run.going():
+    async with asyncio.timeout(60), run.going():
         run.send("a", 0, 50)
         run.send("a", 50, 50)
         await run.until("a", 100, "late")
@@ -245,7 +245,7 @@ async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
     monkeypatch.setattr("daq.session.LEAVE_TIMEOUT", 0.2)
     run = Run(tmp_path / "r.h5", "a", "b")
     run.device("a").hangs = True
-    async with asyncio.timeout(10), run.going():
+    async with asyncio.timeout(60), run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
     assert run.statuses[-1].closed
@@ -263,7 +263,7 @@ async def test_a_driver_that_cannot_be_ended_is_left_alone(
     monkeypatch.setattr("daq.recorder.CANCEL_TIMEOUT", 0.5)
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").may_end = may_end = asyncio.Event()
-    async with asyncio.timeout(10), run.going():
+    async with asyncio.timeout(60), run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
     assert run.statuses[-1].closed
@@ -280,7 +280,7 @@ async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
     tmp_path: Path,
 ) -> None:
     run = Run(tmp_path / "r.h5", "a")
-    async with asyncio.timeout(5), run.going():
+    async with asyncio.timeout(60), run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
         address = control_address(run.path)

@@ -159,4 +159,4 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
             assert "late" in states[: states.index("lost") - 1]
         before = sensor.blocks[sensor.blocks["first_sample"] < stalled["first_sample"]][-1]
         noticed = (by_kind["late"].received.monotonic_ns - before["monotonic_ns"]) / 1e9
-        assert 2 * PERIOD - 0.01 < noticed < 2 * PERIOD + 0.3 * speed
+        assert 2 * PERIOD - 0.01 < noticed < 2 * PERIOD + 1.0 * speed  # a busy machine's second

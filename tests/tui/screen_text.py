@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from textual.app import App
+    from textual.pilot import Pilot
 
 FOLDER = Path(__file__).parent / "pictures"
 _TEXT = re.compile(
     r'<text class="[^"]*-r\d+" x="([\d.]+)" y="[\d.]+" textLength="[\d.]+" '
     r'clip-path="url\(#[^"]*-line-(\d+)\)">(.*?)</text>'
 )
+TURNS = 20
 _CELL = 12.2  # width of a character in the picture
 
 
@@ -28,10 +30,18 @@ def screen_text(app: App[None]) -> str:
     return "\n".join(lines.get(n, "").rstrip() for n in range(max(lines, default=-1) + 1)) + "\n"
 
 
-def assert_looks_as_before(app: App[None], name: str) -> None:
-    """Compare the screen with the picture kept of it; HUDDLE_NEW_PICTURES=1 keeps a new one."""
-    text, kept = screen_text(app), FOLDER / f"{name}.txt"
+async def assert_looks_as_before(pilot: Pilot[None], name: str) -> None:
+    """Compare the screen with the picture kept of it; HUDDLE_NEW_PICTURES=1 keeps a new one.
+
+    On a busy machine a layout may still be on its way: the screen has some turns to come to rest.
+    """
+    kept = FOLDER / f"{name}.txt"
     if os.environ.get("HUDDLE_NEW_PICTURES"):
         FOLDER.mkdir(exist_ok=True)
-        kept.write_text(text, encoding="utf-8")
-    assert text == kept.read_text(encoding="utf-8")
+        kept.write_text(screen_text(pilot.app), encoding="utf-8")
+    expected = kept.read_text(encoding="utf-8")
+    for _ in range(TURNS):
+        if screen_text(pilot.app) == expected:
+            return
+        await pilot.pause()
+    assert screen_text(pilot.app) == expected
