@@ -12,8 +12,10 @@ There is neither counter nor time: samples are numbered as they come, and their 
 of a read that left less than one more in the FIFO. What waits when sampling starts is stale and
 thrown away. A level at the FIFO's capacity means that the device has dropped samples; that it drops
 the newest, not the oldest, is assumed: the gap is put behind what waits then, its length estimated
-from host time. A reply that does not arrive may have taken N words with it: whether it did, the
-next level tells, since the device makes samples at a known rate meanwhile.
+from host time. Fewer words than are known to wait tell that the device was restarted (with
+``"size"``; with ``"left"`` it is not noticed). A reply that does not arrive may have taken N words
+with it: whether it did, the next level tells, since the device makes samples at a known rate
+meanwhile.
 """
 
 from __future__ import annotations
@@ -138,9 +140,26 @@ class FifoDecoder:
             index, since = self._caught_up
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
+        words = registers[1:].view(np.int16)
+        if level < self._asked:  # the rest of what came is nothing
+            words = words[: level // self._n_channels * self._n_channels]
+            found += self._emptied(level, at)
         self.level = max(0, level - self._asked)
         self._last = at
-        found += self._take(registers[1:].view(np.int16), at)
+        found += self._take(words, at)
+        return found
+
+    def _emptied(self, level: int, at: HostTime) -> list[Block | Event]:
+        """Note that fewer words wait than were known to: the device was restarted."""
+        if not self._started:
+            return []
+        text = f"{level} words wait where {self._asked} did: the device was restarted"
+        found = [*self._hand_over(at), Event(self._sensor, "reset", text, at)]
+        index, since = self._caught_up
+        index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
+        self._full.clear()
+        self._skip_to(max(self._next, index - level // self._n_channels), "FIFO emptied")
+        self._flags |= BlockFlag.CLOCK_RESTART
         return found
 
     def _take(self, words: NDArray[np.int16], at: HostTime) -> list[Block | Event]:

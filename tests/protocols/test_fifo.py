@@ -146,6 +146,7 @@ class Device:
         self.waiting = [-1] * (3 * stale)
         self.made = 0
         self.dropped = 0
+        self.emptied = False
 
     def advance(self, n: int) -> None:
         """Make samples, and drop those for which there is no room."""
@@ -164,7 +165,8 @@ class Device:
         assert read.value <= 1 + MAX_WORDS
         assert (read.value - 1) % 3 == 0
         size, n_words = len(self.waiting), read.value - 1
-        assert n_words <= size
+        assert n_words <= size or self.emptied
+        self.waiting += [0] * (n_words - size)
         words, self.waiting = self.waiting[:n_words], self.waiting[n_words:]
         head = size if self.header == "size" else len(self.waiting)
         registers = np.array([head, *words]).astype(np.int64).astype(np.uint16)
@@ -276,6 +278,31 @@ def test_a_fifo_that_stays_full_loses_a_little_each_time(header: Header) -> None
     assert sum(isinstance(b, Block) and b.reason == "FIFO full" for b in found) > 50
     late = np.array(index) - made
     assert np.ptp(late[made > made[-1] - 5000]) <= 100
+
+
+def test_a_fifo_that_was_emptied_gives_no_samples_that_were_none() -> None:
+    """After a power failure it holds less than was asked for, and fills up with zeros."""
+    device, decoder = Device("size"), FifoDecoder("A", 8000.0)
+    found = run(device, decoder, 50)
+    device.waiting, device.emptied = [], True
+    device.advance(4)
+    found += decoder.receive(device.answer(decoder.request()), at(0.0505))
+    device.emptied = False
+    for i in range(51, 100):
+        device.advance(8)
+        found += decoder.receive(device.answer(decoder.request()), at(i * 1e-3))
+    index, counts = numbered(found)
+    made = counts[:, 0].astype(int)
+    emptied = next(b for b in found if isinstance(b, Block) and b.reason)
+    assert emptied.reason == "FIFO emptied"
+    assert emptied.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    assert (np.diff(made) > 0).all(), "no zeros"
+    assert np.ptp(made - index) <= 16, "placed by host time"
+    (event,) = (item for item in found if isinstance(item, Event))
+    assert (event.kind, event.text) == (
+        "reset",
+        "12 words wait where 24 did: the device was restarted",
+    )
 
 
 def test_refusals_are_told() -> None:
