@@ -18,7 +18,9 @@ with the stream ID of the last block that was received, then sends the next fram
 
 :class:`Receiver` finds frames in any bytes. A frame with a bad checksum, or a jump of the sequence
 number, is answered by a refusal of the first number that is missing, at most ``ATTEMPTS`` times.
-While one is awaited, ``awaiting`` is true and later blocks are best held back.
+While one is awaited, ``awaiting`` is true and later blocks are best held back. A number that was
+due before, with a block later than all others (by the date in its header), is of a digitizer that
+was restarted and numbers anew.
 """
 
 from __future__ import annotations
@@ -56,6 +58,11 @@ class Frame:
         """The four bytes of the stream ID, as they stand in the block."""
         return self.block[4:8]
 
+    @property
+    def date(self) -> int:
+        """When the block starts, as a number that grows, whole seconds."""
+        return int.from_bytes(self.block[8:12], "big")
+
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
@@ -79,6 +86,14 @@ class Lost:
 
     sequence: int
     n_frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Anew:
+    """The digitizer numbers its frames anew: ``sequence`` came where ``due`` was due."""
+
+    sequence: int
+    due: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +200,7 @@ class Receiver:
         self._missing: deque[int] = deque()  # in the order they were sent
         self._attempts = 0
         self._raw_stream_id: bytes | None = None
+        self._latest = 0  # date of a block
         self._to_send = bytearray()
 
     @property
@@ -192,9 +208,11 @@ class Receiver:
         """Whether frames that were refused may still come."""
         return bool(self._missing)
 
-    def receive(self, data: bytes) -> Iterator[Frame | Damaged | Skipped | Lost]:
+    def receive(self, data: bytes) -> Iterator[Frame | Damaged | Skipped | Lost | Anew]:
         """Yield what ``data`` completes. Frames sent twice are yielded twice."""
         for found in self._scanner.receive(data):
+            if isinstance(found, Frame):
+                yield from self._numbered_anew(found)
             yield found
             if isinstance(found, Frame):
                 self._raw_stream_id = found.raw_stream_id
@@ -207,6 +225,15 @@ class Receiver:
         to_send = bytes(self._to_send)
         self._to_send.clear()
         return to_send if self._replies else b""
+
+    def _numbered_anew(self, frame: Frame) -> Iterator[Anew]:
+        due = frame.sequence if self._next is None else self._next
+        repeated = (frame.sequence - due) % 256 >= 128 and frame.sequence not in self._missing
+        if repeated and frame.date > self._latest:
+            yield Anew(frame.sequence, due)
+            self._missing.clear()
+            self._next = None
+        self._latest = max(self._latest, frame.date)
 
     def _sequence(self, sequence: int) -> Iterator[Lost]:
         due = sequence if self._next is None else self._next

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.brp import MAX_SIZE, Damaged, Frame, Lost, Receiver, Skipped
+from daq.protocols.brp import MAX_SIZE, Anew, Damaged, Frame, Lost, Receiver, Skipped
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.gcf import SampleBlock, StatusBlock, decode_block
 from daq.protocols.scream import (
@@ -304,6 +304,10 @@ class SerialDecoder:
                     text = f"{n_frames} blocks from number {sequence} did not come again"
                     found.append(Event(self._name, "resynchronised", text, at))
                     self.streams.lost("lost block")
+                case Anew(sequence, due):
+                    text = f"the digitizer numbers anew: block {sequence} came, {due} was due"
+                    found.append(Event(self._name, "reset", text, at))
+                    self.streams.lost("digitizer restarted")
                 case Skipped(n_bytes, start):
                     found.append(Event(self._name, "status", _told(n_bytes, start), at))
         return found
@@ -334,7 +338,8 @@ class ScreamDecoder:
     """GCF from a Scream server: ``receive`` for TCP, ``receive_datagram`` for UDP.
 
     Packets that were overtaken on the way, or are asked for again by number (``missing``), are put
-    in their place if they come before ``PATIENCE`` others.
+    in their place if they come before ``PATIENCE`` others. A number that was due before, with a
+    block later than all others, is of a server that was restarted.
     """
 
     PATIENCE = 32
@@ -344,6 +349,7 @@ class ScreamDecoder:
         self._name = _only(sensors)
         self._finder = PacketFinder()
         self._next: int | None = None
+        self._latest_ns = 0  # start of a block
         self._missing: dict[int, int] = {}  # sequence number: how many came since
 
     @property
@@ -381,7 +387,10 @@ class ScreamDecoder:
         sequence = packet.sequence
         due = sequence if self._next is None else self._next
         ahead = (sequence - due) % 65536
-        if min(ahead, 65536 - ahead) > MOST_PACKETS:
+        start_ns = packet.block.start_ns
+        known = sequence in self._missing or start_ns <= self._latest_ns
+        self._latest_ns = max(self._latest_ns, start_ns)
+        if min(ahead, 65536 - ahead) > MOST_PACKETS or (ahead >= 32768 and not known):
             self._missing.clear()
             self._next = (sequence + 1) % 65536
             self.streams.lost("server restarted")

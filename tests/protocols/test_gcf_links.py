@@ -145,6 +145,31 @@ def test_lost_blocks_are_recovered(how: str) -> None:
     assert not any(b.reason for b in blocks)
 
 
+@pytest.mark.parametrize("due", [12, 99, 126])
+def test_a_digitizer_that_was_restarted_numbers_anew(due: int) -> None:
+    """Its frames go on being told apart: one that is damaged afterwards is recovered."""
+    blocks, decoder = raw_blocks(60), SerialDecoder(SENSORS)
+    first, transmitter = brp.Transmitter(), brp.Transmitter()
+    for raw in blocks[:due]:
+        first.queue(raw)
+    for raw in blocks[due:]:
+        transmitter.queue(raw)
+    found: list[Block | Event] = []
+    while (frame := first.take_frame()) is not None:
+        found += decoder.receive(frame, AT)
+    decoder.take_replies()
+    times_sent = 0
+    while (frame := transmitter.take_frame()) is not None:
+        found += decoder.receive(frame[:99] if times_sent == 5 else frame, AT)
+        transmitter.receive(decoder.take_replies())
+        times_sent += 1
+    counts, blocks_found, events = joined(found)
+    np.testing.assert_array_equal(counts, expected(0, 6000))
+    assert not any(block.reason for block in blocks_found)
+    said = f"the digitizer numbers anew: block 0 came, {due} was due"
+    assert [e.text for e in events if e.kind == "reset"] == [said]
+
+
 def test_what_stays_lost_is_an_exact_gap() -> None:
     """Block 13 (stream 1, second 4) never arrives: one second is missing, and no more."""
     target = gcf.encode_block(sample_block(1, 4))
@@ -389,7 +414,7 @@ def test_memory_stays_bounded() -> None:
     assert len(tcp._finder._buffer) <= 4096  # noqa: SLF001 -- the claim
 
 
-@pytest.mark.parametrize("before", [3, 40_000, 60_000])
+@pytest.mark.parametrize("before", [3, 20_000, 20_500, 40_000, 60_000])
 def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
     """Its packets go on being told apart: one that is lost afterwards is awaited again."""
     decoder = ScreamDecoder(SENSORS)
