@@ -95,7 +95,7 @@ def run_demo(
     scenario = scenario_of(bench)
     compared = compare(snapshot, settings, scenario)
     screen = for_people(json)
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     added = max(entry.clocks / entry.true_psd for entry in compared)
     screen.print(
         f"[b]Self-noise from {low:g} to {high:g} Hz[/b] in dB re 1 ({snapshot.unit})²/Hz, "
@@ -134,7 +134,7 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:
     """Return every channel's noise in the band by each method, with the truth."""
-    edges = band_edges(snapshot.frequency, band_of(settings, snapshot.frequency))
+    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
     inside = snapshot.frequency[slice(*edges)]
     correlation = correlation_of(settings)
     clocks = _added_by_clocks(snapshot, settings)
@@ -171,7 +171,7 @@ def _added_by_clocks(snapshot: Snapshot, settings: Settings) -> FloatArray:
     first = next(iter(snapshot.results.values()), None)
     if first is None:
         return np.zeros(len(snapshot.channels))
-    edges = band_edges(snapshot.frequency, band_of(settings, snapshot.frequency))
+    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
     noise = np.abs(first.noise_psd[slice(*edges)].mean(axis=0))
     share = CLOCK_MARGIN * np.nan_to_num(effect(snapshot, settings))
     return np.asarray(np.minimum(share, 1.0) * noise)
@@ -183,7 +183,7 @@ def _percent(share: float) -> str:
 
 def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Settings) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     edges = band_edges(snapshot.frequency, band)
     data = snapshot.data_psd[slice(*edges)].mean(axis=0)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))

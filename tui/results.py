@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from dataclasses import asdict, is_dataclass, replace
+from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,9 +30,14 @@ def correlation_of(settings: Settings) -> FloatArray:
     return bin_correlation(window, max(1, round(_SHAPE_LENGTH * (1 - settings.overlap))))
 
 
-def band_of(settings: Settings, frequency: FloatArray) -> tuple[float, float]:
-    """Return the band that was asked for, or all that is usable: up to 0.45 of the rate."""
-    return settings.band or (float(frequency[1]), 0.9 * float(frequency[-1]))
+def band_of(settings: Settings, snapshot: Snapshot) -> tuple[float, float]:
+    """Return the band that was asked for, or all that is usable: up to 0.45 of the rate.
+
+    It ends where nothing can be said any more, unless that is all of it.
+    """
+    frequency, known = snapshot.frequency, highest_known(snapshot)
+    low, high = settings.band or (float(frequency[1]), 0.9 * float(frequency[-1]))
+    return low, min(high, known) if low < known else high
 
 
 def channel_means(
@@ -54,7 +59,7 @@ def reached_cov(snapshot: Snapshot, settings: Settings, method: str | None = Non
     noise = snapshot.results.get(method or next(iter(snapshot.results), ""))
     if noise is None:
         return math.nan
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     cov = noise.cov[inside]
     usable = cov[:, np.isfinite(cov).any(axis=0)]
@@ -63,16 +68,18 @@ def reached_cov(snapshot: Snapshot, settings: Settings, method: str | None = Non
 
 def result_title(snapshot: Snapshot, settings: Settings) -> str:
     """Return what the table of results holds."""
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
+    wanted = high if settings.band is None else settings.band[1]
+    asked = f" ({wanted:.3g} was asked for)" if wanted > high else ""
     return (
-        f"[b]Self-noise, mean over {low:.3g} to {high:.3g} Hz[/b], dB re 1 ({snapshot.unit})²/Hz, "
-        "with its 95 % interval"
+        f"[b]Self-noise, mean over {low:.3g} to {high:.3g} Hz[/b]{asked}, "
+        f"dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval"
     )
 
 
 def result_table(snapshot: Snapshot, settings: Settings) -> Table:
     """Return the noise of every channel in the band, by each method."""
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")
     table.add_column("channel")
@@ -193,7 +200,7 @@ _NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # with its advice, once for all met
 
 def highest_known(snapshot: Snapshot) -> float:
     """Return the frequency in Hz above which clocks that ran freely leave nothing to be said."""
-    known = np.isfinite(snapshot.csm).any(axis=(1, 2))
+    known = np.isfinite(snapshot.data_psd).any(axis=1)
     return float(snapshot.frequency[known].max(initial=0.0))
 
 
@@ -351,8 +358,3 @@ def curves_csv(snapshot: Snapshot) -> str:
     for row in np.stack(columns, axis=1):
         writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
     return text.getvalue()
-
-
-def with_band(settings: Settings, band: tuple[float, float] | None) -> Settings:
-    """Return settings for another band, or the same ones."""
-    return settings if band is None else replace(settings, band=band)

@@ -21,7 +21,7 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
     share = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
     if share is None or not snapshot.results:
         return np.full(len(snapshot.channels), np.nan)
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     noise = next(iter(snapshot.results.values())).noise_psd[inside]
     added = np.where(np.isfinite(share[inside] * noise), share[inside] * np.abs(noise), 0.0)

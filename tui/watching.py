@@ -128,7 +128,7 @@ def _update(snapshot: Snapshot, settings: Settings, now: Now | None) -> dict[str
         "left_out": snapshot.left_out,
     }
     if snapshot.results:
-        band = band_of(settings, snapshot.frequency)
+        band = band_of(settings, snapshot)
         document["band_hz"] = band
         document["noise"] = {
             method: {

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from tests.tui.made import SETTINGS, made_snapshot
 from tui.bands import NORMAL_95, band_edges, band_means, bin_correlation, log_edges
+from tui.results import band_of, result_table, result_title
 
 
 @pytest.mark.parametrize(("name", "overlap"), [("hann", 0.5), ("rectangular", 0.0), ("hann", 0.75)])
@@ -57,3 +61,20 @@ def test_bands_leave_zero_frequency_and_nyquist_out() -> None:
     assert np.all(np.diff(edges) > 0)
     with pytest.raises(ValueError, match="no frequency between"):
         band_edges(frequency, (120.0, 130.0))
+
+
+@pytest.mark.parametrize("asked", [(10.0, 98.0), None])
+def test_a_band_ends_where_nothing_can_be_said(asked: tuple[float, float] | None) -> None:
+    snapshot, settings = made_snapshot(), replace(SETTINGS, band=asked)
+    snapshot.csm[snapshot.frequency > 80] = np.nan  # resampled
+    assert band_of(settings, snapshot)[1] == 80
+    title = result_title(snapshot, settings)
+    assert "to 80 Hz" in title
+    assert ("(98 was asked for)" in title) == (asked is not None)
+    assert "?" not in list(result_table(snapshot, settings).columns[2].cells)
+
+
+def test_a_band_of_which_nothing_is_known_stays_what_it_is() -> None:
+    snapshot = made_snapshot()
+    snapshot.csm[snapshot.frequency > 80] = np.nan
+    assert band_of(replace(SETTINGS, band=(85.0, 95.0)), snapshot) == (85.0, 95.0)

@@ -80,7 +80,7 @@ def _verdict(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> Ite
 
 def _channels(snapshot: Snapshot, settings: Settings) -> Table:
     method, noise = next(iter(snapshot.results.items()))
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     inside = slice(*band_edges(snapshot.frequency, band))
     data = np.average(
         snapshot.data_psd[inside], axis=0, weights=np.gradient(snapshot.frequency)[inside]
@@ -176,7 +176,7 @@ def _events(now: Now) -> Table:
 
 def reached_cov_by_channel(snapshot: Snapshot, settings: Settings, method: str) -> list[float]:
     """Return the c.o.v. per frequency of every channel, median in the band."""
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     return [_median(column) for column in snapshot.results[method].cov[inside].T]
 

@@ -83,7 +83,7 @@ def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tup
     method = next((m for m in choice.methods[:1] if m in snapshot.results), None)
     if method is None:
         return ()
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     return channel_means(snapshot.results[method], snapshot.frequency, settings, band)
 
 
@@ -100,7 +100,7 @@ def sensor_table(
 
     What there is no room for is left out: rates first, then numbers of samples, then of gaps.
     """
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     of_sensor = _columns_of(snapshot)
     titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}

@@ -176,7 +176,7 @@ def _response(channel: Channel) -> str:
 
 def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
     rate = 2 * float(snapshot.frequency[-1])
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     rows = [
         ("Method", ", ".join(snapshot.results) or ", ".join(settings.methods)),
         ("Time used", _time_used(snapshot, settings)),

@@ -155,7 +155,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
     worst = max((effect for effect in effects.values() if math.isfinite(effect)), default=math.nan)
     parts: list[Part] = []
     if math.isfinite(worst):
-        band = span(*band_of(settings, snapshot.frequency))
+        band = span(*band_of(settings, snapshot))
         if worst < MATTERS:
             text = f"What is left between the clocks adds {share(worst)} to the noise at most"
             parts.append(Paragraph(f"{text}, within {band}: they do not matter here.", "good"))
@@ -273,7 +273,7 @@ def _clock_effects(snapshot: Snapshot, settings: Settings) -> dict[str, float]:
     bias = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
     if bias is None:
         return {}
-    low, high = band_of(settings, snapshot.frequency)
+    low, high = band_of(settings, snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     effects: dict[str, float] = {}
     for column, label in enumerate(snapshot.channels):

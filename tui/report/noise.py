@@ -150,7 +150,7 @@ def _words(each: Judged) -> tuple[str, Tone]:
 
 
 def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     method, noise = next(iter(snapshot.results.items()))
     means = channel_means(noise, snapshot.frequency, settings, band)
     inside = slice(*band_edges(snapshot.frequency, band))
@@ -238,7 +238,7 @@ def _level_with_error(mean: float, low: float, high: float) -> str:
 
 
 def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:
-    band = band_of(settings, snapshot.frequency)
+    band = band_of(settings, snapshot)
     columns = [
         channel_means(noise, snapshot.frequency, settings, band)
         for noise in snapshot.results.values()
