@@ -112,6 +112,7 @@ def test_usage_is_exit_2(tmp_path: Path) -> None:
     assert result.exit_code == 2
     for said in ("bench.toml", "sampling_rat", "sampling_rate", "sensors"):
         assert said in result.stderr
+    assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
 
 
 def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
@@ -141,6 +142,7 @@ def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["estimate", file, "--segment", "1s", "--band", "60:70"])
     assert result.exit_code == 2
     assert "no frequency between 60 and 70 Hz" in result.stderr
+    assert not result.stdout
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="locales")
@@ -163,7 +165,9 @@ def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
     huddle("init", "--out", str(bench))
     before = bench.read_text(encoding="utf-8")
     assert "the bench file is right" in huddle("check", str(bench), "--no-devices")
-    huddle("init", "--out", str(bench), code=3)
+    refused = CliRunner().invoke(app, ["init", "--out", str(bench)])
+    assert refused.exit_code == 2
+    assert "--force replaces it" in " ".join(refused.stderr.split())
     assert bench.read_text(encoding="utf-8") == before
 
 

@@ -7,13 +7,14 @@ from collections import Counter
 from importlib import resources
 from typing import TYPE_CHECKING
 
+import typer
 from rich.table import Table
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
 from daq.errors import NoAnswerError
 from daq.probe import discover, probe_bench
-from tui.output import console, for_people, write_json
+from tui.output import check_places, console, for_people, write_json, write_text
 from tui.results import plain
 from tui.text import signed
 
@@ -31,12 +32,14 @@ def write_template(out: Path, *, force: bool) -> None:
 
     Raises
     ------
-    FileExistsError
-        There is one already.
+    typer.BadParameter
+        There is one already, or no folder for it.
     """
+    if out.exists() and not force:
+        raise typer.BadParameter(f"{out}: exists already; --force replaces it")
+    check_places(str(out))
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    with out.open("w" if force else "x", encoding="utf-8") as file:
-        file.write(text)
+    write_text(str(out), text)
     console().print(f"{out} written. Fill in ports and sensitivities, then: huddle check {out}")
 
 

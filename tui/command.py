@@ -61,8 +61,9 @@ class HuddleGroup(TyperGroup):
                 traceback.print_exc()
                 typer.echo("huddle: this is a fault in huddle itself; please report it", err=True)
                 raise typer.Exit(TROUBLE) from None
-            for line in messages(error):
-                typer.echo(f"huddle: {line}", err=True)
+            with suppress(OSError):  # where that goes to a file, its disk may be full as well
+                for line in messages(error):
+                    typer.echo(f"huddle: {line}", err=True)
             raise typer.Exit(code) from None
 
 
@@ -87,14 +88,14 @@ def exit_code(error: BaseException) -> int | None:
 
 
 def messages(error: BaseException) -> Iterator[str]:
-    """Yield what went wrong, one line for each failure of a group."""
+    """Yield what went wrong, line by line."""
     if isinstance(error, BaseExceptionGroup):
         for inner in error.exceptions:
             yield from messages(inner)
     elif isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         yield ": ".join(str(part) for part in (error.filename, error.strerror) if part)
     else:
-        yield str(error) or type(error).__name__
+        yield from (str(error) or type(error).__name__).splitlines()
 
 
 app = typer.Typer(

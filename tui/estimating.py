@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
 from daq.bench import parse_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
 from tui.diagnosis import details, summary
 from tui.limits import exceeded
-from tui.output import for_people, notices, write_json, write_text
+from tui.output import check_places, for_people, notices, progress, write_json, write_text
 from tui.results import curves_csv, document, remarks, result_table, result_title
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def estimate_recordings(
     ``wanted`` holds method and fields of Settings, each None where not given. ``diagnostics``
     shows all of them and not only what applies.
     """
+    check_places(json, csv)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
     met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
     notices().print(
@@ -71,13 +72,11 @@ def estimated(
             start=_instant(start, recording.created),
             end=_instant(end, recording.created),
         )
-    with Progress(
+    with progress(
         TextColumn("segments"),
         BarColumn(),
         TextColumn("{task.completed} of {task.total}"),
         TimeRemainingColumn(),
-        console=notices(),
-        transient=True,
     ) as bar:
         task = bar.add_task("")
         snapshot = estimate(
@@ -148,8 +147,9 @@ def show_result(
         Whether every channel meets the limits of the bench file.
     """
     screen = for_people(json, csv)
+    table = result_table(snapshot, settings)  # refuses a band without frequencies
     screen.print(result_title(snapshot, settings))
-    screen.print(result_table(snapshot, settings))
+    screen.print(table)
     for line in remarks(snapshot):
         screen.print(line)
     for part in details(snapshot) if diagnostics else summary(snapshot):

@@ -7,9 +7,11 @@ import math
 import sys
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
+import typer
 from rich.console import Console
+from rich.progress import Progress, ProgressColumn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,19 +23,50 @@ WIDTH_OF_FILES = 110
 
 def console() -> Console:
     """Return standard output."""
-    terminal = sys.stdout.isatty()
-    return Console(highlight=False, width=None if terminal else WIDTH_OF_FILES)
+    return Console(highlight=False, width=_width(sys.stdout))
 
 
 @cache
 def notices() -> Console:
     """Return standard error, where progress and remarks go."""
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, width=_width(sys.stderr))
+
+
+def _width(stream: TextIO) -> int | None:
+    return None if stream.isatty() else WIDTH_OF_FILES
+
+
+def progress(*columns: str | ProgressColumn) -> Progress:
+    """Return a display of how far something is, on terminals; files and pipes get none."""
+    screen = notices()
+    return Progress(
+        *columns,
+        console=screen,
+        refresh_per_second=2,
+        transient=True,
+        disable=not screen.is_terminal,
+    )
 
 
 def for_people(json_file: str | None, csv_file: str | None = None) -> Console:
     """Return where to print tables: standard error, if a program reads standard output."""
     return notices() if STANDARD_OUTPUT in {json_file, csv_file} else console()
+
+
+def check_places(*files: str | None) -> None:
+    """Refuse, before anything is measured, files for which there is no folder.
+
+    Raises
+    ------
+    typer.BadParameter
+        With the folder.
+    """
+    for file in files:
+        if file in {None, STANDARD_OUTPUT}:
+            continue
+        folder = Path(str(file)).absolute().parent
+        if not folder.is_dir():
+            raise typer.BadParameter(f"{file}: there is no folder {folder}; make it first")
 
 
 def write_text(file: str, text: str, *, append: bool = False) -> None:

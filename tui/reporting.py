@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from tui.estimating import LIMIT_NOT_MET, estimated
 from tui.limits import exceeded
-from tui.output import console, notices
+from tui.output import check_places, console, notices
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,10 +55,7 @@ def checked(out: Path) -> Path:
     """
     if out.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{out}: expected a report's name to end in .html or .pdf")
-    if not out.absolute().parent.is_dir():
-        raise typer.BadParameter(
-            f"{out}: there is no folder {out.absolute().parent}; make it first"
-        )
+    check_places(str(out))
     return out
 
 

@@ -14,7 +14,7 @@ from sim_devices.errors import ScenarioError
 from tui.clock_study import clocks
 from tui.laboratory import LABORATORY, Laboratory
 from tui.numerical_studies import NUMERICAL, Ingredients
-from tui.output import for_people, notices, write_json
+from tui.output import for_people, progress, write_json
 from tui.studies import TOLERANCE
 
 if TYPE_CHECKING:
@@ -120,13 +120,11 @@ class _Progress:
     """A bar for what is being simulated, with the time left."""
 
     def __init__(self) -> None:
-        self._bar = Progress(
+        self._bar = progress(
             *Progress.get_default_columns()[:-1],
             TimeRemainingColumn(),
             TextColumn("left,"),
             TimeElapsedColumn(),
-            console=notices(),
-            transient=True,
         )
         self._task = self._bar.add_task("", total=1.0)
         self._what = ""

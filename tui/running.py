@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, TextColumn
 
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
@@ -19,7 +19,7 @@ from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
 from tui.estimating import LIMIT_NOT_MET, check_gains, chosen, show_result
-from tui.output import for_people, notices
+from tui.output import check_places, for_people, notices, progress
 from tui.patience import patience
 from tui.recorder_process import RecorderProcess
 from tui.reporting import checked, write_report
@@ -66,6 +66,7 @@ def run_test(
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
     check_gains(settings, bench.sensors)
+    check_places(json, csv)
     if until_cov is not None:
         settings = replace(settings, target_cov=until_cov)
     duration = bench.recording.duration if duration is None and until_cov is None else duration
@@ -153,7 +154,7 @@ def follow_to_end(
                 interrupted = True
                 recorder.request_stop()
         if not snapshot.closed:
-            notices().print("[red]the recorder was ended from outside")
+            notices().print("[red]the recorder ended without closing its recording")
             try:
                 heal(recorder.out)
             except HuddleError as error:  # a full disk; the file can be read all the same
@@ -192,13 +193,10 @@ def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) ->
 @contextmanager
 def _progress() -> Iterator[Callable[[Snapshot, Settings, float | None], None]]:
     """Show a line that follows a run: time, segments, c.o.v., time left."""
-    with Progress(
+    with progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[state]}"),
-        console=notices(),
-        refresh_per_second=2,
-        transient=True,
     ) as bar:
         task = bar.add_task("0:00", total=None, state="")
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.progress import Progress
 
 from daq.bench import Bench, Channel, Sensor, load
 from daq.drivers.registry import driver_type
@@ -18,7 +17,7 @@ from sim_devices import scenarios
 from sim_devices.errors import ScenarioError
 from sim_devices.scenario import Scenario, SensorClock
 from tui.devices import scenario_of
-from tui.output import for_people, notices, write_json
+from tui.output import for_people, progress, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -74,14 +73,14 @@ def simulate_recording(
     """
     bench, world = _described(scenario)
     seconds = duration or bench.recording.duration or DEFAULT_DURATION
-    with Progress(console=notices(), transient=True) as progress:
-        task = progress.add_task("simulating", total=seconds)
+    with progress() as bar:
+        task = bar.add_task("simulating", total=seconds)
         write(
             out,
             bench,
             world,
             duration=seconds,
-            simulated=lambda s: progress.update(task, completed=s),
+            simulated=lambda s: bar.update(task, completed=s),
         )
     for_people(json).print(f"{out}: {seconds:g} s of {', '.join(world.names)}, simulated")
     write_json(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from tui.command import app
-from tui.output import write_text
+from tui.output import notices, progress, write_text
 
 FULL = Path("/dev/full")
 
@@ -26,6 +28,32 @@ def test_lines_are_appended(tmp_path: Path) -> None:
     for line in ("1\n", "2\n"):
         write_text(str(out), line, append=True)
     assert out.read_text(encoding="utf-8") == "1\n2\n"
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="a device that is always full")
+def test_trouble_that_cannot_be_told_is_trouble_all_the_same() -> None:
+    with FULL.open("w") as full:
+        command = [sys.executable, "-m", "tui", "estimate", "nothing.h5"]
+        assert subprocess.run(command, stderr=full, check=False).returncode == 3
+
+
+def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    notices.cache_clear()
+    with progress() as bar:
+        bar.advance(bar.add_task("segments", total=2.0))
+    notices().print("word " * 20)
+    said = capsys.readouterr().err
+    notices.cache_clear()
+    assert said == "word " * 20 + "\n"
+
+
+@pytest.mark.parametrize("option", ["--json", "--csv"])
+def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(option: str) -> None:
+    result = CliRunner().invoke(app, ["estimate", "nothing.h5", option, "nowhere/result"])
+    assert result.exit_code == 2
+    assert "there is no folder" in result.output
 
 
 @pytest.mark.parametrize(
