@@ -183,7 +183,7 @@ class _Recorder:
                 if not await self._all_connected(connections):
                     return self._status
                 with _WritingThread() as thread:
-                    intake = await thread.run(lambda: self._create(connections, address))
+                    intake = await thread.run(lambda: self._create(connections, address, duration))
                     try:
                         go.set()
                         await self._write(intake, thread, duration, tasks)
@@ -232,7 +232,9 @@ class _Recorder:
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
         return True
 
-    def _create(self, connections: list[Connection], address: tuple[int, str]) -> Intake:
+    def _create(
+        self, connections: list[Connection], address: tuple[int, str], duration: float | None
+    ) -> Intake:
         layouts: dict[str, SensorLayout] = {}
         for connection in connections:
             information = {i.sensor: i for i in connection.information}
@@ -250,7 +252,12 @@ class _Recorder:
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
         self._started = self._clock.now()
         writer = RecordingWriter.create(
-            self._path, self._bench, sensors=ordered, created=self._started, control=address
+            self._path,
+            self._bench,
+            sensors=ordered,
+            created=self._started,
+            control=address,
+            attributes={} if duration is None else {"duration": duration},
         )
         writer.event(Event("", "started", f"{len(ordered)} sensors", self._started))
         return Intake(writer, {layout.name: layout.sampling_rate for layout in ordered})

@@ -162,6 +162,8 @@ def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
     assert status["closed"]
     for name in "ABC":
         assert status["sensors"][name]["samples"] >= 900  # connecting takes part of the duration
+    with Recording.open(out) as recording:
+        assert recording.duration == 5
     code, _, err = finished(start("record", str(bench), "--duration", "5s", "--out", str(out)))
     assert code == 3
     assert "exists already" in err

@@ -85,6 +85,8 @@ class Now:
     sensors : tuple of SensorNow
     events : tuple of Event
         All of them.
+    ends_in : float or None
+        Seconds until it ends by itself, if it does.
     """
 
     elapsed: float
@@ -92,6 +94,7 @@ class Now:
     closed: bool
     sensors: tuple[SensorNow, ...]
     events: tuple[Event, ...]
+    ends_in: float | None = None
 
 
 class Lookout:
@@ -121,8 +124,10 @@ class Lookout:
             *(seen.last_ns for seen in self._seen.values()),
             *(event.received.monotonic_ns for event in self._events[-1:]),
         )
+        elapsed = (latest_ns - begun) * _NS
+        ends = None if recording.closed else recording.duration
         return Now(
-            elapsed=(latest_ns - begun) * _NS,
+            elapsed=elapsed,
             started_utc_ns=recording.created_at.utc_ns,
             closed=recording.closed,
             sensors=tuple(
@@ -130,6 +135,7 @@ class Lookout:
                 for record in recording.sensors
             ),
             events=self._events,
+            ends_in=None if ends is None else max(0.0, ends - elapsed),
         )
 
     def quiet(self) -> bool:

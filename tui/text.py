@@ -25,12 +25,15 @@ def time_left(seconds: float | None) -> str:
     """Return how long something still takes, roughly."""
     if seconds is None or not math.isfinite(seconds):
         return "time left unknown"
-    if seconds <= 0:
-        return "done"
+    return f"{roughly(seconds)} left" if seconds > 0 else "done"
+
+
+def roughly(seconds: float) -> str:
+    """Return a length of time in its largest unit, rounded up."""
     for limit, unit, size in ((90, "s", 1), (5400, "min", 60), (172800, "h", 3600)):
         if seconds < limit:
-            return f"{math.ceil(seconds / size)} {unit} left"
-    return f"{math.ceil(seconds / 86400)} days left"
+            return f"{math.ceil(seconds / size)} {unit}"
+    return f"{math.ceil(seconds / 86400)} days"
 
 
 def decibels(psd: float) -> float:

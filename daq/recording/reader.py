@@ -192,6 +192,9 @@ class Recording:
         self.operator: str = attributes["operator"]
         self.location: str = attributes["location"]
         self.bench_text: str = attributes["bench"]
+        duration = attributes.get("duration")
+        self.duration = None if duration is None else float(duration)
+        """Seconds for which it was to be; None: until it was stopped."""
         self._committed: h5py.Dataset = file["committed"]
         self.sensors = tuple(
             SensorRecord(file["sensors"][name]) for name in self._committed.attrs["sensors"]

@@ -86,7 +86,7 @@ class RecordingWriter:
         sensors: Sequence[SensorLayout],
         created: HostTime,
         control: tuple[int, str] | None = None,
-        attributes: dict[str, str] | None = None,
+        attributes: dict[str, str | float] | None = None,
         chunk_seconds: float = 1.0,
     ) -> RecordingWriter:
         """Create a recording.
@@ -263,7 +263,7 @@ def _describe(
     bench: Bench | None,
     created: HostTime,
     control: tuple[int, str] | None,
-    attributes: dict[str, str],
+    attributes: dict[str, str | float],
 ) -> None:
     utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
     try:

@@ -143,7 +143,7 @@ def empty_snapshot() -> Snapshot:
 
 
 @contextmanager
-def growing(path: Path) -> Iterator[RecordingWriter]:
+def growing(path: Path, *, duration: float | None = None) -> Iterator[RecordingWriter]:
     """Yield the writer of a recording of the demo's bench that nobody has closed."""
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     bench = parse(text)
@@ -151,7 +151,13 @@ def growing(path: Path) -> Iterator[RecordingWriter]:
         SensorLayout(s.name, s.channels, bench.sampling_rate, dtype=np.dtype("<i4"), clock=s.name)
         for s in bench.sensors
     ]
-    writer = RecordingWriter.create(path, bench, sensors=sensors, created=SystemClock().now())
+    writer = RecordingWriter.create(
+        path,
+        bench,
+        sensors=sensors,
+        created=SystemClock().now(),
+        attributes={} if duration is None else {"duration": duration},
+    )
     writer.commit()
     try:
         yield writer

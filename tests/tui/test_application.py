@@ -229,6 +229,22 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Told) ->
         assert "C.Y stands still: no signal" in screen_text(app)
 
 
+@pytest.mark.parametrize("target", [0.05, None])
+async def test_how_far_a_test_is_that_ends_by_itself(told: Told, target: float | None) -> None:
+    settings = replace(SETTINGS, target_cov=target)
+    snapshot = replace(made_snapshot(), time_left=None if target is None else 260.0)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        now = replace(made_now(), ends_in=100.0)
+        await shown(pilot, app, Looked(now), Fresh(snapshot, settings))
+        line = str(app.query_one("#progress", Static).content)
+    assert line.endswith(" · ends in 2 min")
+    bar = line.split(maxsplit=1)[0]
+    share = bar.count("━") / len(bar)
+    left = 100.0 if target is None else 260.0
+    assert share == pytest.approx(100 / (100 + left), abs=1 / len(bar))
+
+
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(told: Told) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:

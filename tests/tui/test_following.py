@@ -126,6 +126,19 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         assert states == {"A": "ended", "B": "ended", "C": "disconnected"}
 
 
+@pytest.mark.parametrize("duration", [60.0, None])
+def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path, duration=duration) as writer, Recording.open(path) as recording:
+        Bench(writer).send("ABC", 8)
+        recording.refresh()
+        now = Lookout(recording).look()
+        assert now.ends_in == (None if duration is None else pytest.approx(52, abs=0.1))
+        writer.close()
+        recording.refresh()
+        assert Lookout(recording).look().ends_in is None
+
+
 def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer, Recording.open(path) as recording:

@@ -13,7 +13,7 @@ from rich.text import Text
 from estimator.self_noise import Flag
 from tui.application.curves import data_curve, noise_curve
 from tui.results import band_of, channel_means, correlation_of, reached_cov
-from tui.text import clock_time, decibels, several, time_left
+from tui.text import clock_time, decibels, roughly, several, time_left
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -198,7 +198,7 @@ def _flagged(snapshot: Snapshot, column: int) -> str:
 def progress_line(
     now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, since: float, width: int
 ) -> Text:
-    """Return how far the test is: a bar where there is a target, segments, c.o.v., time left.
+    """Return how far the test is: a bar where its end is known, segments, c.o.v., time left.
 
     ``since`` is how many seconds ago the snapshot was made.
     """
@@ -224,10 +224,13 @@ def progress_line(
         parts.append(f"waits for {', '.join(waits)}")
     elif target is not None:
         parts.append("target reached" if cov <= target else time_left(left))
+    if now.ends_in is not None:
+        parts.append(f"ends in {roughly(now.ends_in)}")
+    left = now.ends_in if target is None else left
     text = " · ".join(parts)
     line = Text()
     room = width - len(text) - 3
-    if target is not None and left is not None and not snapshot.closed and room >= 8:
+    if left is not None and not snapshot.closed and room >= 8:
         done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
         filled = round(done * room)
         line.append("━" * filled, "#4cc9f0")
