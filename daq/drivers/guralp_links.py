@@ -69,7 +69,7 @@ class _SerialLink:
 class _TcpLink:
     def __init__(self, stream: ByteStream, ids: dict[str, tuple[str, ...]]) -> None:
         self._stream = stream
-        self._decoder = ScreamDecoder(ids)
+        self._decoder = ScreamDecoder(ids, patience=0)  # in order, or lost before
 
     @property
     def streams(self) -> Streams:

@@ -338,14 +338,16 @@ class ScreamDecoder:
     """GCF from a Scream server: ``receive`` for TCP, ``receive_datagram`` for UDP.
 
     Packets that were overtaken on the way, or are asked for again by number (``missing``), are put
-    in their place if they come before ``PATIENCE`` others. A number that was due before, with a
-    block later than all others, is of a server that was restarted.
+    in their place if they come before ``patience`` others: while they are awaited nothing goes out,
+    which must not look like a stall. A number that was due before, with a block later than all
+    others, is of a server that was restarted.
     """
 
-    PATIENCE = 32
+    MOST_MISSING = 32
 
-    def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
+    def __init__(self, sensors: Mapping[str, Iterable[str]], *, patience: int = 2) -> None:
         self.streams = Streams(sensors)
+        self._patience = patience
         self._name = _only(sensors)
         self._finder = PacketFinder()
         self._next: int | None = None
@@ -407,6 +409,6 @@ class ScreamDecoder:
             self.streams.lost("lost packet")
             yield Event(self._name, "resynchronised", f"{ahead} packets missing", at)
         aged = {number: since + 1 for number, since in self._missing.items()}
-        if ahead <= self.PATIENCE:  # more than that is no disorder on the way
+        if ahead <= self.MOST_MISSING:  # more than that is no disorder on the way
             aged |= {(due + i) % 65536: 0 for i in range(ahead)}
-        self._missing = {n: since for n, since in aged.items() if since < self.PATIENCE}
+        self._missing = {n: since for n, since in aged.items() if since < self._patience}

@@ -335,9 +335,25 @@ def test_udp_packets_that_overtake_and_that_stay_lost() -> None:
     assert [e.text for e in events] == ["1 packets missing", "1 packets missing"]
 
 
+@pytest.mark.parametrize("lost", range(3, 6))
+@pytest.mark.parametrize("patience", [0, 2])
+def test_one_that_stays_lost_holds_up_less_than_a_block(lost: int, patience: int) -> None:
+    """What comes two block periods after the last looks like a stall."""
+    decoder = ScreamDecoder(SENSORS, patience=patience)
+    seconds = []
+    for second, sent in enumerate(np.array(packets(8), object).reshape(8, 3)):
+        found: list[Block | Event] = []
+        for i, data in enumerate(sent):
+            if 3 * second + i != lost:
+                found += decoder.receive(data, AT)
+        if any(isinstance(item, Block) for item in found):
+            seconds.append(second)
+    assert seconds == [0, 2, 3, 4, 5, 6, 7]
+
+
 def test_udp_packets_asked_for_again() -> None:
     sent = packets(4)
-    decoder = ScreamDecoder(SENSORS)
+    decoder = ScreamDecoder(SENSORS, patience=32)
     found = [
         item for i, data in enumerate(sent) if i != 4 for item in decoder.receive_datagram(data, AT)
     ]
@@ -350,7 +366,7 @@ def test_udp_packets_asked_for_again() -> None:
 
 def test_udp_packets_the_server_no_longer_has() -> None:
     sent = packets(5)
-    decoder = ScreamDecoder(SENSORS)
+    decoder = ScreamDecoder(SENSORS, patience=32)
     for i in (0, 1, 2, 3, 5, 6, 7, 8):
         decoder.receive_datagram(sent[i], AT)
     decoder.not_available(65_534)
@@ -417,7 +433,7 @@ def test_memory_stays_bounded() -> None:
 @pytest.mark.parametrize("before", [3, 20_000, 20_500, 40_000, 60_000])
 def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
     """Its packets go on being told apart: one that is lost afterwards is awaited again."""
-    decoder = ScreamDecoder(SENSORS)
+    decoder = ScreamDecoder(SENSORS, patience=32)
     blocks = [scream.Packet(0, "", sample_block(i, s)) for s in range(30) for i in range(3)]
     numbers = [*range(before, before + 45), *range(20_000, 20_045)]
     found: list[Block | Event] = []
