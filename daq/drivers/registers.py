@@ -210,7 +210,7 @@ class _Poller:
         now = self._clock.now()
         self._n_wrong[kind] += 1
         counted = f"{text.encode()[:180].decode(errors='ignore')} ({self._n_wrong[kind]} so far)"
-        return [*self._decoder.flush(now), Event(self.sensor, kind, counted, now)]
+        return [*self._decoder.flush(), Event(self.sensor, kind, counted, now)]
 
     def _schedule(self) -> None:
         """Next poll at an absolute instant; those whose time has gone by are left out."""

@@ -257,6 +257,7 @@ class RegisterDecoder:
         self._rows: list[Sequence[int]] = []
         self._sent: list[int] = []
         self._received: list[int] = []
+        self._at: HostTime | None = None  # when the last of them came
         self._next = 0
         self._last_instant: int | None = None
         self._last_key: int | None = None
@@ -280,11 +281,13 @@ class RegisterDecoder:
         self._rows.append(registers)
         self._sent.append(sent.monotonic_ns)
         self._received.append(at.monotonic_ns)
-        return self.flush(at) if len(self._rows) >= self._gather else []
+        self._at = at
+        return self.flush() if len(self._rows) >= self._gather else []
 
-    def flush(self, at: HostTime) -> list[Block | Event]:
+    def flush(self) -> list[Block | Event]:
         """Return what has been gathered."""
-        if not self._rows:
+        at = self._at
+        if not self._rows or at is None:
             return []
         registers = np.array(self._rows, np.uint16)
         sent, received = np.array(self._sent, np.int64), np.array(self._received, np.int64)

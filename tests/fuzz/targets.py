@@ -106,7 +106,7 @@ def polled_registers(fuzzed: bytes) -> None:
         values = struct.unpack(f">{len(read) // 2}H", read[: len(read) // 2 * 2])
         with contextlib.suppress(RemoteProtocolError):
             decoder.receive(values, at, at)
-    decoder.flush(_at(LATER))
+    decoder.flush()
     found: list[object] = []
     for k in range(40):
         held = WITMOTION.encode(np.array([k, 0, 0]), time_ns=10**18 + k * 50_000_000)

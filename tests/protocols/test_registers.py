@@ -127,6 +127,15 @@ def test_without_a_device_time_the_instant_is_halfway() -> None:
     assert (block.first_sample, block.flags) == (0, BlockFlag.CLOCK_RESTART)
 
 
+def test_what_waited_for_more_came_when_it_came() -> None:
+    """Not when the device was given up: the length of a gap to the next session hangs on it."""
+    one = decoder(rate=8.0)
+    assert one.receive([5], host(100), host(104)) == []
+    (block,) = one.flush()
+    assert isinstance(block, Block)
+    assert block.received == host(104)
+
+
 def test_polls_without_a_reading_are_a_gap() -> None:
     one = decoder(rate=4.0)
     (first,) = one.receive([1], host(0), host(0))
@@ -202,7 +211,7 @@ def test_any_replies_are_decoded_or_refused(replies: list[list[int]]) -> None:
         else:
             with pytest.raises(RemoteProtocolError, match="7 registers asked for"):
                 one.receive(reply, host(50 * k), host(50 * k + 5))
-    one.flush(host(2000))
+    one.flush()
     # and after that every valid reply counts
     rows = []
     for k in range(60):
