@@ -15,7 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.estimation import Settings, estimate
+from sim_devices.scenarios import SCENARIOS
 from tui.command import app
+from tui.reproduce import STUDIES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -80,6 +82,14 @@ def test_every_command_has_help_with_examples(name: str) -> None:
     text = huddle(name, "--help")
     assert "Examples" in text
     assert f"huddle {name} " in text or f"huddle {name}\n" in text
+
+
+def test_help_names_every_study_and_scenario() -> None:
+    said = {
+        name: set(re.findall(r"\w+", huddle(name, "--help"))) for name in ("reproduce", "simulate")
+    }
+    assert set(STUDIES) <= said["reproduce"]
+    assert set(SCENARIOS) <= said["simulate"]
 
 
 def test_help_loads_neither_arrays_nor_screens() -> None:

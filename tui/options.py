@@ -89,7 +89,13 @@ FilesArgument: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="FILE", help="Recordings (.h5); several are put together.")
 ]
 OutOption: TypeAlias = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="FILE", help="Where to write it.")
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        metavar="FILE",
+        help="Recording to write (.h5); named by bench and time where not given.",
+    ),
 ]
 JsonOption: TypeAlias = Annotated[
     str | None,
@@ -101,7 +107,13 @@ CsvOption: TypeAlias = Annotated[
 ]
 DurationOption: TypeAlias = Annotated[
     float | None,
-    typer.Option("--duration", "-d", metavar="TIME", parser=duration, help="As in 90s, 20min, 3h."),
+    typer.Option(
+        "--duration",
+        "-d",
+        metavar="TIME",
+        parser=duration,
+        help="As in 90s, 20min, 3h; where not given, as the bench file says.",
+    ),
 ]
 MethodOption: TypeAlias = Annotated[
     Method | None,
@@ -114,14 +126,22 @@ MethodOption: TypeAlias = Annotated[
 ]
 SegmentOption: TypeAlias = Annotated[
     float | None,
-    typer.Option("--segment", metavar="TIME", parser=duration, help="Length of one segment."),
+    typer.Option(
+        "--segment", metavar="TIME", parser=duration, help="Length of one segment, as in 10s, 2min."
+    ),
 ]
 OverlapOption: TypeAlias = Annotated[
     float | None,
-    typer.Option("--overlap", min=0, max=0.99, help="Share by which segments overlap."),
+    typer.Option(
+        "--overlap",
+        metavar="SHARE",
+        min=0,
+        max=0.99,
+        help="By which segments overlap, as in 0.5.",
+    ),
 ]
 WindowOption: TypeAlias = Annotated[
-    str | None, typer.Option("--window", metavar="NAME", help="Any window of scipy.")
+    str | None, typer.Option("--window", metavar="NAME", help="Any window of scipy, as in hann.")
 ]
 DetrendOption: TypeAlias = Annotated[
     Detrend | None,
@@ -143,14 +163,18 @@ ClocksOption: TypeAlias = Annotated[
 ]
 StartOption: TypeAlias = Annotated[
     str | None,
-    typer.Option("--start", metavar="T", help="From here: UTC, or a time after the start."),
+    typer.Option(
+        "--start",
+        metavar="T",
+        help="From here: UTC as in 2026-11-21T03:00:00, or after the start as in 2h.",
+    ),
 ]
 EndOption: TypeAlias = Annotated[
-    str | None, typer.Option("--end", metavar="T", help="To here: UTC, or after the start.")
+    str | None, typer.Option("--end", metavar="T", help="To here: likewise.")
 ]
 UnitOption: TypeAlias = Annotated[
     str | None,
-    typer.Option("--unit", metavar="UNIT", help="As in m/s², m/s, µg: spectra are in UNIT²/Hz."),
+    typer.Option("--unit", metavar="UNIT", help="As in m/s², mm/s, µg: spectra are in UNIT²/Hz."),
 ]
 BandOption: TypeAlias = Annotated[
     str | None,
@@ -193,5 +217,11 @@ DiagnosticsOption: TypeAlias = Annotated[
     bool, typer.Option("--diagnostics", help="Show all that is known of the test, band by band.")
 ]
 SpeedOption: TypeAlias = Annotated[
-    float | None, typer.Option("--speed", min=0.01, help="How many times as fast as life.")
+    float | None,
+    typer.Option(
+        "--speed",
+        metavar="FACTOR",
+        min=0.01,
+        help="How many times as fast as life; where not given, as the bench file says.",
+    ),
 ]

@@ -12,7 +12,6 @@ from tui.options import (
     BenchArgument,
     DurationOption,
     JsonOption,
-    OutOption,
     SpeedOption,
 )
 
@@ -93,13 +92,18 @@ def devices(
             help="Note each fault that strikes, and all that is sent: a line of JSON each.",
         ),
     ] = None,
-    out: OutOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Bench file to write; printed where not given."
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Serve a bench's devices, simulated, until Ctrl-C.
 
     Each device is a process of its own and speaks its real protocol, on a
-    pseudo-terminal or a TCP port. Prints a bench file that connects to them.
+    pseudo-terminal or a TCP port. Makes a bench file that connects to them.
 
     What moves, and how noisy each sensor is, stands in the bench file under
     simulation.
@@ -139,10 +143,20 @@ def plan(
     bench: BenchArgument,
     *,
     snr: Annotated[
-        float, typer.Option("--snr", min=1e-6, help="Motion over noise, as ratio of PSDs.")
+        float,
+        typer.Option(
+            "--snr", metavar="RATIO", min=1e-6, help="Motion over noise, as ratio of PSDs."
+        ),
     ] = 1000.0,
     cov: Annotated[
-        float, typer.Option("--cov", min=1e-4, max=1.0, help="Wanted scatter of one frequency.")
+        float,
+        typer.Option(
+            "--cov",
+            metavar="COV",
+            min=1e-4,
+            max=1.0,
+            help="Wanted coefficient of variation at one frequency.",
+        ),
     ] = 0.05,
     json: JsonOption = None,
 ) -> None:

@@ -19,12 +19,16 @@ def reproduce(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves; all if none.",
+            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, clocks; "
+            "all if none.",
         ),
     ] = None,
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FOLDER", help="Where figures go.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FOLDER", help="Where figures go; reproduced/ where not given."
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
