@@ -220,8 +220,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="Bench file with a \\[simulation] table, or of the paper: fig4, fig5, fig9, fig12, "
-            "fig13, setup1, setup2, waves.",
+            help="Bench file with a \\[simulation] table, or of the paper: fig4, fig5, fig9, "
+            "fig12, fig13, setup1, setup2, waves.",
         ),
     ],
     *,
