@@ -2,13 +2,15 @@
 
 A mask is judged in bands a third of an octave wide, where single frequencies scatter less: a
 channel fails where even the lower end of the band mean's 95 % interval is above the mask. It meets
-the mask for certain where the upper end is below it everywhere.
+the mask for certain where the upper end is below it everywhere. The intervals hold for all bands of
+a mask at once (Bonferroni): of channels that are just at it, one in forty fails by chance.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +59,7 @@ class Judged:
 
     @property
     def certain(self) -> bool:
-        """Whether the whole 95 % interval is on one side of the mask."""
+        """Whether the whole interval is on one side of the mask."""
         return self.low > self.limit_psd or self.high <= self.limit_psd
 
     @property
@@ -130,6 +132,7 @@ def _judge(
         edges,
         correlation_of(settings),
         weights=np.gradient(snapshot.frequency),
+        quantile=NormalDist().inv_cdf(1 - 0.025 / (edges.size - 1)),
     )
     worst = _worst(means, mask)
     if worst is None:

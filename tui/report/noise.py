@@ -90,7 +90,7 @@ def limits_section(bench: Bench | None, snapshot: Snapshot, found: list[Judged])
     note = (
         f"By the {method} estimate, in bands a third of an octave wide; shown is the band where "
         f"the channel does worst. dB re 1 ({snapshot.unit})²/Hz. A channel fails where the whole "
-        "95 % interval is above the limit."
+        "95 % interval, of all these bands at once, is above the limit."
     )
     table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))
