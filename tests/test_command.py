@@ -8,7 +8,8 @@ import os
 import re
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +20,7 @@ from sim_devices.scenarios import SCENARIOS
 from tui.command import app
 from tui.reproduce import STUDIES
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
+ROOT = Path(__file__).parents[1]
 COMMANDS = (
     "init",
     "check",
@@ -218,6 +217,22 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
     shown = huddle("plan", str(bench), "--cov", "0.05")
     assert "efficiency" in shown
+
+
+def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
+    bench, out = str(tmp_path / "lab.toml"), str(tmp_path / "model.h5")
+    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    huddle("init", "--out", bench)
+    for command in (
+        ("check", bench, "--no-devices"),
+        ("plan", bench),
+        ("simulate", bench, "--out", out, "--duration", "25s"),
+        ("repair", out, "--check"),
+        ("estimate", out),
+    ):
+        document = json.loads(huddle(*command, "--json", "-"))
+        missing = [key for key in document if f"`{key}`" not in said]
+        assert not missing, command
 
 
 # --------------------------------------------------------------- the real recording
