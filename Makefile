@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := daq estimator sim_devices tui tests benchmarks
+SOURCES := daq estimator sim_devices tui tests benchmarks docs
 
 .PHONY: demo test check bench clean
 
@@ -25,6 +25,7 @@ check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
+	$(BIN)/mypy docs/images/make.py
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def run() -> list[Row]:
     ]
     for name, step in (("20 ppm", 1 + PPM * 1e-6), ("1 %", 1.01)):
         positions = np.arange(100.3, len(samples) - 100, step)
-        work = least_work(lambda at=positions: resample(samples, at), repeats=3)
+        work = least_work(partial(resample, samples, positions), repeats=3)
         rows.append(
             Row(
                 f"channel samples a second and core, rates {name} apart",

@@ -15,10 +15,10 @@ import re
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image
 
 from daq.estimation import Settings, estimate
@@ -70,7 +70,8 @@ def placed(run: re.Match[str]) -> str:
     return "".join(parts)
 
 
-async def photograph(recording: Path, out: Path, *, size: tuple[int, int], keys: tuple[str, ...]):
+async def photograph(recording: Path, *, size: tuple[int, int], keys: tuple[str, ...]) -> str:
+    """Return a picture (SVG) of the application on a recording, after some keys."""
     settings = Settings(segment=2.0, methods=METHODS, band=(2.0, 20.0), target_cov=0.15)
     app = HuddleApp(RecordingControls(recording, settings), path=recording)
     async with app.run_test(size=size) as pilot:
@@ -78,7 +79,11 @@ async def photograph(recording: Path, out: Path, *, size: tuple[int, int], keys:
             await pilot.pause(0.1)
         await pilot.press(*keys)
         await pilot.pause(0.5)
-        picture = app.export_screenshot(title="huddle")
+        return app.export_screenshot(title="huddle")
+
+
+def draw(picture: str, out: Path) -> None:
+    """Write a picture of the application as PNG."""
     picture = _TEXT.sub(placed, picture.replace("Fira Code", "DejaVu Sans Mono"))
     with tempfile.NamedTemporaryFile("w", suffix=".svg") as file:
         file.write(picture)
@@ -90,19 +95,17 @@ async def photograph(recording: Path, out: Path, *, size: tuple[int, int], keys:
 
 
 def application(folder: Path) -> None:
+    """Draw the application on the demo's bench."""
     recording = folder / "lab.h5"
     bench = ROOT / "tui" / "resources" / "demo.toml"
     command = [sys.executable, "-m", "tui", "simulate", str(bench), "--duration", "300s"]
     subprocess.run([*command, "--out", str(recording)], check=True)
-    asyncio.run(photograph(recording, HERE / "application.png", size=(100, 30), keys=("down",)))
+    picture = asyncio.run(photograph(recording, size=(100, 30), keys=("down",)))
+    draw(picture, HERE / "application.png")
 
 
 def real_recording(folder: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    """Draw the noise of the sensors of the real recording."""
     recording = folder / "tst.h5"
     import_files(sorted(DATA.glob("*.mseed")), recording, response=DATA / "T-compact_Q330HR_BH_40")
     settings = Settings(segment=409.6, detrend="none", methods=METHODS, unit="m/s²")
@@ -111,7 +114,8 @@ def real_recording(folder: Path) -> None:
     edges = log_edges(frequency, 220)
     edges = edges[frequency[edges] <= 16.0]
     centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
-    figure, axes = plt.subplots(1, 3, figsize=(11, 4.2), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
     for axis, name, title in zip(
         axes, ("BH0", "BH1", "BH2"), ("vertical", "horizontal", "horizontal"), strict=True
     ):
@@ -156,6 +160,7 @@ def report(folder: Path) -> None:
 
 
 def main() -> None:
+    """Make all pictures."""
     with tempfile.TemporaryDirectory() as folder:
         application(Path(folder))
         report(Path(folder))
