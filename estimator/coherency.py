@@ -140,6 +140,12 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     return Coherency(matrix, psd, flags, duplicates)
 
 
+def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
+    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not finite."""
+    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1) | (frequency <= 0)
+    return np.where(lost[:, None, None], np.nan, given.matrix)
+
+
 def from_parts(
     method: str, given: Coherency, parts: tuple[FloatArray, ...], flags: IntArray
 ) -> SelfNoise:

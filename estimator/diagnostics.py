@@ -15,10 +15,10 @@ import numpy as np
 from scipy import special
 
 from estimator.advice import Advice, advise
-from estimator.coherency import check_dims, coherency
+from estimator.coherency import check_dims, coherency, testable
 from estimator.dimension import bands
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.factor_analysis import maximise, testable
+from estimator.factor_analysis import maximise
 from estimator.model_test import BandTest, ModelTest, model_test, pool
 from estimator.presence import Presence, presence
 from estimator.response import (

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.coherency import check_dims, coherency
+from estimator.coherency import check_dims, coherency, testable
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.factor_analysis import max_factors, maximise, testable
+from estimator.factor_analysis import max_factors, maximise
 from estimator.likelihood import standard_error
 from estimator.model_test import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.presence import presence

@@ -7,9 +7,10 @@ they exceed one, and what is left of -2/n times the log likelihood ratio is twic
     f(psi) = sum over the other eigenvalues of (w - ln w - 1)           (Lawley and Maxwell)
 
 which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
-eigendecomposition, negative curvature turned round, steps kept in a trust region, every
-frequency at its own pace, and those that have arrived left out. A channel that falls towards zero
-noise, where Newton's steps in ln psi become one each, is put there at once if that is better.
+eigendecomposition, steps kept in a trust region, every frequency at its own pace, and those that
+have arrived left out. Where the Hessian is not convex its expectation is taken as long as that
+promises much, and near the end negative curvature is turned round. A channel that falls towards
+zero noise, where Newton's steps in ln psi become one each, is put there at once if that is better.
 """
 
 from __future__ import annotations
@@ -20,15 +21,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.self_noise import Flag
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-    from estimator.coherency import Coherency
 
 MAX_ITERATIONS = 200
-DECREMENT = 1e-8
-"""Newton decrement at which a frequency has arrived: ln psi is then within 1e-4 standard errors
+DECREMENT = 1e-7
+"""Newton decrement at which a frequency has arrived: ln psi is then within 3e-4 standard errors
 of a single average, and the step still taken squares that."""
 BOUNDARY = 1e-6
 """psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
@@ -36,6 +35,7 @@ _MAX_STEP = 2.0  # in ln psi, the first trust region
 _MIN_RADIUS = 1e-9
 _MIN_CURVATURE = 1e-9
 _CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
+_FAR = 0.1  # part of the discrepancy that a step by the Hessian's expectation has to promise
 _FALLING = np.log(0.1 / BOUNDARY)
 """A channel that falls further from less than this above its boundary is tried there at once: on
 its way the likelihood grows ever less, and ln psi by one a step."""
@@ -140,12 +140,6 @@ def check_factors(n_factors: int, n_channels: int) -> None:
         )
 
 
-def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
-    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not finite."""
-    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1) | (frequency <= 0)
-    return np.where(lost[:, None, None], np.nan, given.matrix)
-
-
 def maximise(
     csm: ComplexArray,
     n_factors: int,
@@ -177,11 +171,11 @@ def maximise(
 
     Notes
     -----
-    The search starts from ``(1 - q / (2 p)) / (S^-1)_ii``; a frequency that has not arrived after
-    `MAX_ITERATIONS` is reported as such. Gradient ``sum_m (1 - w_m) |u_im|**2`` over the residual
-    eigenvalues; Hessian after Clarke (1970) carried over to complex matrices. Its expectation
-    ``|P_ij|**2``, P the projector on the residual eigenvectors, is the Fisher information of
-    ln psi with A eliminated.
+    The search starts from the best multiple of ``1 / (S^-1)_ii``; a frequency that has not arrived
+    after `MAX_ITERATIONS` is reported as such. Gradient ``sum_m (1 - w_m) |u_im|**2`` over the
+    residual eigenvalues; Hessian after Clarke (1970) carried over to complex matrices. Its
+    expectation ``|P_ij|**2``, P the projector on the residual eigenvectors, is the Fisher
+    information of ln psi with A eliminated.
     """
     if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
         raise InvalidMatrixError(
@@ -207,7 +201,7 @@ def maximise(
     if usable.any():
         partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
         lowest = np.log(partial * BOUNDARY)
-        start = partial * (1 - n_factors / (2 * p))
+        start = partial
         if n_factors == 0 and penalty is None:  # then that is the maximum
             start = np.real(np.einsum("fii->fi", csm[usable]))
         _search(
@@ -251,7 +245,7 @@ def _search(
     q = found.n_factors
     n = len(precision)
     penalty = found.penalty
-    best = _evaluate(precision, x0, q)
+    best = _scaled(_evaluate(precision, x0, q), q)
     gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
     falling = _falling(best.x, step, lowest)
     radius = np.full(n, _MAX_STEP)
@@ -314,8 +308,18 @@ def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
     scale = np.exp(0.5 * x)
     inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])
     w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
-    terms = np.where(_residual(w, q), w - np.log(w) - 1, 0.0)
-    return _Point(x.copy(), terms.sum(axis=1), w, u)
+    return _Point(x.copy(), _discrepancy(w, q), w, u)
+
+
+def _scaled(at: _Point, q: int) -> _Point:
+    """Go to the best multiple of all psi, where the residual eigenvalues have a mean of one."""
+    mean = at.eigenvalues[:, q:].mean(axis=1, keepdims=True)
+    w = at.eigenvalues / mean
+    return _Point(at.x + np.log(mean), _discrepancy(w, q), w, at.eigenvectors)
+
+
+def _discrepancy(w: FloatArray, q: int) -> FloatArray:
+    return np.asarray(np.where(_residual(w, q), w - np.log(w) - 1, 0.0).sum(axis=1))
 
 
 def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:
@@ -333,22 +337,37 @@ def _newton(
     """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
     w, u = at.eigenvalues, at.eigenvectors
     residual = _residual(w, q)
-    power = np.abs(u) ** 2
-    gradient = np.einsum("fik,fk->fi", power, np.where(residual, 1 - w, 0.0))
-    gradient += at.x @ penalty
-    hessian = _hessian(w, u, residual, q) + penalty
+    conj = u.conj().swapaxes(1, 2)
+    projector = (u * residual[:, None, :]) @ conj
+    weighted = (u * np.where(residual, w, 0.0)[:, None, :]) @ conj
+    gradient = np.einsum("fii->fi", projector - weighted).real + at.x @ penalty
+    hessian = weighted.real * projector.real + weighted.imag * projector.imag + penalty
+    if q:
+        hessian += _turning(w, u, residual, q)
     at_boundary = (at.x <= lowest) & (gradient > 0)
     free = ~at_boundary
-    hessian *= free[:, :, None] & free[:, None, :]
+    among = free[:, :, None] & free[:, None, :]
+    hessian *= among
     i = np.arange(w.shape[1])
     hessian[:, i, i] += at_boundary
     downhill = np.where(free, gradient, 0.0)
     step = np.zeros_like(downhill)
     convex = _least_pivot(hessian) > _CONVEX
-    step[convex] = -np.linalg.solve(hessian[convex], downhill[convex, :, None])[:, :, 0]
-    if not convex.all():
-        step[~convex] = _turned(hessian[~convex], downhill[~convex])
+    step[convex] = _solved(hessian[convex], downhill[convex])
+    bent = np.flatnonzero(~convex)
+    if len(bent):
+        expected = (projector.real[bent] ** 2 + projector.imag[bent] ** 2 + penalty) * among[bent]
+        expected[:, i, i] += at_boundary[bent] + _MIN_CURVATURE
+        step[bent] = _solved(expected, downhill[bent])
+        gain = -(step[bent] * downhill[bent]).sum(axis=1)
+        size = np.abs(step[bent]).max(axis=1)
+        bent = bent[(gain < _FAR * at.discrepancy[bent]) | (size > _MAX_STEP)]
+        step[bent] = _turned(hessian[bent], downhill[bent])
     return gradient, step, -(step * downhill).sum(axis=1), at_boundary
+
+
+def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    return np.asarray(-np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
 
 
 def _least_pivot(matrices: FloatArray) -> FloatArray:
@@ -374,18 +393,13 @@ def _turned(hessian: FloatArray, downhill: FloatArray) -> FloatArray:
     return np.asarray(-np.einsum("fik,fk->fi", axes, along / curvature))
 
 
-def _hessian(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:
-    """Second derivatives of the discrepancy by ln psi, shape (n_freqs, p, p)."""
-    conj = u.conj().swapaxes(1, 2)
-    projector = (u * residual[:, None, :]) @ conj
-    weighted = (u * np.where(residual, w, 0.0)[:, None, :]) @ conj
-    hessian = np.real(weighted * projector.conj())
-    if q:
-        p = w.shape[1]
-        factor, rest = w[:, None, :q], w[:, q:, None]
-        distance = np.maximum(factor - rest, 1e-6 * factor)
-        weight = np.where(residual[:, None, :q], 0.0, (1 - rest) * (factor + rest) / distance)
-        pairs = (u[:, :, q:, None].conj() * u[:, :, None, :q]).reshape(len(w), p, q * (p - q))
-        bent = (pairs * weight.reshape(len(w), 1, q * (p - q))) @ pairs.conj().swapaxes(1, 2)
-        hessian += np.real(bent)
-    return np.asarray(hessian, np.float64)
+def _turning(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:
+    """Second derivatives by ln psi that come of the factors' turning, shape (n_freqs, p, p)."""
+    n, p = w.shape
+    factor, rest = w[:, None, :q], w[:, q:, None]
+    distance = np.maximum(factor - rest, 1e-6 * factor)
+    weight = np.where(residual[:, None, :q], 0.0, (1 - rest) * (factor + rest) / distance)
+    pairs = (u[:, :, q:, None].conj() * u[:, :, None, :q]).reshape(n, p, q * (p - q))
+    weighted = pairs * weight.reshape(n, 1, q * (p - q))
+    # the real part of a product of complex numbers is one of twice as many real numbers
+    return np.asarray(weighted.view(np.float64) @ pairs.view(np.float64).swapaxes(1, 2))

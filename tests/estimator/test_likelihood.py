@@ -9,7 +9,7 @@ import pytest
 
 from estimator import fisher
 from estimator.errors import InsufficientDataError, InvalidMatrixError
-from estimator.factor_analysis import max_factors, maximise
+from estimator.factor_analysis import DECREMENT, max_factors, maximise
 from estimator.likelihood import maximum_likelihood
 from estimator.self_noise import Flag
 from tests.estimator.models import (
@@ -122,11 +122,11 @@ def test_second_order_means_few_iterations() -> None:
         equal_noise(9, dims=(3, 3, 3), snr=1e3), 1080, np.random.default_rng(9), n_draws=100
     )
     found = maximise(draws, 3)
-    assert found.iterations.max() <= 6
-    assert found.gradient_norm.max() < 1e-4
+    assert found.iterations.max() <= 3
+    assert found.gradient_norm.max() < np.sqrt(DECREMENT)  # the Hessian's elements are at most 1
 
 
-@pytest.mark.parametrize(("n_factors", "most"), [(0, 1), (1, 8), (3, 12)])
+@pytest.mark.parametrize(("n_factors", "most"), [(0, 1), (1, 8), (3, 10)])
 def test_noise_that_falls_to_zero_takes_few_iterations(n_factors: int, most: int) -> None:
     """Weak motion and few averages: nearly every frequency has such a channel, or several."""
     draws = wishart(
