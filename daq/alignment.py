@@ -225,7 +225,9 @@ class AlignedRecording:
         reference = sources[self._reference]
         first_of: dict[str, SensorSource] = {}
         for source in [reference, *(each for each in sources if each is not reference)]:
-            first = first_of.setdefault(source.clock_name, source)
+            name = source.clock_name
+            first = first_of.get(name) or source.repeats(first_of.values()) or source
+            first_of[name] = first
             measured = None if source is reference else source.measured(reference.known_clock)
             if source.polled:
                 source.clock = source.by_instants()

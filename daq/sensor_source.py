@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import bisect
 import itertools
+import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from daq.clock_model import Clock
@@ -22,6 +25,10 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
+
+
+_PROOF = 256  # samples whose counts are equal, one by one, are the same samples
+_APART = 1.0  # seconds by which two wires may deliver them apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,11 +169,49 @@ class SensorSource:
         std = np.concatenate([each.std for each in self.learnt])
         return MeasuredDelays(index, seconds, std)
 
+    def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
+        """Return the one of others that is the same sensor, read over another wire."""
+        for other in others:
+            apart = self.arrivals.start - other.arrivals.start
+            guess = round(apart * self.record.sampling_rate)
+            if self._lag(other, self.runs[0].first_sample, guess) is not None:
+                return other
+        return None
+
+    def _lag(self, other: SensorSource, first: int, guess: int) -> int | None:
+        """Return the n for which its samples i, soon after `first`, are the other's i + n.
+
+        By their counts; None if they are not the same, or stand still, or repeat themselves.
+        """
+        stated = self.device_utc or self.polled or other.device_utc or other.polled
+        if stated or self.record.sampling_rate != other.record.sampling_rate:
+            return None
+        reach = math.ceil(_APART * self.record.sampling_rate)
+        first = max(first, other.runs[0].first_sample - guess) + 2 * reach
+        mine = self._counts(first, _PROOF)
+        others = other._counts(first + guess - reach, _PROOF + 2 * reach)
+        if mine is None or others is None or mine.shape[1] != others.shape[1]:
+            return None
+        if np.count_nonzero(np.diff(mine, axis=0).any(axis=1)) < _PROOF // 4:
+            return None
+        stretches = np.lib.stride_tricks.sliding_window_view(others, _PROOF, axis=0)
+        same = np.flatnonzero((stretches == mine.T).all(axis=(1, 2)))
+        return guess - reach + int(same[0]) if len(same) == 1 else None
+
+    def _counts(self, first: int, n_samples: int) -> NDArray[Any] | None:
+        """Return counts of contiguous samples from `first` on, if they are there."""
+        for run in self.runs:
+            if run.first_sample <= first and first + n_samples <= run.first_sample + run.n_samples:
+                row = run.first_row + first - run.first_sample
+                return self.record.counts(row, row + n_samples)[:, self.columns]
+        return None
+
     def share(self, first: SensorSource, measured: MeasuredDelays | None) -> None:
         """Set the clock to that of another sensor, which the same oscillator samples.
 
         Sensors whose blocks are received together count alike. Others have begun to count at
-        different samples: how many apart, the samples tell, or else the arrival times.
+        different samples: how many apart, the samples tell, or else the arrival times. If it is
+        the same sensor, its counts tell.
         """
         name, known = self.record.name, first.known_clock
         self.offset_in_doubt = not self.arrivals.come_with(first.arrivals)
@@ -176,7 +221,12 @@ class SensorSource:
         stretches, by_samples = [], measured is not None
         for begin, end, index, seconds in self.arrivals.earliest():
             apart = float((known.position(seconds) - index).min())
-            if measured is not None:
+            lag = None
+            if self.clock_name != first.clock_name:
+                lag = self._lag(first, begin, round(apart))
+            if lag is not None:
+                apart, by_samples = lag, True
+            elif measured is not None:
                 mine = (measured.index >= begin) & (measured.index < end)
                 mine &= np.isfinite(measured.std)
                 if mine.any():
