@@ -1,8 +1,11 @@
 """Options that several commands share, each defined once."""
 
+import inspect
+from collections.abc import Callable
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -225,3 +228,56 @@ SpeedOption: TypeAlias = Annotated[
         help="How many times as fast as life; where not given, as the bench file says.",
     ),
 ]
+
+
+def _estimate(
+    *,
+    method: MethodOption = None,
+    segment: SegmentOption = None,
+    overlap: OverlapOption = None,
+    window: WindowOption = None,
+    detrend: DetrendOption = None,
+    no_correction: NoCorrectionOption = False,
+    clocks: ClocksOption = None,
+    reject: RejectOption = None,
+    octaves: OctavesOption = None,
+    dimension: DimensionOption = None,
+    gain: GainOption = None,
+    start: StartOption = None,
+    end: EndOption = None,
+    unit: UnitOption = None,
+    band: BandOption = None,
+) -> dict[str, Any]:
+    """Return what is wanted of an estimate: fields of Settings, None where not given."""
+    return {
+        "method": method,
+        "segment": segment,
+        "overlap": overlap,
+        "window": window,
+        "detrend": detrend,
+        "correct": False if no_correction else None,
+        "clocks": clocks,
+        "reject": reject,
+        "octaves": octaves,
+        "dimension": factors(dimension),
+        "gains": gains(gain),
+        "start": start,
+        "end": end,
+        "unit": unit,
+        "band": frequencies(band),
+    }
+
+
+def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of an estimate; it gets what they ask for as ``wanted``."""
+    shared = inspect.signature(_estimate).parameters
+    first, *others = inspect.signature(command).parameters.values()
+
+    @wraps(command)
+    def with_options(**given: Any) -> None:  # noqa: ANN401 - values of options
+        wanted = _estimate(**{name: given.pop(name) for name in shared})
+        command(**given, **wanted)
+
+    own = [each for each in others if each.kind is not each.VAR_KEYWORD]
+    vars(with_options)["__signature__"] = inspect.Signature([first, *shared.values(), *own])
+    return with_options

@@ -3,36 +3,19 @@
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tui.commands import examples
 from tui.options import (
-    BandOption,
-    ClocksOption,
     CsvOption,
-    DetrendOption,
     DiagnosticsOption,
-    DimensionOption,
     DurationOption,
-    EndOption,
     FileArgument,
     FilesArgument,
-    GainOption,
     JsonOption,
-    MethodOption,
-    NoCorrectionOption,
-    OctavesOption,
-    OverlapOption,
-    RejectOption,
-    SegmentOption,
-    StartOption,
-    UnitOption,
-    WindowOption,
-    factors,
-    frequencies,
-    gains,
+    with_estimate_options,
 )
 
 
@@ -42,27 +25,14 @@ from tui.options import (
     "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
     "huddle estimate night.h5 --octaves --dimension auto --diagnostics",
 )
+@with_estimate_options
 def estimate(
     files: FilesArgument,
     *,
-    method: MethodOption = None,
-    segment: SegmentOption = None,
-    overlap: OverlapOption = None,
-    window: WindowOption = None,
-    detrend: DetrendOption = None,
-    no_correction: NoCorrectionOption = False,
-    clocks: ClocksOption = None,
-    reject: RejectOption = None,
-    octaves: OctavesOption = None,
-    dimension: DimensionOption = None,
-    gain: GainOption = None,
-    start: StartOption = None,
-    end: EndOption = None,
-    unit: UnitOption = None,
-    band: BandOption = None,
     diagnostics: DiagnosticsOption = False,
     json: JsonOption = None,
     csv: CsvOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of Settings
 ) -> None:
     """Estimate the self-noise of every channel from recordings.
 
@@ -70,27 +40,7 @@ def estimate(
     """
     from tui.estimating import estimate_recordings
 
-    estimate_recordings(
-        files,
-        method=method,
-        segment=segment,
-        overlap=overlap,
-        window=window,
-        detrend=detrend,
-        correct=False if no_correction else None,
-        clocks=clocks,
-        reject=reject,
-        octaves=octaves,
-        dimension=factors(dimension),
-        gains=gains(gain),
-        start=start,
-        end=end,
-        unit=unit,
-        band=frequencies(band),
-        diagnostics=diagnostics,
-        json=json,
-        csv=csv,
-    )
+    estimate_recordings(files, diagnostics=diagnostics, json=json, csv=csv, **wanted)
 
 
 @examples(
@@ -98,6 +48,7 @@ def estimate(
     "huddle report night.h5 --out night.pdf --band 1:20",
     "huddle report monday.h5 tuesday.h5 --method all --out week.html",
 )
+@with_estimate_options
 def report(
     files: FilesArgument,
     *,
@@ -111,21 +62,7 @@ def report(
             "where not given.",
         ),
     ] = None,
-    method: MethodOption = None,
-    segment: SegmentOption = None,
-    overlap: OverlapOption = None,
-    window: WindowOption = None,
-    detrend: DetrendOption = None,
-    no_correction: NoCorrectionOption = False,
-    clocks: ClocksOption = None,
-    reject: RejectOption = None,
-    octaves: OctavesOption = None,
-    dimension: DimensionOption = None,
-    gain: GainOption = None,
-    start: StartOption = None,
-    end: EndOption = None,
-    unit: UnitOption = None,
-    band: BandOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of Settings
 ) -> None:
     """Write the calibration report of a huddle test, for the screen and for paper.
 
@@ -138,25 +75,7 @@ def report(
     """
     from tui.reporting import report_recordings
 
-    report_recordings(
-        files,
-        out=out,
-        method=method,
-        segment=segment,
-        overlap=overlap,
-        window=window,
-        detrend=detrend,
-        correct=False if no_correction else None,
-        clocks=clocks,
-        reject=reject,
-        octaves=octaves,
-        dimension=factors(dimension),
-        gains=gains(gain),
-        start=start,
-        end=end,
-        unit=unit,
-        band=frequencies(band),
-    )
+    report_recordings(files, out=out, **wanted)
 
 
 @examples(
