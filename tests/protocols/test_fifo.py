@@ -241,6 +241,8 @@ def test_reads_without_a_reply(header: Header, reached: bool) -> None:
     hurt_blocks = [b for b in found if isinstance(b, Block) and b.reason]
     assert [b.reason for b in hurt_blocks] == (["lost reply"] if missing else [])
     assert all(b.flags == BlockFlag.MISSING_ESTIMATED for b in hurt_blocks)
+    guessed = [b for b in found if isinstance(b, Block) and b.flags & BlockFlag.MISSING_ESTIMATED]
+    assert len(guessed) == bool(lost[0]), "clocks begin anew where the index may be wrong"
 
 
 @pytest.mark.parametrize("header", ["size", "left"])
