@@ -14,6 +14,8 @@ from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from daq.bench import parse_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
+from estimator.errors import EstimatorError
+from estimator.windows import get_window
 from tui.diagnosis import details, summary
 from tui.limits import exceeded
 from tui.output import check_places, for_people, notices, progress, write_json, write_text
@@ -101,6 +103,12 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
     if method is not None:
         changes["methods"] = (str(method),)
     settings = replace(settings, **changes)
+    try:
+        get_window(settings.window, 16)
+    except EstimatorError:
+        raise typer.BadParameter(
+            f"--window {settings.window!r}: scipy.signal.get_window knows none of this name"
+        ) from None
     for option, needed in (("dimension", "maximum-likelihood"), ("gains", "two-channel")):
         if option not in changes or {needed, "all"} & set(settings.methods):
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from tui.following import follow
 from tui.state import Lookout, Now, SensorNow
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from daq.estimation import Settings, Snapshot
@@ -94,15 +96,21 @@ class Bench:
         self.writer.commit()
 
 
-def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> None:
-    path = tmp_path / "run.h5"
+@contextmanager
+def looked_at(path: Path) -> Iterator[tuple[Bench, Callable[[], dict[str, SensorNow]]]]:
+    """Yield a bench that is recorded, and how its sensors are by name."""
     with growing(path) as writer, Recording.open(path) as recording:
-        bench, lookout = Bench(writer), Lookout(recording)
+        lookout = Lookout(recording)
 
         def look() -> dict[str, SensorNow]:
             recording.refresh()
             return {sensor.name: sensor for sensor in lookout.look_closely().sensors}
 
+        yield Bench(writer), look
+
+
+def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> None:
+    with looked_at(tmp_path / "run.h5") as (bench, look):
         assert {sensor.state for sensor in look().values()} == {"waiting"}
         bench.send("ABC", 6)
         assert {sensor.state for sensor in look().values()} == {"live"}
@@ -121,7 +129,7 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         bench.send("B", 14)
         assert look()["B"].state == "live"
         bench.say("C", "disconnected", 14.5, "the port is gone")
-        writer.close()
+        bench.writer.close()
         states = {name: sensor.state for name, sensor in look().items()}
         assert states == {"A": "ended", "B": "ended", "C": "disconnected"}
 
@@ -133,7 +141,7 @@ def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -
         Bench(writer).send("ABC", 8)
         recording.refresh()
         now = Lookout(recording).look()
-        assert now.ends_in == (None if duration is None else pytest.approx(52, abs=0.1))
+        assert now.ends_in == (None if duration is None else pytest.approx(60 - now.elapsed))
         writer.close()
         recording.refresh()
         assert Lookout(recording).look().ends_in is None
@@ -155,14 +163,7 @@ def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:
 
 
 def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -> None:
-    path = tmp_path / "run.h5"
-    with growing(path) as writer, Recording.open(path) as recording:
-        bench, lookout = Bench(writer), Lookout(recording)
-
-        def look() -> dict[str, SensorNow]:
-            recording.refresh()
-            return {sensor.name: sensor for sensor in lookout.look_closely().sensors}
-
+    with looked_at(tmp_path / "run.h5") as (bench, look):
         bench.send("AB", 6)
         bench.send("C", 6, dead=1)
         bench.send("A", 8, clipped=True)
