@@ -18,6 +18,7 @@ from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.counting import Run, SampleCounter
 from daq.protocols.epson import BURST_HEADER, DELIMITER, FLAG_ERROR, word_sums
 from daq.protocols.framing import PIECE, BoolArray, OctetArray, find_frames
+from daq.protocols.wording import several
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -162,7 +163,7 @@ class BurstDecoder:
         found: list[Block | Event] = []
         for run in runs:
             if run.restarted:
-                text = f"COUNT began anew; about {run.missing} samples are missing"
+                text = f"COUNT began anew; missing: about {several(run.missing, 'sample')}"
                 found.append(Event(self._sensor, "reset", text, at))
             found.append(self._block(run, counts[run.start : run.stop], at))
         return found
@@ -172,7 +173,7 @@ class BurstDecoder:
         if run.restarted or not self._started:
             flags |= BlockFlag.CLOCK_RESTART
         if run.missing:
-            reason = f"{run.missing} samples not received"
+            reason = several(run.missing, "sample", "not received")
             if run.restarted:
                 reason = "the device was reset"
             if run.restarted or "count" not in self._burst:
@@ -196,9 +197,9 @@ class BurstDecoder:
 
     def _report(self, at: HostTime) -> list[Event]:
         said = {
-            "checksum": "{} frames with a wrong checksum",
-            "resynchronised": "{} bytes that are no frame were skipped",
-            "repeated": "{} frames came twice",
+            "checksum": ("frame", "with a wrong checksum"),
+            "resynchronised": ("byte", "skipped between frames"),
+            "repeated": ("frame", "came twice"),
         }
         events = []
         for kind, n in self._counts.items():
@@ -206,5 +207,5 @@ class BurstDecoder:
                 self._counts[kind] = 0
                 self._reported[kind] = at.monotonic_ns
                 kind_of_event = "resynchronised" if kind == "repeated" else kind
-                events.append(Event(self._sensor, kind_of_event, said[kind].format(n), at))
+                events.append(Event(self._sensor, kind_of_event, several(n, *said[kind]), at))
         return events

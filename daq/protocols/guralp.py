@@ -32,6 +32,7 @@ from daq.protocols.scream import (
     PacketFinder,
     decode_packet,
 )
+from daq.protocols.wording import several
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -301,7 +302,7 @@ class SerialDecoder:
                     found.append(Event(self._name, "checksum", f"block {sequence} was damaged", at))
                     self.streams.lost("damaged block")
                 case Lost(sequence, n_frames):
-                    text = f"{n_frames} blocks from number {sequence} did not come again"
+                    text = f"{several(n_frames, 'block')} from number {sequence} did not come again"
                     found.append(Event(self._name, "resynchronised", text, at))
                     self.streams.lost("lost block")
                 case Anew(sequence, due):
@@ -366,7 +367,9 @@ class ScreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, at)
             else:
-                found.append(Event(self._name, "resynchronised", f"skipped {item} bytes", at))
+                found.append(
+                    Event(self._name, "resynchronised", f"skipped {several(item, 'byte')}", at)
+                )
         return found
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
@@ -407,7 +410,7 @@ class ScreamDecoder:
     def _advance(self, due: int, ahead: int, at: HostTime) -> Iterator[Event]:
         if ahead:
             self.streams.lost("lost packet")
-            yield Event(self._name, "resynchronised", f"{ahead} packets missing", at)
+            yield Event(self._name, "resynchronised", several(ahead, "packet", "missing"), at)
         aged = {number: since + 1 for number, since in self._missing.items()}
         if ahead <= self.MOST_MISSING:  # more than that is no disorder on the way
             aged |= {(due + i) % 65536: 0 for i in range(ahead)}

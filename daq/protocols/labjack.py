@@ -45,6 +45,7 @@ from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.counting import CLOCK_TOLERANCE, SLACK, SampleCounter
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack_registers import CORE_HZ, CORE_TIMER, FEEDBACK, STREAM_DATA_CAPTURE_16
+from daq.protocols.wording import several
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -245,7 +246,9 @@ class StreamDecoder:
             if isinstance(item, Packet):
                 found += self._packet(item, rows, at)
             else:
-                found.append(Event(self._name, "resynchronised", f"skipped {item} bytes", at))
+                found.append(
+                    Event(self._name, "resynchronised", f"skipped {several(item, 'byte')}", at)
+                )
         return found + self._blocks(rows, at)
 
     def receive_response(self, packet: Packet, at: HostTime) -> list[Block | Event]:
@@ -267,7 +270,7 @@ class StreamDecoder:
             return found
         if lost:
             found += self._blocks(rows, at)
-            found.append(Event(self._name, "resynchronised", f"{lost} packets lost", at))
+            found.append(Event(self._name, "resynchronised", several(lost, "packet", "lost"), at))
             self._skip_samples(lost * self._packet_size)
         self._packet_size = len(packet.samples) or self._packet_size
         if packet.status == AUTO_RECOVER_ACTIVE and not self._recovering:
@@ -280,7 +283,7 @@ class StreamDecoder:
             before, scans = self._around_dummy(scans)
             rows.append(before)
             found += self._blocks(rows, at)
-            text = f"the device skipped {packet.information} scans (2941)"
+            text = f"the device skipped {several(packet.information, 'scan')} (2941)"
             found.append(Event(self._name, "overflow", text, at))
             self._next_row += packet.information
             self._reason = "buffer overflow"

@@ -21,6 +21,7 @@ import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, CountsArray, Event
 from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.wording import several
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -346,7 +347,7 @@ class RegisterDecoder:
                 flags |= BlockFlag.CLOCK_RESTART
             if missing[start]:
                 flags |= BlockFlag.MISSING_ESTIMATED
-                reason = f"{missing[start]} polls without a reading"
+                reason = several(int(missing[start]), "poll", "without a reading")
             part = counts[start:stop]
             if part.dtype.kind != "f":
                 ends = np.iinfo(self._map.dtype)

@@ -164,9 +164,9 @@ def test_a_wrong_checksum_is_a_gap_of_exactly_one() -> None:
     found = decoder().receive(bytes(stream), at(0.05))
     blocks = [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 4), (5, 5)]
-    assert blocks[1].reason == "1 samples not received"
+    assert blocks[1].reason == "1 sample not received"
     assert [(e.kind, e.text) for e in found if isinstance(e, Event)] == [
-        ("checksum", "1 frames with a wrong checksum")
+        ("checksum", "1 frame with a wrong checksum")
     ]
 
 

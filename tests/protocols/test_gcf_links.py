@@ -332,7 +332,7 @@ def test_udp_packets_that_overtake_and_that_stay_lost() -> None:
     counts, blocks, events = joined(found)
     np.testing.assert_array_equal(counts, np.concatenate([expected(0, 200), expected(300, 3700)]))
     assert [b.first_sample for b in blocks if b.reason] == [300]
-    assert [e.text for e in events] == ["1 packets missing", "1 packets missing"]
+    assert [e.text for e in events] == ["1 packet missing", "1 packet missing"]
 
 
 @pytest.mark.parametrize("lost", range(3, 6))
