@@ -11,8 +11,9 @@ stepped in the middle of a run changes nothing.
 Arrival times are thinned to the earliest in each second, so that memory and work do not grow with
 the block rate. A line under all of them (the edge of their lower convex hull below their mean)
 takes out what is common; the earliest in each stretch of `_NODE` seconds then is one observation
-for the filter of :mod:`daq.clock_filter`, which follows a rate that wanders. Delays measured from
-the samples (:mod:`daq.refinement`) join there.
+for the filter of :mod:`daq.clock_filter`, which follows a rate that wanders; where blocks are
+polled, a stretch is as long as :mod:`daq.polling` says. Delays measured from the samples
+(:mod:`daq.refinement`) join there.
 
 A stretch between restarts of the device's clock is an :class:`daq.clock_model.Epoch`; within one,
 the sample index counts without error. A block that says ``CLOCK_RESTART`` or
@@ -36,7 +37,7 @@ import numpy as np
 
 from daq.clock_filter import Observations, smooth
 from daq.clock_model import Clock, ClockState, Epoch
-from daq.polling import Polls
+from daq.polling import SURELY, Polls, shows
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 _NANO = 1e-9
 _NODE = 10.0  # seconds of arrival times that make one observation
 _MOST_NODES = 3000
-_FEW = 4  # nodes
 _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
@@ -263,7 +263,12 @@ class ArrivalTimes:
     ) -> Clock:
         left = self._late - slope * self._index - np.array(anchors)[self._epoch]
         duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
+        # Within one step of polled latencies nothing is seen of a clock, for a whole beat.
+        step = self._polls.step(slope)
+        beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
         node = max(_NODE, duration / _MOST_NODES)
+        if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
+            node, step = max(node, SURELY * beat), 0.0  # the earliest of those is early indeed
         kept = _earliest(self._index, left, self._epoch, self.sampling_rate * node)
         begins = np.diff(self._index // (self.sampling_rate * node), prepend=-1.0) != 0
         begins |= np.diff(self._epoch, prepend=-1) != 0
@@ -289,15 +294,12 @@ class ArrivalTimes:
             from_samples=variance > 0,
             restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
         )
-        # Within one step of polled latencies nothing is seen of a clock, for a whole beat.
-        step = self._polls.step(slope)
-        beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
         hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
         smoothed = smooth(observations, least_noise=max(hidden, scatter))
         residual = smoothed.varying
-        if len(kept) < _FEW:  # hardly more than the line itself, which nothing checks
-            residual = math.hypot(residual, 2 * scatter)
         refined = bool(observations.from_samples.any())
+        if not refined:  # nothing checks the line within the time of one observation
+            residual = math.hypot(residual, max(hidden, 2 * scatter) / len(kept))
         known_to = float(np.sqrt(np.mean(smoothed.std**2)))
         if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
             return self._filtered(sensor, slope, anchors, None)

@@ -8,14 +8,17 @@ times, and, where the sensors share a motion, the delay against a reference sens
 the samples. The latter know the lateness up to one constant (latencies differ), so the state is
 (lateness, rate, constant).
 
-A Kalman filter runs for a grid of strengths of the random walk and of arrival noise at once; the
-most likely pair is smoothed backwards (Rauch, Tung, Striebel 1965). An innovation beyond four
-standard deviations counts as four: an outlier cannot pull, a change that stays is followed.
-A restart of the device's clock forgets the lateness and keeps the rate.
+A Kalman filter runs for a grid of strengths of the random walk and of arrival noise at once. Few
+observations leave many pairs possible, so all those are smoothed backwards (Rauch, Tung, Striebel
+1965) and averaged by their likelihood, times what is known of oscillators and of arrivals
+beforehand. What is stated is the variance of that mixture about its mean over the recording: a
+constant is no concern of the method. An innovation beyond four standard deviations counts as four:
+an outlier cannot pull, a change that stays is followed. A restart of the device's clock forgets the
+lateness and keeps the rate.
 
 Arrivals alone do not tell a clock that wanders from a host whose shortest latency does. So the
-clock is smoothed twice: with the most likely walk, and with one that oscillators have at a steady
-temperature. By how much both differ is part of what is stated.
+clock is smoothed once more, with the walk that oscillators have at a steady temperature. By how
+much both differ is part of what is stated.
 
 Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model.md.
 """
@@ -40,6 +43,10 @@ _STEADY = 1e-8  # the walk of an oscillator that is left in peace: 0.25 ppm in t
 _START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
 _RESTART_RATE = 1e-6
 _HUBER = 4.0
+_USUAL = 5e-9  # walk that is expected, within
+_USUALLY = 0.75  # decades
+_HARDLY_MORE = 0.35  # decades by which arrivals scatter more than those of their group say
+_UNLIKELY = 0.01  # of the greatest likelihood: too little to count
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +90,6 @@ class Smoothed:
         may be their wander.
     constant : float
         By how much observations from the samples lie above those from arrivals, in s.
-    walk, noise : float
-        Most likely strength of the random walk (s/s per √s), and of arrival noise (s).
     """
 
     lateness: FloatArray
@@ -92,12 +97,10 @@ class Smoothed:
     std: FloatArray
     varying: float
     constant: float
-    walk: float
-    noise: float
 
 
 def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
-    """Return the most likely clock.
+    """Return the clock to be expected.
 
     Parameters
     ----------
@@ -106,31 +109,33 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     least_noise : float
         Standard deviation of arrivals, in s, that they have at least.
     """
-    walks, noises = (grid.ravel() for grid in np.meshgrid(_WALKS, _NOISES, indexing="ij"))
-    noises = np.maximum(noises, least_noise)
+    strengths = _WALKS, np.unique(np.maximum(_NOISES, least_noise))
+    walks, noises = (grid.ravel() for grid in np.meshgrid(*strengths, indexing="ij"))
     likelihood = _filter(observations, walks, noises, None)
-    best = int(np.argmax(likelihood))
+    likelihood -= (np.log10(walks / _USUAL) / _USUALLY) ** 2 / 2
+    likelihood -= (np.log10(noises / noises[0]) / _HARDLY_MORE) ** 2 / 2
+    relative = np.exp(likelihood - likelihood.max())
     steady = int(np.argmax(np.where(np.isclose(walks, _STEADY), likelihood, -np.inf)))
-    both = [best, steady]
-    track = _Track.empty(len(observations.seconds), len(both))
-    _filter(observations, walks[both], noises[both], track)
-    states, covariances = _backwards(track)
-    state, covariance = states[:, 0], covariances[:, 0]
-    variance = alone = covariance[:, 0, 0]
-    wander = 0.0
-    if observations.from_samples.any():
-        variance = alone + 2 * covariance[:, 0, 2] + covariance[:, 2, 2]
-    else:
-        wander = float(np.std(states[:, 0, 0] - states[:, 1, 0]))
+    taken = np.append(np.flatnonzero(relative > _UNLIKELY), steady)
+    track = _Track.empty(len(observations.seconds), len(taken))
+    _filter(observations, walks[taken], noises[taken], track)
+    sees = np.array([1.0, 0.0, float(observations.from_samples.any())])
+    states, covariances, of_means = _backwards(track, sees)
+    weight = np.append(relative[taken[:-1]], 0.0)
+    weight /= weight.sum()
+    state = np.einsum("npk,p->nk", states, weight)
+    apart = (states - state[:, None]) @ sees
+    variance = (sees @ covariances @ sees + apart**2) @ weight
+    of_mean = (of_means + apart.mean(axis=0) ** 2) @ weight
+    wander = 0.0 if sees[2] else float(np.std(apart[:, -1]))
+    bends = np.diff(state[:, 1]) * np.diff(observations.seconds)  # straight between nodes
+    bent = math.sqrt(float(bends @ bends) / max(len(bends), 1) / 120)
     return Smoothed(
         lateness=state[:, 0],
         rate=state[:, 1],
         std=np.sqrt(np.maximum(variance, 0.0)),
-        # Whatever constant is taken out, what varies is no more than is left.
-        varying=math.hypot(math.sqrt(max(min(alone.mean(), variance.mean()), 0.0)), wander),
+        varying=math.hypot(math.sqrt(max(float(variance.mean() - of_mean), 0.0)), wander, bent),
         constant=float(state[-1, 2]),
-        walk=float(walks[best]),
-        noise=float(noises[best]),
     )
 
 
@@ -209,9 +214,16 @@ def _filter(
     return likelihood
 
 
-def _backwards(track: _Track) -> tuple[FloatArray, FloatArray]:
-    """Rauch-Tung-Striebel: what later observations say about earlier states."""
+def _backwards(track: _Track, sees: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rauch-Tung-Striebel: what later observations say about earlier states.
+
+    Returns states, their covariances, and of every pair the variance that the mean of all
+    ``sees @ state`` has.
+    """
     state, covariance = track.filtered.copy(), track.filtered_covariance.copy()
+    # Of each state with the sum of all later ones; smoothed states are a Markov chain too.
+    later = np.zeros(state.shape)
+    of_sum = sees @ covariance[-1] @ sees
     crossed = track.transition[1:, None] @ covariance[:-1]
     gains = np.linalg.solve(track.predicted_covariance[1:], crossed).swapaxes(-1, -2)
     for number in range(len(state) - 2, -1, -1):
@@ -220,4 +232,6 @@ def _backwards(track: _Track) -> tuple[FloatArray, FloatArray]:
         state[number] += (gain @ ahead[:, :, None])[:, :, 0]
         known = covariance[after] - track.predicted_covariance[after]
         covariance[number] += gain @ known @ gain.swapaxes(-1, -2)
-    return state, covariance
+        later[number] = (gain @ (covariance[after] @ sees + later[after])[:, :, None])[:, :, 0]
+        of_sum = of_sum + sees @ covariance[number] @ sees + 2 * later[number] @ sees
+    return state, covariance, np.asarray(of_sum / len(state) ** 2)

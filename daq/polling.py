@@ -6,7 +6,7 @@ USB adapters hand over what they have at every poll, some 16 ms apart. Samples a
 regular, so the latencies of blocks are not spread over the poll interval: they take a few values, a
 step apart, that drift slowly together as samples and polls beat. The earliest arrival follows that
 drift and returns after a beat: nothing of the clock within one step can be seen, for minutes or
-hours, however many blocks come.
+hours, however many blocks come. But the earliest of a whole beat is as early as can be.
 
 What shows polls is that lateness comes in clusters. Among sorted values of independent latencies
 the largest gap is a few times the usual one; between clusters it is many times that. Windows of
@@ -30,6 +30,11 @@ _BLOCKS = 64  # in a window: few enough for little drift, many enough for cluste
 _FEWEST_BLOCKS = 24  # while there is no whole window yet
 _MOST_WINDOWS = 32
 _CLUSTERED = 15.0  # usual gaps in the largest one; 6 where latencies are independent
+
+SURELY = 1.5
+"""Beats that hold a whole one, however clocks wander."""
+_STRETCHES = 4  # as long, at least, that show it
+_WHOLE = 0.7  # of a step, from the least lateness to nine tenths of the others
 
 
 @dataclass(slots=True)
@@ -78,3 +83,19 @@ class Polls:
             return 0.0
         step = float(np.median(largest))
         return step if step > _CLUSTERED * float(np.median(usual)) else 0.0
+
+
+def shows(seconds: FloatArray, late: FloatArray, *, step: float, beat: float) -> bool:
+    """Whether lateness goes through a whole step of the polls in every beat, as it is reckoned.
+
+    Parameters
+    ----------
+    seconds, late : float64, shape (n_blocks,)
+        When, on the sensor's count, and by how much beyond the line under all; early blocks do.
+    step, beat : float
+        In seconds.
+    """
+    begins = np.flatnonzero(np.diff(seconds // (SURELY * beat))) + 1
+    stretches = np.split(late, begins)
+    spans = [float(np.quantile(each, 0.9) - each.min()) for each in stretches]
+    return len(spans) >= _STRETCHES and float(np.median(spans)) > _WHOLE * step

@@ -236,11 +236,41 @@ def test_what_polls_hide_of_a_clock_is_not_claimed(n_blocks: int) -> None:
     assert np.mean(covered) >= 0.9
 
 
+def test_over_whole_beats_polls_hide_nothing() -> None:
+    left, stated = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        taken = last_samples(24_000, rng.choice([-1, 1]) * rng.uniform(12.0, 30.0))
+        phase = rng.uniform(0.0, 16e-3)
+        arrivals = np.ceil((taken - phase) / 16e-3) * 16e-3 + phase  # a step of 4 ms
+        clock = solved(block_rows(arrivals + rng.exponential(5e-5, len(taken))))
+        error = clock.at(BLOCK * np.arange(1.0, len(taken) + 1) - 1) - taken
+        left.append(error.std())
+        stated.append(clock.state.residual)
+    assert np.median(left) < 1e-4  # 40 minutes; a line through all arrivals leaves 0.2 ms
+    assert 0.5 < np.median(np.array(stated) / left) < 2.0
+
+
 def error_over_stated(rows: np.ndarray, taken: np.ndarray) -> float:
     """Return what is left of a clock (rms about its mean), in units of what is stated."""
     clock = solved(rows)
     error = clock.at(BLOCK * np.arange(1.0, len(rows) + 1) - 1) - taken
     return float(error.std() / clock.state.residual)
+
+
+@pytest.mark.parametrize("seconds", [30, 120, 300])
+def test_what_is_stated_is_what_is_left_neither_much_more_nor_less(seconds: int) -> None:
+    rng = np.random.default_rng(12 + seconds)
+    left, stated = [], []
+    for _ in range(30):
+        taken = last_samples(10 * seconds, rng.uniform(-30, 30))
+        clock = solved(block_rows(np.maximum.accumulate(taken + rng.exponential(1e-3, len(taken)))))
+        error = clock.at(BLOCK * np.arange(1.0, len(taken) + 1) - 1) - taken
+        left.append(error.var())
+        stated.append(clock.state.residual**2)
+    # The mean of 30 squares of normal slopes is known to 26 %; the root to 13 %. Three
+    # observations of 10 s allow for more noise than there is.
+    assert 0.7 < np.sqrt(np.mean(stated) / np.mean(left)) < 3.0
 
 
 def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_does() -> None:
@@ -256,7 +286,7 @@ def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_doe
         ratios.append(error_over_stated(block_rows(np.maximum.accumulate(taken + late)), taken))
         rows = block_rows(np.maximum.accumulate(taken + rng.exponential(1e-3, len(taken))))
         quiet.append(solved(rows).state.residual)
-    assert max(ratios) < 2.0
+    assert np.sqrt(np.mean(np.square(ratios))) < 2.0
     assert np.median(quiet) < 6e-6  # nothing is taken back where latencies are independent
 
 
