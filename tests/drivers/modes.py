@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from daq.protocols import epson
 from sim_devices import launch
 from sim_devices.device import Source
+from sim_devices.pacing import WorldClock
 from sim_devices.scenario import Scenario
 from sim_devices.serve import device_spec
 from tests.sim_devices.bench import device, sensors, spec
@@ -47,13 +49,20 @@ CASES: dict[str, dict[str, Any]] = {
     "fifo": {"driver": "fifo", "settings": {}},
     "text serial": {
         "driver": "text",
-        "settings": {"columns": [1, 2, 3], "counter_column": 0, "baud_rate": 115200},
+        "settings": {
+            "columns": [1, 2, 3],
+            "counter_column": 0,
+            "nmea_checksum": True,
+            "baud_rate": 115200,
+        },
     },
     "text tcp": {"driver": "text", "port": "tcp", "settings": {"time_column": 3}},
     "text udp": {"driver": "text", "port": "udp", "settings": {"preset": "raspberry-shake"}},
 }
 OFFSETS = {"labjack": 33523}
 """Counts where a sensor feels nothing."""
+RANGES = {"labjack": (0, 65535), "fifo": (-32768, 32767), "registers": (-32768, 32767)}
+"""Of counts, where the motion goes beyond them."""
 
 
 def table(mode: str) -> dict[str, Any]:
@@ -84,39 +93,47 @@ class Served:
 
     def assert_felt(
         self, mode: str, name: str, index: NDArray[np.int64], counts: NDArray[Any]
-    ) -> None:
-        """See that counts are what the sensor felt: each sample once, and in its place."""
-        driver = CASES[mode]["driver"]
-        felt = self._felt[name] + OFFSETS.get(driver, 0)
-        if driver == "registers":  # each poll is the latest reading
-            apart = np.abs(felt[None] - counts[:, None]).max(axis=2)
-            which = apart.argmin(axis=1)
-            assert apart.min(axis=1).max() <= 0.5
-            assert (np.diff(which) >= 0).all()
-            return
-        start = int(np.abs(felt - counts[0]).max(axis=1).argmin())
-        expected = felt[start + index - index[0]]
-        assert np.abs(expected - counts).max() <= 0.5 + 1e-8 * np.abs(expected).max(), mode
+    ) -> NDArray[np.int64]:
+        """See that counts are what the sensor felt: each sample once, and in its place.
 
-    def remember(self) -> None:
-        """Note what is needed to know what was felt when the devices have ended."""
-        _ = self._felt
+        Returns which sample of the world each is.
+        """
+        driver = CASES[mode]["driver"]
+        felt = np.clip(self._felt[name] + OFFSETS.get(driver, 0), *RANGES.get(driver, (None, None)))
+        if driver == "registers":  # each poll is the latest reading
+            which = np.asarray(KDTree(felt).query(counts, p=np.inf)[1], np.int64)
+            assert np.abs(felt[which] - counts).max() <= 0.5, mode
+            assert (np.diff(which) >= 0).all(), mode
+            return which
+        start = int(np.abs(felt - counts[0]).max(axis=1).argmin())
+        which = index + (start - int(index[0]))
+        expected = felt[which]
+        assert np.abs(expected - counts).max() <= 0.5 + 1e-8 * np.abs(expected).max(), mode
+        return which
+
+    def struck(self, mode: str) -> list[dict[str, Any]]:
+        """Return the faults that struck a mode's device so far."""
+        told = _lines(self.log.with_name("faults"))
+        return [one for one in told if one["sensors"][0] in self.devices[mode].sensors]
 
     @cached_property
     def _felt(self) -> _Felt:
-        return _Felt(self.world, self.log)
+        return _Felt(self.world, _lines(self.log))
+
+
+def _lines(log: Path) -> list[dict[str, Any]]:
+    """Read a log that may be being written."""
+    lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
 class _Felt(dict[str, "NDArray[np.float64]"]):
-    """What each sensor feels from world time 0 on, in counts, worked out when asked for."""
+    """What each sensor has felt since world time 0, in counts, worked out when asked for."""
 
-    SECONDS = 400.0
-
-    def __init__(self, world: dict[str, Any], log: Path) -> None:
+    def __init__(self, world: dict[str, Any], told: list[dict[str, Any]]) -> None:
         super().__init__()
         self._world = world
-        lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-        self._utc_ns = {n: x["utc_ns"] for x in lines if "utc_ns" in x for n in x["sensors"]}
+        self._utc_ns = {n: x["utc_ns"] for x in told if "utc_ns" in x for n in x["sensors"]}
 
     def __missing__(self, name: str) -> NDArray[np.float64]:
         one = next(one for one in self._world["devices"] if name in one["sensors"])
@@ -126,13 +143,14 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
         source = Source(world, described)
         if described.driver == "guralp":  # on whole seconds of UTC
             source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
-        self[name] = source.counts(name, 0, round(self.SECONDS * rate))
+        now = WorldClock(self._world["epoch_ns"], self._world["speed"]).now()
+        self[name] = source.counts(name, 0, round(now * rate))
         return self[name]
 
 
 @contextlib.contextmanager
 def serving(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iterator[Served]:
-    """Serve the devices of all modes."""
+    """Serve the devices of all modes, with a fault script."""
     tables = [table(mode) for mode in CASES]
     world = spec(*tables, speed=speed)
     for one in tables:
@@ -140,6 +158,10 @@ def serving(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iter
             world["scenario"]["sensors"][name]["sampling_rate"] = one["sampling_rate"]
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "sent"
-        world |= {"faults": faults or [], "sent_log": str(log)}
+        world |= {
+            "faults": faults or [],
+            "sent_log": str(log),
+            "fault_log": str(log.with_name("faults")),
+        }
         with launch.start(world) as running:
             yield Served(dict(zip(CASES, running, strict=True)), world, log)
