@@ -25,9 +25,9 @@ from tests.alignment.recordings import ORIGIN, Sensor, blocks
 from tui.command import app
 from tui.report import ReportError, drawing, write
 from tui.report.contents import report_of
+from tui.report.drift import without_line
 from tui.report.paper import pages
 from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
-from tui.report.plots import without_line
 from tui.report.source import sources
 
 if TYPE_CHECKING:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tui.diagnosis import summary
+from tui.report.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.report.plots import REJECT, drift_plot, model_test_plot
+from tui.report.plots import REJECT, model_test_plot
 from tui.report.wording import (
     NOTHING,
     plain_number,
