@@ -32,8 +32,6 @@ STANDARD_GRAVITY = 9.80665
 COUNTS_PER_G = 2**24
 COUNTS_PER_UNIT = COUNTS_PER_G / STANDARD_GRAVITY
 """Nominal sensitivity in counts per m/s²."""
-COUNTS_PER_RADIAN = 2**29
-"""Sensitivity of the tilt outputs."""
 TEMPERATURE_SLOPE, TEMPERATURE_OFFSET = -0.0037918, 34.987
 """°C per count, and °C at count 0."""
 DEVICE_ID = 0x5345
@@ -69,7 +67,6 @@ WINDOW = 0x7E
 
 SAMPLING, CONFIGURATION, SLEEP = 1, 2, 3
 """Written to MODE_CTRL's high byte; bits 11:10 read back one less."""
-MODE_BUSY = 0x0300
 FILTER_BUSY = 0x0020
 NOT_READY = 0x0400
 RESET, FLASH_BACKUP, FACTORY = 0x80, 0x08, 0x04

@@ -42,8 +42,6 @@ from daq.protocols.gcf import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PORT = 1567
-PING = b"GCFPING\0"
 SEND = b"GCFSEND:B\0"
 STOP = b"GCFSTOP\0"
 ACKNOWLEDGED = b"GCFACKN\0"
