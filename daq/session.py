@@ -56,6 +56,24 @@ class Trouble:
 Item = Block | Event | Connected | Trouble
 
 
+@dataclass(slots=True)
+class BackOff:
+    """How long to wait before a device is tried again: twice as long after each failure."""
+
+    delay: float = FIRST_DELAY
+    """Before the next attempt, s."""
+
+    def failed(self) -> float:
+        """Return how long to wait now, s."""
+        delay, self.delay = self.delay, min(2 * self.delay, LONGEST_DELAY)
+        return delay
+
+    def lived(self, seconds: float) -> None:
+        """Note how long a session has yielded blocks: one that comes and goes is no success."""
+        if seconds >= self.delay:
+            self.delay = FIRST_DELAY
+
+
 class Connection:
     """A port with its driver and sensors."""
 
@@ -69,7 +87,7 @@ class Connection:
         self.connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Done when the first session is open, or could not be opened."""
         self.alive = False
-        self._delay = FIRST_DELAY
+        self._back_off = BackOff()
         self._said = ""
         self._before: Session | None = None
         self._clock = clock
@@ -109,8 +127,7 @@ class Connection:
                 reason = await self._say(failure, queue)
             elif _kind(failure) == "refused" and str(failure) != self._said:
                 await self._say(failure, queue)
-            await asyncio.sleep(self._delay)
-            self._delay = min(2 * self._delay, LONGEST_DELAY)
+            await asyncio.sleep(self._back_off.failed())
 
     def _open(self) -> AbstractAsyncContextManager[Session]:
         if self._before is not None and isinstance(self.driver, Resuming):
@@ -179,9 +196,10 @@ class Connection:
                 return False
             return True
 
-        speed = self._clock.speed
+        speed, begun_ns = self._clock.speed, self._clock.now().monotonic_ns
         watch = Watch({s.name: s.sampling_rate * speed for s in self.sensors}, say)
         checked = Checked(self.driver, self.sensors)
+        suspended = self._clock.suspended
         async with contextlib.aclosing(_generator(session)) as items:
             try:
                 async with watch:
@@ -192,8 +210,11 @@ class Connection:
                             return
                         item = checked.check(item)
                         if isinstance(item, Block):
+                            if self._clock.suspended > suspended + LEAST_SUSPENDED:
+                                suspended = await self._resume(item, suspended, queue)
                             watch.block_came(item)
-                            self._delay = FIRST_DELAY
+                            lived_ns = item.received.monotonic_ns - begun_ns
+                            self._back_off.lived(lived_ns * 1e-9 / speed)
                         await queue.put(item)
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
@@ -201,6 +222,15 @@ class Connection:
                 raise NoAnswerError(
                     f"{self.port}: stalled: no block for {watch.seconds:.2g} s"
                 ) from error
+
+    async def _resume(self, block: Block, before: float, queue: asyncio.Queue[Item]) -> float:
+        """Say for how long the computer was suspended; raise if nobody counted what was missed."""
+        now = self._clock.suspended
+        text = f"the computer was suspended for {now - before:.3g} s"
+        if block.device_counter is None and block.instants_ns is None:
+            raise NoAnswerError(f"{self.port}: {text}")
+        await queue.put(Event(block.sensor, "status", text, self._clock.now()))
+        return now
 
     def _check_identity(self, session: Session) -> None:
         """Refuse another device than the bench file names, or than was there before."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, cast
 
 from daq.errors import NoAnswerError
 from daq.protocols.block import Event
-from daq.session import Connection, Trouble
-from tests.devices import ManualClock, PlayedDevice, PlayedDriver, PlayedSession, bench
+from daq.session import LONGEST_DELAY, BackOff, Connection, Trouble
+from tests.devices import ManualClock, PlayedDevice, PlayedDriver, PlayedSession, bench, block
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -68,3 +68,34 @@ async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
     running.cancel()
     await asyncio.wait([running])
     assert kinds == ["connected", "stalled", "connected"]
+
+
+def test_only_a_session_that_lived_as_long_as_the_wait_shortens_it() -> None:
+    back_off = BackOff()
+    assert [back_off.failed() for _ in range(6)] == [0.2, 0.4, 0.8, 1.6, 3.2, LONGEST_DELAY]
+    back_off.lived(LONGEST_DELAY - 0.1)
+    assert back_off.failed() == LONGEST_DELAY
+    back_off.lived(LONGEST_DELAY)
+    assert back_off.failed() == 0.2
+
+
+async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> None:
+    """One block is no success: it would be set up anew five times a second, for weeks."""
+    device, clock = PlayedDevice(), ManualClock()
+    driver = PlayedDriver({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    loop, opened = asyncio.get_running_loop(), []
+    async with asyncio.timeout(20):
+        for _ in range(4):
+            await device.opened.wait()
+            device.opened.clear()
+            opened.append(loop.time())
+            device.items.put_nowait(block("A", 0, 10, clock.now()))
+            device.items.put_nowait(NoAnswerError("gone again"))
+    running.cancel()
+    await asyncio.wait([running])
+    assert opened[-1] - opened[0] > 0.2 + 0.4 + 0.7
