@@ -171,6 +171,7 @@ async def test_pictures(told: Told, name: str, size: tuple[int, int]) -> None:
         await pilot.press("escape")
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-ended")
+        assert screen_text(app).splitlines()[-1].endswith("←→↑↓ Select")  # the longest line of keys
         await pilot.press("question_mark")
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-help")

@@ -10,18 +10,20 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.bench import parse
+from daq.bench import load, parse
 from daq.estimation import Settings, estimate
 from daq.protocols.block import Event, HostTime
 from daq.recording.layout import SensorLayout
 from daq.recording.writer import RecordingWriter
 from tests.alignment.recordings import ORIGIN, Sensor, blocks
+from tui.application.main import BenchControls
 from tui.command import app
 from tui.report import ReportError, drawing, write
 from tui.report.contents import report_of
@@ -32,12 +34,12 @@ from tui.report.source import sources
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from daq.estimation import Snapshot
     from tui.report.parts import Part
 
 RATE, N_SAMPLES = 100.0, 6000
+ROOT = Path(__file__).parents[2]
 HOSTILE = "<script>alert(1)</script>".replace("/", "⁄") + " & $x^2 {{7*7}}"
 """A name as a file from elsewhere may have it; bench files allow all but the slash."""
 BENCH = """
@@ -152,6 +154,14 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     out = folder / "night.html"
     report = write(snapshot, out, recordings=[recording], settings=settings)
     return Reported(recording, snapshot, settings, out.read_text(encoding="utf-8"), report)
+
+
+def test_the_demo_s_reports_outlive_its_folder(reported: Reported, tmp_path: Path) -> None:
+    settings, path = reported.settings, ROOT / "tui" / "resources" / "demo.toml"
+    controls = BenchControls(path, load(path), settings, reports=tmp_path)
+    out = controls.report(reported.recording, reported.snapshot, settings)
+    assert out == tmp_path / "night.html"
+    assert out.read_text(encoding="utf-8") == reported.page
 
 
 def words_of(part: Part) -> list[str]:

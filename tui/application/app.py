@@ -69,7 +69,7 @@ class HuddleApp(App[None]):
         Binding("question_mark", "help", "Help", key_display="?"),
         Binding("q", "quit", "Quit"),
         Binding("ctrl+c", "quit", "Quit", show=False),
-        Binding("right", "channel(1)", "Channel", key_display="←→↑↓"),
+        Binding("right", "channel(1)", "Select", key_display="←→↑↓"),
         Binding("left", "channel(-1)", "Channel", show=False),
         Binding("down", "sensor(1)", "Sensor", show=False),
         Binding("up", "sensor(-1)", "Sensor", show=False),

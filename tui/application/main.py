@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -22,8 +23,6 @@ from tui.recorder_process import RecorderProcess
 from tui.running import finish_recording
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from daq.bench import Bench
     from daq.estimation import Snapshot
 
@@ -41,6 +40,8 @@ class BenchControls:
     bench: Bench
     settings: Settings
     can_start: bool = True
+    reports: Path | None = None
+    """Folder of reports; None: beside their recordings."""
     started: list[RecorderProcess] = field(default_factory=list)
 
     @property
@@ -86,8 +87,8 @@ class BenchControls:
         finish_recording(path, snapshot)
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
-        """Write the report beside the recording."""
-        return _report(path, snapshot, settings)
+        """Write the report."""
+        return _report(path, snapshot, settings, folder=self.reports)
 
     def release(self) -> None:
         """Forget the recorders; they go on."""
@@ -137,10 +138,12 @@ class RecordingControls:
         return _report(path, snapshot, settings)
 
 
-def _report(path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+def _report(
+    path: Path, snapshot: Snapshot, settings: Settings, *, folder: Path | None = None
+) -> Path:
     from tui.report import write  # noqa: PLC0415 - loads matplotlib
 
-    out = path.with_suffix(".html")
+    out = (folder or path.parent) / f"{path.stem}.html"
     write(snapshot, out, recordings=[path], settings=settings)
     return out
 
@@ -204,7 +207,8 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     Path or None
         The last recording, closed.
     """
-    controls = BenchControls(path, load(path), settings)
+    # The demo's recording goes when the demo ends; what has been asked for stays.
+    controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
         HuddleApp(controls, start=True).run()
         for recorder in controls.started:
