@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
 LEAVE_TIMEOUT = 5.0
 """How long a driver may take to leave its device, s."""
+LEAST_SUSPENDED = 0.01
+"""How long a computer is suspended at least, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +201,7 @@ class Connection:
         speed, begun_ns = self._clock.speed, self._clock.now().monotonic_ns
         watch = Watch({s.name: s.sampling_rate * speed for s in self.sensors}, say)
         checked = Checked(self.driver, self.sensors)
+        suspended = self._clock.suspended
         async with contextlib.aclosing(_generator(session)) as items:
             try:
                 async with watch:
@@ -209,6 +212,8 @@ class Connection:
                             return
                         item = checked.check(item)
                         if isinstance(item, Block):
+                            if self._clock.suspended > suspended + LEAST_SUSPENDED:
+                                suspended = await self._resume(item, suspended, queue)
                             watch.block_came(item)
                             lived_ns = item.received.monotonic_ns - begun_ns
                             self._back_off.lived(lived_ns * 1e-9 / speed)
@@ -219,6 +224,15 @@ class Connection:
                 raise NoAnswerError(
                     f"{self.port}: stalled: no block for {watch.seconds:.2g} s"
                 ) from error
+
+    async def _resume(self, block: Block, before: float, queue: asyncio.Queue[Item]) -> float:
+        """Say for how long the computer was suspended; raise if nobody counted what was missed."""
+        now = self._clock.suspended
+        text = f"the computer was suspended for {now - before:.3g} s"
+        if block.device_counter is None and block.instants_ns is None:
+            raise NoAnswerError(f"{self.port}: {text}")
+        await queue.put(Event(block.sensor, "status", text, self._clock.now()))
+        return now
 
     def _check_identity(self, session: Session) -> None:
         """Refuse another device than the bench file names, or than was there before."""

@@ -29,6 +29,7 @@ class ManualClock:
 
     ns: int = 10**12
     speed: float = 1.0
+    suspended: float = 0.0
 
     def now(self) -> HostTime:
         """Return the present instant."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from typing import TYPE_CHECKING, cast
 
+import pytest
+
+from daq.clock import SystemClock
 from daq.errors import NoAnswerError
-from daq.protocols.block import Event
+from daq.protocols.block import Block, Event
 from daq.session import LONGEST_DELAY, BackOff, Connection, Trouble
 from tests.devices import ManualClock, PlayedDevice, PlayedDriver, PlayedSession, bench, block
 
@@ -99,3 +103,50 @@ async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> No
     running.cancel()
     await asyncio.wait([running])
     assert opened[-1] - opened[0] > 0.2 + 0.4 + 0.7
+
+
+@pytest.mark.parametrize("counter", [None, 20])
+async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_count(
+    counter: int | None,
+) -> None:
+    device = PlayedDevice()
+    clock = ManualClock()
+    driver = PlayedDriver({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    said: list[Event] = []
+    n_blocks = 0
+    async with asyncio.timeout(60):
+        device.items.put_nowait(block("A", 0, 10, clock.now()))
+        while n_blocks < 1:
+            n_blocks += isinstance(await queue.get(), Block)
+        clock.advance(37.0)
+        clock.suspended += 37.0
+        for first in (10, 20):
+            device.items.put_nowait(block("A", first, 10, clock.now(), device_counter=counter))
+        while n_blocks < (2 if counter is None else 3):
+            item = await queue.get()
+            n_blocks += isinstance(item, Block)
+            event = item.event if isinstance(item, Trouble) else item
+            if isinstance(event, Event) and event.kind != "connected":
+                said.append(event)
+    running.cancel()
+    await asyncio.wait([running])
+    assert device.n_sessions == (2 if counter is None else 1)
+    assert [event.kind for event in said] == ["stalled" if counter is None else "status"]
+    assert "the computer was suspended for 37 s" in said[0].text
+
+
+def test_host_time_goes_on_while_the_computer_is_suspended() -> None:
+    asleep_ns = 0
+    clock = SystemClock(2.0, lambda: time.monotonic_ns() + asleep_ns, _began_ns=time.monotonic_ns())
+    before = clock.now()
+    assert clock.suspended < 1.0
+    asleep_ns = 3_600_000_000_000
+    after = clock.now()
+    assert clock.suspended == pytest.approx(3600.0, abs=1.0)
+    assert after.monotonic_ns - before.monotonic_ns >= 2 * asleep_ns  # at twice life's pace
+    assert after.utc_ns - before.utc_ns == after.monotonic_ns - before.monotonic_ns
