@@ -40,9 +40,10 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield path
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "tui", *arguments],
+        env=os.environ | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -56,11 +57,13 @@ def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 def wait_for_samples(path: Path, n_samples: int) -> None:
-    """Return when this many samples of every sensor are committed."""
+    """Return when this many samples of every sensor are committed to a file, or to one below."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
-        if path.exists():
-            with Recording.open(path) as recording:
+        for file in path.rglob("*.h5") if path.is_dir() else (path,):
+            if not file.exists():
+                continue
+            with Recording.open(file) as recording:
                 if min(sensor.n_samples for sensor in recording.sensors) >= n_samples:
                     return
         os.sched_yield()
@@ -207,6 +210,15 @@ def test_check_finds_what_is_on_a_port(bench: Path) -> None:
     (device,) = json.loads(said)["devices"]
     assert device["driver"] == "epson"
     assert device["information"]["model"].startswith("A352")
+
+
+def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> None:
+    process = start("demo", "--speed", "8", "--json", "-", TMPDIR=str(tmp_path))
+    wait_for_samples(tmp_path, 2500)
+    process.send_signal(signal.SIGINT)
+    code, said, err = finished(process)
+    assert code == 130, err
+    assert len(json.loads(said)["channels"]) == 18
 
 
 def test_demo_shows_which_estimate_is_right() -> None:

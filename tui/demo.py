@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import typer
 from rich.table import Table
 
 from daq.bench import dump, format_duration, parse
@@ -20,7 +21,7 @@ from tui.devices import scenario_of, simulated
 from tui.output import for_people, notices, write_json
 from tui.recorder_process import RecorderProcess
 from tui.results import band_of, correlation_of
-from tui.running import follow_to_end
+from tui.running import INTERRUPTED, follow_to_end
 from tui.synchronisation import effect
 from tui.text import level, level_with_error
 
@@ -76,6 +77,7 @@ def run_demo(
     speed = bench.speed if speed is None else speed
     terminal = all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr))
     on_screen = terminal and not table and json is None
+    interrupted = False
     with tempfile.TemporaryDirectory(prefix="huddle-demo-") as folder:
         with simulated(bench, speed=speed) as reachable:
             path = Path(folder) / "demo.toml"
@@ -85,7 +87,7 @@ def run_demo(
                 out = _show(path, settings)
             else:
                 out = path.with_suffix(".h5")
-                _record(path, out, settings, bench.recording.duration or 60.0, speed)
+                interrupted = _record(path, out, settings, bench.recording.duration or 60.0, speed)
         if out is None or not out.exists():
             return
         snapshot = estimate([out], settings)
@@ -107,6 +109,8 @@ def run_demo(
     for line in verdict(compared):
         screen.print(line)
     write_json(json, _document(compared, snapshot))
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
 
 
 def _show(path: Path, settings: Settings) -> Path | None:
@@ -115,7 +119,8 @@ def _show(path: Path, settings: Settings) -> Path | None:
     return show_demo(path, settings)
 
 
-def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> None:
+def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
+    """Record without a screen; return whether Ctrl-C ended it."""
     notices().print(
         "Three simulated accelerometers on their serial protocol, "
         f"{format_duration(duration)} at {speed:g} × life, so {format_duration(duration / speed)}."
@@ -123,13 +128,14 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
     recorder = RecorderProcess(path, out, duration=duration)
     try:
         recorder.wait_for_file()
-        follow_to_end(recorder, settings, duration=duration)
+        _, interrupted = follow_to_end(recorder, settings, duration=duration)
         recorder.check()
     except KeyboardInterrupt:
         recorder.stop()
         raise
     finally:
         recorder.close()
+    return interrupted
 
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:
