@@ -6,7 +6,7 @@ See :mod:`daq.protocols.text` for what messages are made of.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING, Any, Literal
@@ -112,11 +112,19 @@ def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
         seconds = float(text)
         resolution_ns = 10 ** max(0, 9 - len(text.partition(".")[2]))
     else:
-        seconds = datetime.strptime(text, format_.time_format).replace(tzinfo=UTC).timestamp()
+        seconds = _instant(text, format_.time_format).replace(tzinfo=UTC).timestamp()
         resolution_ns = 1000 if "%f" in format_.time_format else _NS
     if not 0 <= seconds < _LATEST_S:
         raise ValueError(text)
     return round(seconds * 1e6) * 1000, resolution_ns
+
+
+def _instant(text: str, time_format: str) -> datetime:
+    try:
+        return datetime.strptime(text, time_format)  # noqa: DTZ007 -- the caller knows the zone
+    except ValueError:  # a leap second has a second 60, which here is the next minute's first
+        minute = datetime.strptime(text, time_format.replace("%S", "60"))  # noqa: DTZ007
+        return minute + timedelta(minutes=1)
 
 
 class MessageFinder:

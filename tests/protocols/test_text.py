@@ -209,6 +209,38 @@ def test_times_that_stand_for_many_rows(written: str) -> None:
     assert all(b.flags & BlockFlag.MISSING_ESTIMATED for b in gaps)
 
 
+def test_a_leap_second_loses_nothing_of_a_tiltmeter() -> None:
+    """A device that writes the second 60: at a row a second the index goes on."""
+    decoder = TextDecoder("A", LILY, sampling_rate=1.0)
+    times = ["2016/12/31 23:59:58", "2016/12/31 23:59:59", "2016/12/31 23:59:60"]
+    times += [f"2017/01/01 00:00:0{second}" for second in range(5)]
+    found: list[Block | Event] = []
+    for second, time in enumerate(times):
+        found += decoder.receive(
+            f"LILY,{time},{second},25,194,26,11,N9655\r\n".encode(), at(second)
+        )
+    index, rows, events = split(found)
+    assert index == list(range(8))
+    assert [row[0] for row in rows] == index
+    assert not events
+
+
+def test_a_leap_second_of_many_rows_is_a_gap() -> None:
+    """The second after it has the same times, which came before: a gap, but none in silence."""
+    format_ = TextFormat(columns=(1,), time_column=0, time_format="%Y-%m-%dT%H:%M:%S.%f")
+    decoder = TextDecoder("A", format_, sampling_rate=10.0)
+    seconds = ["23:59:59", "23:59:60", "00:00:00", "00:00:01", "00:00:02"]
+    found: list[Block | Event] = []
+    for second, time in enumerate(seconds):
+        day = "2016-12-31T" if second < 2 else "2017-01-01T"
+        for k in range(10):
+            row = f"{day}{time}.{k},{10 * second + k}\n"
+            found += decoder.receive(row.encode(), at(second + k / 10))
+    index, rows, events = split(found)
+    assert [row[0] for row in rows] == index == [*range(20), *range(29, 50)]
+    assert events[-1].kind == "reset"
+
+
 def test_a_tiltmeter_that_repeats_a_row() -> None:
     """Times as coarse as the rows: only what repeats to the letter is known already."""
     decoder = TextDecoder("A", LILY, sampling_rate=1.0)
