@@ -10,7 +10,7 @@ from daq.bench import load
 from daq.clock import SystemClock
 from daq.recorder import recording_path, run
 from tui.output import notices, write_json
-from tui.text import clock_time, several
+from tui.text import clock_time, roughly, several
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,19 +35,25 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
     if screen.is_terminal:
         with Live(console=screen, refresh_per_second=2, transient=True) as live:
             status = run(
-                bench, out, duration=duration, acknowledged=lambda now: live.update(_line(now))
+                bench,
+                out,
+                duration=duration,
+                acknowledged=lambda now: live.update(progress_line(now, duration)),
             )
     else:
         status = run(bench, out, duration=duration)
-    screen.print(f"{_line(status)}\n{out} closed", soft_wrap=True)
+    screen.print(f"{progress_line(status)}\n{out} closed", soft_wrap=True)
     write_json(json, status.to_dict())
 
 
-def _line(status: Status) -> str:
+def progress_line(status: Status, duration: float | None = None) -> str:
+    """Return what is safe of every sensor, and when a run of this duration ends."""
     sensors = "  ".join(
         f"{name} {sensor.samples}"
         + (f" ({several(sensor.gaps, 'gap')}, {sensor.missing} missing)" if sensor.gaps else "")
         + (f" {sensor.state}" if sensor.state in {"late", "lost"} else "")
         for name, sensor in status.sensors.items()
     )
-    return f"{clock_time(status.elapsed)}  samples safe: {sensors}"
+    left = None if duration is None else max(0.0, duration - status.elapsed)
+    ends = "" if left is None else f"  ends in {roughly(left)}"
+    return f"{clock_time(status.elapsed)}  samples safe: {sensors}{ends}"

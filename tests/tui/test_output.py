@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from daq.intake import SensorStatus
+from daq.recorder import Status
 from tui.command import app
 from tui.output import notices, progress, write_text
+from tui.recording import progress_line
 
 FULL = Path("/dev/full")
 
@@ -21,6 +24,12 @@ def test_a_full_disk_is_told_with_the_file_s_name(append: bool) -> None:
     with pytest.raises(OSError, match="No space left") as trouble:
         write_text(str(FULL), "{}", append=append)
     assert trouble.value.filename == str(FULL)
+
+
+def test_a_recorder_on_a_terminal_says_when_it_ends() -> None:
+    status = Status("a.h5", 20.0, {"A": SensorStatus("recording", 4000, 0, 0)})
+    assert progress_line(status) == "0:20  samples safe: A 4000"
+    assert progress_line(status, 100.0) == "0:20  samples safe: A 4000  ends in 80 s"
 
 
 def test_lines_are_appended(tmp_path: Path) -> None:
