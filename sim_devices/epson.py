@@ -7,9 +7,9 @@ software reset, flash backup, factory defaults, AUTO_START, busy and not-ready b
 wrapping, each burst sent when its last bit would have left the UART, sampling by an external
 trigger, and, on an M-A370, in step with 1PPS.
 
-What is connected to the EXT pin is told by ``settings``, beyond the driver's: ``trigger_rate``, a
-generator of so many Hz that is never off (else nothing: then no sample is ever taken), or ``pps`` =
-true, the seconds of UTC (else nothing: then the device samples by its own clock).
+Connected to the EXT pin is what the bench file's ``external`` says: a generator of triggers at the
+sampling rate that is never off, or the seconds of UTC. With neither, a device that is told to wait
+for triggers takes no sample, and one that is told to follow the seconds samples by its own clock.
 
 What it does not do: the filters' attenuation and delay, and sleep, which nothing but a reset ends.
 """
@@ -74,8 +74,9 @@ class EpsonDevice:
         fields = device.settings.get("fields") or ("x", "y", "z")
         self._axes = [field for field in fields if field != "temperature"]
         self._first_count = int(device.settings.get("first_count", 0))
-        self._trigger_rate = float(device.settings.get("trigger_rate", 0.0))
-        self._pps = bool(device.settings.get("pps"))
+        connected = str(device.settings.get("external", ""))
+        self._trigger_rate = device.sampling_rate if connected.startswith("trigger") else 0.0
+        self._pps = connected.startswith("pps")
         self._utc_ns = device.utc_ns
         self._baud_rate = int(device.settings.get("baud_rate", 460800))
         serial_number = device.serial_number or f"S{zlib.crc32(self._sensor.encode()) % 10**7:07d}"

@@ -34,10 +34,16 @@ XYZ = [{"name": axis, "sensitivity": epson.COUNTS_PER_UNIT} for axis in "xyz"]
 OFF = 500.0
 """ppm of the devices' own clocks."""
 TABLES = {
-    "pps": device("pps", model="M-A370", channels={"pps": XYZ}, settings={"pps": True}),
+    "pps": device(
+        "pps", model="M-A370", channels={"pps": XYZ}, settings={"external": "pps-rising"}
+    ),
     "none": device("none", model="M-A370", channels={"none": XYZ}),
     "trigger": device(
-        "trigger", model="M-A370", channels={"trigger": XYZ}, settings={"trigger_rate": 100.0}
+        "trigger",
+        model="M-A370",
+        channels={"trigger": XYZ},
+        sampling_rate=100.0,
+        settings={"external": "trigger-rising"},
     ),
     "A352": device("A352", model="M-A352", channels={"A352": XYZ}),
 }
@@ -105,8 +111,8 @@ async def test_without_pps_a_device_samples_by_its_own_clock(
 
 async def test_every_trigger_makes_a_sample(running: Running) -> None:
     settings = {"external": "trigger-falling"}
-    sensor = connecting(running, "trigger", settings=settings, sampling_rate=100.0)
-    truth = running.source("trigger").at_rate(100.0).disciplined(0.0)
+    sensor = connecting(running, "trigger", settings=settings)
+    truth = running.source("trigger").disciplined(0.0)
     assert await mismatch(sensor, truth) <= 0.5
 
 
