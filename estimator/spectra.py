@@ -179,6 +179,8 @@ class CrossSpectra:
                 np.multiply(segment, self._taper, out=frames[i])
             np.fft.rfft(frames[:n], axis=1, out=spectra[:n])
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
+            if len(starts) == 1:  # to sum it and take it apart again would cost more
+                return spectra[0, :, :, None] * spectra[0, :, None, :].conj()
             parts = spectra[:n].view(np.float64)
             for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
                 some = slice(low, low + FREQUENCIES_PER_BLOCK)

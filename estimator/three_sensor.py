@@ -90,9 +90,12 @@ def estimate(
     of_block = functools.partial(_estimate, dims=dims, n_effective=n_effective, correct=correct)
     if len(blocks) == 1:
         found = [of_block(given)]
-    else:
-        with ThreadPoolExecutor(min(THREADS, len(blocks))) as pool:
-            found = list(pool.map(of_block, blocks))
+    else:  # each thread its share at once: one by one they would wait for one another
+        size = -(-len(blocks) // THREADS)
+        shares = [blocks[first : first + size] for first in range(0, len(blocks), size)]
+        with ThreadPoolExecutor(THREADS) as pool:
+            of_shares = pool.map(lambda share: [of_block(block) for block in share], shares)
+            found = list(itertools.chain.from_iterable(of_shares))
     noise, deviation, low, high, flags = (
         np.concatenate(parts) for parts in zip(*found, strict=True)
     )
@@ -164,7 +167,9 @@ def _mean_of_pairs(
         Pairs, counted both ways, that can be used; zero where nothing can be said.
     """
     S, (m, d), columns = given.matrix, columns.shape, columns.ravel()
-    between, towards = S[:, columns[:, None], columns], S[:, rows[:, None], columns]
+    between, towards = (  # as fancy indices leave them, frequencies would run fastest
+        np.ascontiguousarray(S[:, channels[:, None], columns]) for channels in (columns, rows)
+    )
     inverses, pairs = _inverses(given, between, columns, m)
     usable = others[None]
     if given.duplicates.any():  # a copy of one of the target's channels spoils that sensor for it
@@ -176,7 +181,7 @@ def _mean_of_pairs(
     # The mean of P = S_ik inv(S_jk) over k, at the columns of j.
     motion = (towards * np.repeat(usable, d, axis=2)) @ inverses
     motion *= np.repeat(usable / np.maximum(partners, 1), d, axis=2)
-    own = _summed(motion * towards.conj(), m)
+    own = np.einsum("frkc->frk", (motion * towards.conj()).reshape(len(S), len(rows), m, d))
     power = np.einsum("fpp->fp", S).real[:, rows]
     noise = power - weight * np.einsum("frj,frj->fr", partners, own.real)
     # One residual a sensor: those of sensor j paired with different k differ by their sampling
@@ -229,15 +234,8 @@ def _residuals(
     by_sensor = motion.reshape(n_freqs, n_rows, m, -1).swapaxes(1, 2)
     taken = by_sensor @ between.reshape(n_freqs, m, -1, n_columns)
     taken *= motion.conj()[:, None]
-    G = np.ascontiguousarray(_summed(taken, m).swapaxes(1, 2))
+    G: ComplexArray = np.einsum("fjrkc->frjk", taken.reshape(n_freqs, m, n_rows, m, -1))
     G += power[:, :, None, None]
     G -= own[:, :, :, None]
     G -= own.conj()[:, :, None, :]
     return G
-
-
-def _summed(values: ComplexArray, m: int) -> ComplexArray:
-    """Sum the last axis over each of m sensors' channels: one product, faster than many sums."""
-    n_columns = values.shape[-1]
-    of_sensors = np.repeat(np.eye(m), n_columns // m, axis=0)
-    return np.asarray((values.reshape(-1, n_columns) @ of_sensors).reshape(*values.shape[:-1], m))
