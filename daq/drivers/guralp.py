@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from daq.bench import Sensor
     from daq.clock import HostClock
     from daq.drivers.guralp_links import Link
-    from daq.protocols.guralp import Streams
+    from daq.protocols.gcf_streams import Streams
 
 MARGIN = 3.0
 """Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""

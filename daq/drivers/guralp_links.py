@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from daq.datagrams import DatagramStream
     from daq.drivers.guralp import GuralpSettings
     from daq.protocols.block import HostTime
-    from daq.protocols.guralp import Streams
+    from daq.protocols.gcf_streams import Streams
     from daq.transport import ByteStream
 
 SEND_INTERVAL = 10.0
