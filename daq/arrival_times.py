@@ -328,7 +328,7 @@ class ArrivalTimes:
             source="arrival times",
             offset=epochs[0].start,
             ppm=-drift / (1 + drift) * 1e6,
-            ppm_std=float(np.sqrt(2)) * residual / duration * 1e6,
+            ppm_std=math.sqrt(12) * residual / duration * 1e6,  # as if all of it were a slope
             wander_ppm=float(smoothed.rate.std()) * 1e6,
             residual=residual,
             n_epochs=len(epochs),

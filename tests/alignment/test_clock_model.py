@@ -261,16 +261,20 @@ def error_over_stated(rows: np.ndarray, taken: np.ndarray) -> float:
 @pytest.mark.parametrize("seconds", [30, 120, 300])
 def test_what_is_stated_is_what_is_left_neither_much_more_nor_less(seconds: int) -> None:
     rng = np.random.default_rng(12 + seconds)
-    left, stated = [], []
+    left, stated, off, known_to = [], [], [], []
     for _ in range(30):
-        taken = last_samples(10 * seconds, rng.uniform(-30, 30))
+        ppm = rng.uniform(-30, 30)
+        taken = last_samples(10 * seconds, ppm)
         clock = solved(block_rows(np.maximum.accumulate(taken + rng.exponential(1e-3, len(taken)))))
         error = clock.at(BLOCK * np.arange(1.0, len(taken) + 1) - 1) - taken
         left.append(error.var())
         stated.append(clock.state.residual**2)
+        off.append((clock.state.ppm - ppm) ** 2)
+        known_to.append(clock.state.ppm_std**2)
     # The mean of 30 squares of normal slopes is known to 26 %; the root to 13 %. Three
     # observations of 10 s allow for more noise than there is.
     assert 0.7 < np.sqrt(np.mean(stated) / np.mean(left)) < 3.0
+    assert 0.8 < np.sqrt(np.mean(known_to) / np.mean(off)) < 3.5
 
 
 def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_does() -> None:
