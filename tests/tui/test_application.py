@@ -236,14 +236,15 @@ async def test_how_far_a_test_is_that_ends_by_itself(told: Told, target: float |
     snapshot = replace(made_snapshot(), time_left=None if target is None else 260.0)
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        now = replace(made_now(), ends_in=100.0)
+        live = tuple(replace(sensor, state="live") for sensor in made_now().sensors)
+        now = replace(made_now(), sensors=live, ends_in=100.0)
         await shown(pilot, app, Looked(now), Fresh(snapshot, settings))
         line = str(app.query_one("#progress", Static).content)
-    assert line.endswith(" · ends in 2 min")
+    assert line.endswith("ends in 2 min")
+    assert (" · target in 5 min · " in line) == (target is not None)
     bar = line.split(maxsplit=1)[0]
     share = bar.count("━") / len(bar)
-    left = 100.0 if target is None else 260.0
-    assert share == pytest.approx(100 / (100 + left), abs=1 / len(bar))
+    assert share == pytest.approx(100 / (100 + 100), abs=1 / len(bar))  # what comes first
 
 
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(told: Told) -> None:

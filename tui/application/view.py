@@ -223,14 +223,14 @@ def progress_line(
     elif waits:
         parts.append(f"waits for {', '.join(waits)}")
     elif target is not None:
-        parts.append("target reached" if cov <= target else time_left(left))
+        parts.append("target reached" if cov <= target else _until_target(left, now))
     if now.ends_in is not None:
         parts.append(f"ends in {roughly(now.ends_in)}")
-    left = now.ends_in if target is None else left
+    left = min((each for each in (left, now.ends_in) if each is not None), default=None)
     text = " · ".join(parts)
     line = Text()
     room = width - len(text) - 3
-    if left is not None and not snapshot.closed and room >= 8:
+    if left is not None and not snapshot.closed and room >= 6:
         done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
         filled = round(done * room)
         line.append("━" * filled, "#4cc9f0")
@@ -238,6 +238,11 @@ def progress_line(
         line.append("  ")
     line.append(text)
     return line
+
+
+def _until_target(left: float | None, now: Now) -> str:
+    """Return how long the target still takes; of a run that ends, what it is that takes so long."""
+    return f"target in {roughly(left)}" if left and now.ends_in is not None else time_left(left)
 
 
 def alerts(now: Now) -> list[Text]:
