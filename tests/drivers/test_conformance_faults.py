@@ -9,8 +9,8 @@ of tests.acceptance.)
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,10 +26,11 @@ from sim_devices.pacing import WorldClock
 from tests.drivers.modes import CASES, Served, serving
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from daq.recording.reader import SensorRecord
+
+pytestmark = pytest.mark.timeout(240)
 
 SPEED = 4.0
 BEGIN = 44.0
@@ -110,17 +111,8 @@ def script() -> list[dict[str, Any]]:
     ]
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """All modes, recorded."""
-
-    served: Served
-    path: Path
-    struck: dict[str, list[str]]
-    """Faults of each mode's device since all were being recorded."""
-
-
 async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
+    """Record all modes; return the faults of each one's device since all were being recorded."""
     world = WorldClock(served.world["epoch_ns"], SPEED)
     stop = asyncio.Event()
     begun = math.inf
@@ -153,30 +145,26 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
                 return struck
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
-    path = tmp_path_factory.mktemp("faults") / "all.h5"
-    with serving(speed=SPEED, faults=script()) as served:
-        yield Recorded(served, path, asyncio.run(_recorded(served, path)))
-
-
 def test_no_mode_is_left_out() -> None:
     assert set(FAULTS) == set(CASES)
 
 
-@pytest.mark.parametrize("mode", CASES)
-def test_each_sample_is_in_its_place(recorded: Recorded, mode: str) -> None:
-    struck = recorded.struck[mode]
-    assert len(set(struck)) > len(FAULTS[mode]) / 2
-    with Recording.open(recorded.path) as recording:
-        for sensor in recording.sensors:
-            if sensor.name not in recorded.served.device(mode).sensors:
-                continue
-            kinds = [event.kind for event in recording.events if event.sensor == sensor.name]
-            assert set(kinds) <= KINDS
-            if "disconnect" in struck and "udp" not in mode:
-                assert kinds.count("connected") >= 2
-            _hold_against_the_world(recorded.served, mode, sensor)
+def test_each_sample_is_in_its_place(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    """One test, for all modes are recorded once."""
+    path = tmp_path / "all.h5"
+    with serving(speed=SPEED, faults=script()) as served:
+        struck = asyncio.run(_recorded(served, path))
+        with Recording.open(path) as recording:
+            for mode, sensor in itertools.product(CASES, recording.sensors):
+                if sensor.name not in served.device(mode).sensors:
+                    continue
+                with subtests.test(sensor=sensor.name):
+                    assert len(set(struck[mode])) > len(FAULTS[mode]) / 2
+                    kinds = [e.kind for e in recording.events if e.sensor == sensor.name]
+                    assert set(kinds) <= KINDS
+                    if "disconnect" in struck[mode] and "udp" not in mode:
+                        assert kinds.count("connected") >= 2
+                    _hold_against_the_world(served, mode, sensor)
 
 
 def _hold_against_the_world(served: Served, mode: str, sensor: SensorRecord) -> None:
