@@ -181,6 +181,18 @@ def test_a_run_too_short_for_any_estimate_is_refused_before_it_begins(
     assert not out.exists()
 
 
+def test_a_recording_that_is_there_is_not_taken_for_the_new_one(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "old.h5"
+    out.write_bytes(b"last night")
+    result = CliRunner().invoke(app, ["run", str(bench), "--out", str(out)])
+    assert result.exit_code == 3
+    assert "exists already" in result.stderr
+    assert not result.stdout
+    assert out.read_bytes() == b"last night"
+
+
 def test_ports_that_are_not_there_are_named_and_exit_3(bench: Path, tmp_path: Path) -> None:
     broken = parse(bench.read_text(encoding="utf-8"))
     sensors = tuple(

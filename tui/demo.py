@@ -18,7 +18,7 @@ from daq.bench import dump, format_duration, parse
 from daq.estimation import Settings, estimate
 from tui.bands import band_edges, band_means
 from tui.devices import scenario_of, simulated
-from tui.output import for_people, notices, write_json
+from tui.output import check_places, for_people, notices, write_json
 from tui.recorder_process import RecorderProcess
 from tui.results import band_of, correlation_of
 from tui.running import INTERRUPTED, follow_to_end
@@ -68,6 +68,7 @@ def run_demo(
     json: str | None,
 ) -> None:
     """Serve the demo's bench, record it, estimate, and compare; or open the application on it."""
+    check_places(None if keep is None else str(keep))
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     bench = parse(text, "demo")
     if duration is not None:

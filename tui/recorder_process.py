@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from daq.control import ask
-from daq.errors import HuddleError
+from daq.errors import HuddleError, RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,9 +42,16 @@ class RecorderProcess:
         Recording it writes; must not exist.
     duration : float, optional
         In seconds; until it is told to stop, if not given.
+
+    Raises
+    ------
+    RecordingError
+        If there is a recording already: it would be taken for the new one.
     """
 
     def __init__(self, bench_path: Path, out: Path, *, duration: float | None = None) -> None:
+        if out.exists():
+            raise RecordingError(f"{out}: exists already; expected a new file")
         self.out = out
         self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
         arguments = [sys.executable, "-m", "tui", "record", str(bench_path), "--out", str(out)]

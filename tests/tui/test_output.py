@@ -58,9 +58,14 @@ def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
     assert said == "word " * 20 + "\n"
 
 
-@pytest.mark.parametrize("option", ["--json", "--csv"])
-def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(option: str) -> None:
-    result = CliRunner().invoke(app, ["estimate", "nothing.h5", option, "nowhere/result"])
+@pytest.mark.parametrize(
+    "command",
+    [("estimate", "nothing.h5", "--json"), ("estimate", "nothing.h5", "--csv"), ("demo", "--keep")],
+)
+def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(
+    command: tuple[str, ...],
+) -> None:
+    result = CliRunner().invoke(app, [*command, "nowhere/result"])
     assert result.exit_code == 2
     assert "there is no folder" in result.output
 
