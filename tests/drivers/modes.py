@@ -143,8 +143,8 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
         source = Source(world, described)
         if described.driver == "guralp":  # on whole seconds of UTC
             source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
-        now = WorldClock(self._world["epoch_ns"], self._world["speed"]).now()
-        self[name] = source.counts(name, 0, round(now * rate))
+        end = WorldClock(self._world["epoch_ns"], self._world["speed"]).now() + 1.0
+        self[name] = source.counts(name, 0, round(end * rate))
         return self[name]
 
 
