@@ -108,6 +108,7 @@ class CrossSpectra:
         self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
         # One value a sample and channel: numpy multiplies contiguous arrays several times faster.
         self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
+        self._tapers = bool(np.any(self._window != 1))
         # Trends are fitted to the samples and taken off their spectra, where they fill few bins.
         trends = _trends(settings.detrend, length)
         self._fit = trends / np.sum(trends**2, axis=1, keepdims=True)
@@ -173,11 +174,11 @@ class CrossSpectra:
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
             n = len(rows)
-            for i, row in enumerate(rows):
-                segment = samples[row : row + length]
-                np.matmul(self._fit, segment, out=trend[i])
-                np.multiply(segment, self._taper, out=frames[i])
-            np.fft.rfft(frames[:n], axis=1, out=spectra[:n])
+            segments = _segments(samples, rows, length)
+            np.matmul(self._fit, segments, out=trend[:n])
+            if self._tapers:
+                segments = np.multiply(segments, self._taper, out=frames[:n])
+            np.fft.rfft(segments, axis=1, out=spectra[:n])
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
             if len(starts) == 1:  # to sum it and take it apart again would cost more
                 return spectra[0, :, :, None] * spectra[0, :, None, :].conj()
@@ -272,6 +273,15 @@ class CrossSpectra:
         spectra._sum = total.astype(np.complex128)
         spectra.n_segments = n_segments
         return spectra
+
+
+def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
+    """Segments that begin at `rows`, shape (n, length, n_channels): no copy if evenly spaced."""
+    windows = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0).swapaxes(1, 2)
+    steps = np.diff(rows)
+    if len(steps) == 0 or (steps[0] > 0 and np.all(steps == steps[0])):
+        return windows[rows[0] : rows[-1] + 1 : steps[0] if len(steps) else 1]
+    return windows[rows]
 
 
 def _trends(detrend: str, length: int) -> FloatArray:

@@ -97,6 +97,17 @@ def test_however_the_samples_are_cut_the_result_is_the_same() -> None:
     np.testing.assert_allclose(pieces.csm(), whole.csm(), rtol=1e-11, atol=1e-15)
 
 
+@pytest.mark.parametrize("window", ["hann", "rectangular"])
+def test_segments_may_lie_anywhere_in_any_order(window: str) -> None:
+    samples = noise(5000, 3)
+    settings = WelchSettings(RATE, 100, window=window)
+    even, anywhere = CrossSpectra(settings, 3), CrossSpectra(settings, 3)
+    starts = np.arange(7, 4900, 70)
+    even.add(samples, starts)
+    anywhere.add(samples, np.random.default_rng(2).permutation(starts))
+    np.testing.assert_allclose(anywhere.csm(), even.csm(), rtol=1e-11, atol=1e-15)
+
+
 def test_accumulators_add_and_survive_the_journey() -> None:
     samples = noise(6000, 3)
     settings = WelchSettings(RATE, 100, window=("kaiser", 5.0))
