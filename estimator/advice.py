@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.model_test import rejected_below
 from estimator.presence import presence
 from estimator.self_noise import Flag
 from estimator.stance import stance
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Advice", "advise"]
 
-REJECT = 0.01
 TYPICAL = 10.0
 CROSSING = 20.0
 CROSSING_THREE = 100.0
@@ -187,7 +187,8 @@ def _incoherence(
 ) -> Iterator[Advice]:
     d = max(dims)
     crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
-    for run in _runs(bands, lambda band: band.test.p_value < REJECT):
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
         ratios = [b.test.statistic / b.test.degrees for b in run]
         mean = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
         most = max(ratios)

@@ -17,8 +17,13 @@ from estimator.errors import InsufficientDataError
 from estimator.windows import get_window
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from estimator.arrays import BoolArray, FloatArray
     from estimator.factor_analysis import Maximum
+
+REJECT = 0.01
+"""Chance that a good test is said to fail."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +130,14 @@ def _estimated_parameters(maximum: Maximum) -> FloatArray:
     inverse = fisher.covariance(information + maximum.penalty)
     count = np.einsum("fij,fji->f", information, inverse)
     return np.where(np.isfinite(count), count, float(p))
+
+
+def rejected_below(tests: Iterable[BandTest]) -> float:
+    """Return the p value below which one of several bands fails.
+
+    `REJECT` is the chance that any band of a good test does: each has its part (Bonferroni).
+    """
+    return REJECT / max(1, sum(np.isfinite(test.p_value) for test in tests))
 
 
 def neighbour_correlation(window: FloatArray, hop: int, n_segments: int) -> FloatArray:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.model_test import rejected_below
 from tui.diagnosis import summary
 from tui.report.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.report.plots import REJECT, model_test_plot
+from tui.report.plots import model_test_plot
 from tui.report.wording import (
     NOTHING,
     plain_number,
@@ -48,7 +49,12 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     if not tested:
         text = "Not tested: that takes three sensors, and more averages than channels."
         return Section(title, (Paragraph(text, "doubtful"),))
-    runs = [list(run) for fails, run in groupby(tested, key=_fails) if fails]
+    rejected = rejected_below(band.test for band in tested)
+
+    def fails(band: BandDiagnosis) -> bool:
+        return band.test.p_value < rejected
+
+    runs = [list(run) for failing, run in groupby(tested, key=fails) if failing]
     parts: list[Part] = []
     if runs:
         where = "; ".join(_run_in_words(run) for run in runs)
@@ -79,7 +85,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     tones: dict[tuple[int, int], Tone] = {}
     for number, band in enumerate(tested):
         snr = band.snr[np.isfinite(band.snr)]
-        if _fails(band):
+        if fails(band):
             tones[number, 6] = "bad" if _ratio(band) > 2 else "doubtful"
         rows.append(
             (
@@ -89,7 +95,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
                 plain_number(band.dimension, ".0f"),
                 f"{_decibels(snr.min())} … {_decibels(snr.max())}" if snr.size else NOTHING,
                 plain_number(_ratio(band), ".3f"),
-                "fails" if _fails(band) else "holds",
+                "fails" if fails(band) else "holds",
                 probability(band.test.p_value),
             )
         )
@@ -97,7 +103,14 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
         "band (Hz)", "least coherence", "condition", "dimension", "SNR (dB)",
         "statistic / expected", "test", "p",
     )  # fmt: skip
-    parts.append(Table(header, tuple(rows), left=frozenset({6}), tones=tones))
+    parts += [
+        Table(header, tuple(rows), left=frozenset({6}), tones=tones),
+        Paragraph(
+            f"A band fails where p is below {rejected:.2g}: then one good test in a hundred has a "
+            "band that does.",
+            "quiet",
+        ),
+    ]
     return Section(title, tuple(parts))
 
 
@@ -243,10 +256,6 @@ def advice_section(snapshot: Snapshot) -> Section:
     if not lines:
         return Section("Advice", (Paragraph("Nothing to remark."),))
     return Section("Advice", (Items(tuple(Paragraph(_sentence(line)) for line in lines)),))
-
-
-def _fails(band: BandDiagnosis) -> bool:
-    return band.test.p_value < REJECT
 
 
 def _ratio(band: BandDiagnosis) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from scipy import special
 
-from estimator.model_test import neighbour_correlation
+from estimator.model_test import REJECT, neighbour_correlation
 from estimator.windows import get_window
 from tui.bands import band_means, log_edges
 from tui.limits import concerns, mask_psd
@@ -37,7 +37,6 @@ POINTS = 240
 """Most points of a curve: more than print resolves. Each is a mean over its share of the axis."""
 TEST_POINTS = 90
 NOISE_HEIGHT, TEST_HEIGHT = 1.45, 1.25
-REJECT = 0.01
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
