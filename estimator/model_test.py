@@ -6,6 +6,7 @@ motion, tilt, noise common to two channels (a cable, a digitizer), a bad clock.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -137,7 +138,7 @@ def rejected_below(tests: Iterable[BandTest]) -> float:
 
     `REJECT` is the chance that any band of a good test does: each has its part (Bonferroni).
     """
-    return REJECT / max(1, sum(np.isfinite(test.p_value) for test in tests))
+    return REJECT / max(1, sum(math.isfinite(test.p_value) for test in tests))
 
 
 def neighbour_correlation(window: FloatArray, hop: int, n_segments: int) -> FloatArray:
