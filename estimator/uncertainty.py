@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
+BOUNDLESS = 300.0  # in ln noise: as far as an end of an interval goes, short of overflow
+
 
 def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
     """Traces from which the scatter of an estimate follows.
@@ -144,7 +146,7 @@ def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
     in_log = above & (_skew(*logs) < _skew(*ends))
     linear, log = _doubled(*ends, cov * np.abs(noise)), _doubled(*logs, cov)
     lows, highs, covs = found.low.copy(), found.high.copy(), found.cov.copy()
-    down, up = (np.exp(np.where(in_log, reach, 0.0)) for reach in log)
+    down, up = (np.exp(np.where(in_log, np.minimum(reach, BOUNDLESS), 0.0)) for reach in log)
     lows[real] = np.where(in_log, noise / down, noise - linear[0])
     highs[real] = np.where(in_log, noise * up, noise + linear[1])
     covs[real] *= np.sqrt(2)
