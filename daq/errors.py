@@ -43,5 +43,9 @@ class CannotAlignError(HuddleError, ValueError):
     """The sensors of a recording cannot be brought onto one grid."""
 
 
+class WrongSettingError(CannotAlignError):
+    """What an estimate was asked for does not fit the recording's sensors or units."""
+
+
 class ImportFormatError(HuddleError, ValueError):
     """A foreign file cannot be understood."""

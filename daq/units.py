@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.errors import CannotAlignError
+from daq.errors import WrongSettingError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,14 +56,14 @@ def conversion(unit: str, wanted: str, frequency: NDArray[np.float64]) -> NDArra
 
     Raises
     ------
-    CannotAlignError
+    WrongSettingError
         If one cannot become the other.
     """
     unit, wanted = canonical(unit), canonical(wanted)
     if unit == wanted:
         return np.ones(len(frequency), dtype=np.complex128)
     if unit not in _MOTION or wanted not in _MOTION:
-        raise CannotAlignError(
+        raise WrongSettingError(
             f"unit {unit!r} cannot be turned into {wanted!r};"
             f" among each other can: {', '.join(_MOTION)}"
         )

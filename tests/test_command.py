@@ -368,6 +368,7 @@ def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -
         ("--gain", "Q=2"),
         ("--gain", "XX.TST5.10"),
         ("--gain", "XX.TST5.10=0"),
+        ("--unit", "kg"),
     ):
         huddle("estimate", str(tst), *options, code=2)
 

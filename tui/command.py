@@ -69,14 +69,15 @@ class HuddleGroup(TyperGroup):
 
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error; None for one that we did not foresee."""
-    from daq.errors import BenchFileError, HuddleError  # noqa: PLC0415
+    from daq.errors import BenchFileError, HuddleError, WrongSettingError  # noqa: PLC0415
 
     if isinstance(error, BaseExceptionGroup):
         codes = [exit_code(inner) for inner in error.exceptions]
         return None if None in codes else max(code for code in codes if code is not None)
     if type(error).__name__ == "RecorderFailedError":
         return int(getattr(error, "code", TROUBLE))
-    if isinstance(error, BenchFileError) or type(error).__name__ in _WRONG_USE:
+    wrong_use = isinstance(error, (BenchFileError, WrongSettingError))
+    if wrong_use or type(error).__name__ in _WRONG_USE:
         return USAGE
     if isinstance(error, (HuddleError, OSError)):
         return TROUBLE

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.errors import CannotAlignError
+from daq.errors import WrongSettingError
 from daq.units import conversion
 from estimator.dimension import BandDimension, choose_dimension
 from estimator.errors import InsufficientDataError
@@ -111,7 +111,7 @@ def known_gains(settings: Settings, channels: Channels) -> FloatArray:
 
     Raises
     ------
-    CannotAlignError
+    WrongSettingError
         If they name a sensor or channel that is not there, or a gain of 0.
     """
     gains = np.ones(len(channels))
@@ -120,7 +120,7 @@ def known_gains(settings: Settings, channels: Channels) -> FloatArray:
         named = [number for number, known in enumerate(names) if name in known]
         if not named or not np.isfinite(gain) or gain == 0:
             listed = ", ".join(dict.fromkeys(sensor for sensor, _ in names))
-            raise CannotAlignError(
+            raise WrongSettingError(
                 f"gain {name}={gain:g}: expected a sensor ({listed}) or one of its channels"
                 f" ({names[0][1]}, …), and a number other than 0"
             )
