@@ -12,10 +12,11 @@ There is neither counter nor time: samples are numbered as they come, and their 
 of a read that left less than one more in the FIFO. What waits when sampling starts is stale and
 thrown away. A level at the FIFO's capacity means that the device has dropped samples; that it drops
 the newest, not the oldest, is assumed: the gap is put behind what waits then, its length estimated
-from host time. Fewer words than are known to wait tell that the device was restarted (with
-``"size"``; with ``"left"`` it is not noticed). A reply that does not arrive may have taken N words
-with it: whether it did, the next level tells, since the device makes samples at a known rate
-meanwhile.
+from host time. Fewer words than are known to wait, and zeros behind them, tell that the device was
+restarted (with ``"size"``; with ``"left"`` it is not noticed). If there is more than zeros, the
+header is what is left, whatever was said: nothing is thrown away. A reply that does not arrive may
+have taken N words with it: whether it did, the next level tells, since the device makes samples at
+a known rate meanwhile.
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ class FifoDecoder:
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
         words = registers[1:].view(np.int16)
-        if level < self._asked:  # the rest of what came is nothing
+        if level < self._asked and not words[level:].any():  # the rest of what came is nothing
             words = words[: level // self._n_channels * self._n_channels]
             found += self._emptied(level, at)
         self.level = max(0, level - self._asked)

@@ -307,6 +307,16 @@ def test_a_fifo_that_was_emptied_gives_no_samples_that_were_none() -> None:
     )
 
 
+def test_nothing_is_thrown_away_where_the_header_is_not_what_was_said() -> None:
+    """What is left, taken for the size, is less than was asked for at every read."""
+    found = run(Device("left"), FifoDecoder("A", 8000.0, header="size"), 300)
+    index, counts = numbered(found)
+    assert index == list(range(len(index)))
+    assert len(index) > 2300
+    assert set((np.diff(counts[:, 0].astype(int)) % 30000).tolist()) == {1}
+    assert not any(isinstance(item, Event) for item in found)
+
+
 def test_refusals_are_told() -> None:
     decoder = FifoDecoder("A", RATE)
     decoder.request()
