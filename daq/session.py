@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
 LEAVE_TIMEOUT = 5.0
 """How long a driver may take to leave its device, s."""
-LEAST_SUSPENDED = 0.01
-"""How long a computer is suspended at least, s."""
+LEAST_SUSPENDED = 0.5
+"""How long a computer is suspended at least, s; a busy one may read its two clocks so far apart."""
 
 
 @dataclass(frozen=True, slots=True)
