@@ -174,9 +174,20 @@ class SensorSource:
         for other in others:
             apart = self.arrivals.start - other.arrivals.start
             guess = round(apart * self.record.sampling_rate)
-            if self._lag(other, self.runs[0].first_sample, guess) is not None:
+            lag = self._lag(other, self.runs[0].first_sample, guess)
+            if lag is not None and not self._departs(other, lag):
                 return other
         return None
+
+    def _departs(self, other: SensorSource, lag: int) -> bool:
+        """Whether counts that were the other's at first are not at the end of the first epoch.
+
+        Coarse counts of one motion can be equal by chance, until clocks have drifted apart.
+        """
+        mine, others = (next(each.arrivals.earliest())[1] for each in (self, other))
+        first = min(mine, others - lag) - _PROOF
+        last, other_last = self._counts(first, _PROOF), other._counts(first + lag, _PROOF)
+        return last is not None and other_last is not None and bool((last != other_last).any())
 
     def _lag(self, other: SensorSource, first: int, guess: int) -> int | None:
         """Return the n for which its samples i, soon after `first`, are the other's i + n.

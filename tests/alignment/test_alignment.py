@@ -271,6 +271,24 @@ def test_a_sensor_wired_twice_is_named_and_stops_nothing(
         assert np.isfinite(snapshot.results[method].noise_psd[4:160, [0, 1, 4, 5]]).all()
 
 
+def test_coarse_counts_that_are_equal_by_chance_at_first_are_not_one_sensor(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    tones, phases = rng.uniform(0.5, 40.0, (100, 1)), rng.uniform(0.0, 2 * np.pi, (100, 1))
+
+    def seen(ppm: float) -> Sensor:  # without noise, from the same instant on
+        rate = 100.0 * (1 + ppm * 1e-6)
+        motion = np.sin(2 * np.pi * tones * np.arange(12_000) / rate + phases).sum(axis=0)
+        return Sensor(np.round(motion / 14)[:, None].astype(np.int32), rate=rate, nominal=100.0)
+
+    sensors = {"a": seen(0.0), "b": seen(10.0)}
+    assert np.array_equal(sensors["a"].counts[:500], sensors["b"].counts[:500])
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        rates = [state.ppm for state in AlignedRecording(recording).clocks]
+    assert rates == pytest.approx([0.0, 10.0], abs=0.01)
+
+
 def test_a_shared_clock_has_a_rate_too(tmp_path: Path) -> None:
     rate = 100.0 * (1 + 18e-6)
     sensors = {
