@@ -21,7 +21,7 @@ import numpy as np
 
 from daq.clock_model import ClockState, nominal
 from daq.errors import CannotAlignError
-from daq.resampling import SPAN, USABLE, reach, resample
+from daq.resampling import SPAN, USABLE, all_there, reach, resample
 from daq.sensor_source import Learnt, SensorSource, main_columns
 
 if TYPE_CHECKING:
@@ -344,7 +344,7 @@ class AlignedRecording:
             inside = np.arange(low, high)
             present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
             inputs[~present] = 0.0
-            usable = _all_present(present, np.floor(positions).astype(np.int64) - low, margin)
+            usable = all_there(present, positions - low, ratio=ratio)
             if usable.any():
                 samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
                 valid |= usable
@@ -405,12 +405,3 @@ def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:
             f" ask for {lowest:g} Hz or less"
         )
     return wanted
-
-
-def _all_present(present: BoolArray, base: NDArray[np.int64], margin: int) -> BoolArray:
-    """Whether all samples that the kernel takes around `base` are present."""
-    missing = np.concatenate([[0], np.cumsum(~present)])
-    low = np.clip(base - max(margin - 1, 0), 0, len(present))
-    high = np.clip(base + margin + 1, 0, len(present))
-    inside = (base >= 0) & (base < len(present))
-    return np.asarray(inside & (missing[high] == missing[low]), dtype=np.bool_)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
+    BoolArray = NDArray[np.bool_]
 
 USABLE = 0.45
 """Share of the lower rate up to which samples keep what they are."""
@@ -58,6 +59,26 @@ def reach(ratio: float = 1.0) -> int:
         Input rate over output rate.
     """
     return math.ceil(HALF_WIDTH * max(1.0, ratio)) + 1
+
+
+def all_there(present: BoolArray, positions: FloatArray, *, ratio: float = 1.0) -> BoolArray:
+    """Tell at which positions all samples that the kernel takes are there.
+
+    Parameters
+    ----------
+    present : bool, shape (n_samples,)
+        Which samples are there.
+    positions : float64, shape (n_outputs,)
+        As `resample` takes them.
+    ratio : float
+        Input rate over output rate.
+    """
+    base, half = np.floor(positions).astype(np.int64), reach(ratio)
+    missing = np.concatenate([[0], np.cumsum(~present)])
+    low = np.clip(base - half + 1, 0, len(present))
+    high = np.clip(base + half + 1, 0, len(present))
+    inside = (base >= 0) & (base < len(present))
+    return np.asarray(inside & (missing[high] == missing[low]), dtype=np.bool_)
 
 
 def are_whole(positions: FloatArray) -> bool:
