@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 MAX_ITERATIONS = 200
 DECREMENT = 1e-7
 """Newton decrement at which a frequency has arrived: ln psi is then within 3e-4 standard errors
-of a single average, and the step still taken squares that."""
+of a single average, and the step still taken, if short, squares that."""
 BOUNDARY = 1e-6
 """psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
 _MAX_STEP = 2.0  # in ln psi, the first trust region
+_LAST_STEP = 0.01  # in ln psi: longer ones, of a likelihood that is nearly flat, may lead downhill
 _MIN_RADIUS = 1e-9
 _MIN_CURVATURE = 1e-9
 _CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
@@ -48,7 +49,7 @@ class Maximum:
     Attributes
     ----------
     psi : float64, shape (n_freqs, n_channels)
-        Noise PSD at the maximum (one Newton step beyond the rest below), unit**2/Hz, not
+        Noise PSD at the maximum (one short Newton step beyond the rest below), unit**2/Hz, not
         corrected for small samples; NaN where the matrix is singular.
     discrepancy : float64, shape (n_freqs,)
         ``sum(w - ln w - 1)`` over the eigenvalues no factor explains.
@@ -283,7 +284,8 @@ def _search(
         converged[moved] = decrement[moved] < DECREMENT
         stuck = radius < _MIN_RADIUS
         going = np.flatnonzero(~converged & ~stuck)
-    last = np.where(converged[:, None], step, 0.0)
+    sure = converged & (np.abs(step).max(axis=1) < _LAST_STEP)
+    last = np.where(sure[:, None], step, 0.0)
     found.psi[where] = np.exp(np.maximum(best.x + last, lowest))
     found.discrepancy[where] = best.discrepancy
     found.eigenvalues[where] = best.eigenvalues

@@ -126,6 +126,19 @@ def test_second_order_means_few_iterations() -> None:
     assert found.gradient_norm.max() < np.sqrt(DECREMENT)  # the Hessian's elements are at most 1
 
 
+def test_the_last_step_does_not_leave_the_maximum() -> None:
+    """As many factors as can be told: the likelihood is nearly flat, its parabola far too wide."""
+    draws = wishart(
+        equal_noise(2, dims=(3, 3, 3), snr=1), 100_000, np.random.default_rng(2), n_draws=100
+    )
+    found = maximise(draws, 6)
+    scale = 1 / np.sqrt(found.psi)
+    w = np.linalg.eigvalsh(draws * scale[:, :, None] * scale[:, None, :])[:, :3]
+    worse = np.sum(w - np.log(w) - 1, axis=1) - found.discrepancy
+    assert found.converged.all()
+    assert worse.max() < 10 * DECREMENT
+
+
 @pytest.mark.parametrize(("n_factors", "most"), [(0, 1), (1, 8), (3, 10)])
 def test_noise_that_falls_to_zero_takes_few_iterations(n_factors: int, most: int) -> None:
     """Weak motion and few averages: nearly every frequency has such a channel, or several."""
