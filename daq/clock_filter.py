@@ -17,8 +17,8 @@ an outlier cannot pull, a change that stays is followed. A restart of the device
 lateness and keeps the rate.
 
 Arrivals alone do not tell a clock that wanders from a host whose shortest latency does. So the
-clock is smoothed once more, with the walk that oscillators have at a steady temperature. By how
-much both differ is part of what is stated.
+clock is smoothed once more, with the likeliest walk that oscillators have at a steady temperature.
+By how much both differ is part of what is stated.
 
 Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model.md.
 """
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _WALKS = 10.0 ** np.arange(-10.0, -6.4, 0.5)  # random walk of the rate, s/s per √s
 _NOISES = 10.0 ** np.arange(-6.0, -2.4, 0.5)  # of arrival observations, s
-_STEADY = 1e-8  # the walk of an oscillator that is left in peace: 0.25 ppm in ten minutes
+_STEADY = 1.1e-8  # at most, of an oscillator that is left in peace: 0.25 ppm in ten minutes
 _START = np.array([1e-2, 1e-4, 1.0])  # what is not known at first: s, s/s, s
 _RESTART_RATE = 1e-6
 _HUBER = 4.0
@@ -115,7 +115,7 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     likelihood -= (np.log10(walks / _USUAL) / _USUALLY) ** 2 / 2
     likelihood -= (np.log10(noises / noises[0]) / _HARDLY_MORE) ** 2 / 2
     relative = np.exp(likelihood - likelihood.max())
-    steady = int(np.argmax(np.where(np.isclose(walks, _STEADY), likelihood, -np.inf)))
+    steady = int(np.argmax(np.where(walks < _STEADY, likelihood, -np.inf)))
     taken = np.append(np.flatnonzero(relative > _UNLIKELY), steady)
     track = _Track.empty(len(observations.seconds), len(taken))
     _filter(observations, walks[taken], noises[taken], track)
