@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
 def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Latency) -> None:
     rows = {
-        row.clocks: row for row in study(tmp_path, snr=1e4, duration=400.0, latency=latency, seed=3)
+        row.clocks: row for row in study(tmp_path, snr=1e4, duration=200.0, latency=latency, seed=3)
     }
     assert np.abs(rows["face value"].against_oracle[3:]).min() > 10  # garbage
     assert rows["refined"].residual_us.max() < 2.0
@@ -84,7 +84,7 @@ def test_half_a_minute_is_stated_by_its_samples_not_by_its_arrivals(
     tmp_path: Path, latency: Latency
 ) -> None:
     left, stated = [], []
-    for seed in range(4):
+    for seed in range(2):
         scenario = free_running(snr=1e4, duration=30.0, seed=seed)
         path = tmp_path / f"{seed}.h5"
         synthesise(path, scenario, duration=30.0, latency=latency, seed=seed)
@@ -118,15 +118,16 @@ def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None
     latency = Latency("batching", 16e-3)
     left, told = [], []
     for seed in range(3):
-        scenario = free_running(snr=0.3, duration=200.0, seed=seed)
+        scenario = free_running(snr=0.3, duration=100.0, seed=seed)
         path = synthesise(
-            tmp_path / f"{seed}.h5", scenario, duration=200.0, latency=latency, seed=seed
+            tmp_path / f"{seed}.h5", scenario, duration=100.0, latency=latency, seed=seed
         )
         snapshot = estimate([path])
         stated = snapshot.diagnostics["synchronisation"]["residual"]
         left += residuals(snapshot, scenario).tolist()
         told += [stated[name] for name in scenario.names[1:]]
-    # Both are of one slope mostly, and two of three share the reference's.
+    # Both are of one slope mostly, and two of three share the reference's. Blind to
+    # polls, 700 times too little is said of one clock; in 200 s, by chance, no less than here.
     assert np.all(np.array(left) < 3 * np.array(told))
     assert np.sqrt(np.mean(np.square(left))) < 2 * np.sqrt(np.mean(np.square(told)))
 
@@ -163,7 +164,7 @@ def test_a_rate_that_is_off_by_one_per_cent_is_followed(tmp_path: Path) -> None:
 
 
 def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:
-    rows = {row.clocks: row for row in study(tmp_path, snr=0.3, duration=400.0, seed=4)}
+    rows = {row.clocks: row for row in study(tmp_path, snr=0.3, duration=200.0, seed=4)}
     alone, refined = rows["arrival times"], rows["refined"]
     assert np.all(refined.residual_us < alone.residual_us + 1.0)
     assert np.abs(refined.against_oracle).max() < np.abs(alone.against_oracle).max() + 1e-3
