@@ -126,8 +126,8 @@ def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None
         stated = snapshot.diagnostics["synchronisation"]["residual"]
         left += residuals(snapshot, scenario).tolist()
         told += [stated[name] for name in scenario.names[1:]]
-    # Both are of one slope mostly, and two of three share the reference's. Blind to
-    # polls, 700 times too little is said of one clock; in 200 s, by chance, no less than here.
+    # Both are of one slope mostly, and two of three share the reference's. Blind to polls, 700
+    # times too little is said of one clock.
     assert np.all(np.array(left) < 3 * np.array(told))
     assert np.sqrt(np.mean(np.square(left))) < 2 * np.sqrt(np.mean(np.square(told)))
 
