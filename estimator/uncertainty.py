@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
-BOUNDLESS = 300.0  # in ln noise: as far as an end of an interval goes, short of overflow
+BOUNDLESS = 300.0  # in ln noise: as far as an interval is widened, short of overflow
 
 
 def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
@@ -147,8 +147,8 @@ def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
     linear, log = _doubled(*ends, cov * np.abs(noise)), _doubled(*logs, cov)
     lows, highs, covs = found.low.copy(), found.high.copy(), found.cov.copy()
     down, up = (np.exp(np.where(in_log, np.minimum(reach, BOUNDLESS), 0.0)) for reach in log)
-    lows[real] = np.where(in_log, noise / down, noise - linear[0])
-    highs[real] = np.where(in_log, noise * up, noise + linear[1])
+    lows[real] = np.minimum(low, np.where(in_log, noise / down, noise - linear[0]))
+    highs[real] = np.maximum(high, np.where(in_log, noise * up, noise + linear[1]))
     covs[real] *= np.sqrt(2)
     return replace(found, cov=covs, low=lows, high=highs)
 
