@@ -142,7 +142,9 @@ def _live() -> list[Row]:
                 100 * seconds / (settings.hop / RATE),
                 "% of the time its new samples took",
                 at_most=share,
-                note="all threads together" if snr > 1 else "motion lost in the noise everywhere",
+                note="all threads together"
+                if snr > 1
+                else "motion lost in the noise everywhere; updates are spaced (tui.spacing)",
             )
         )
     return rows

@@ -10,6 +10,7 @@ from daq.errors import HuddleError, RecordingError
 from daq.estimation import Estimation
 from daq.recording.reader import Recording, control_address
 from estimator.errors import EstimatorError, InsufficientDataError
+from tui.spacing import Spacing
 from tui.state import Lookout
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def follow(
 ) -> None:
     """Follow a recording until it is closed or ``ended``; a recorder that was killed is trouble.
 
-    The estimate is made anew when the number of segments has grown, and by this share at least.
+    The estimate is made anew when the number of segments has grown, and by this share at least;
+    less often where it takes long (:mod:`tui.spacing`).
     """
     try:
         with Estimation([path], settings) as estimation:
@@ -75,13 +77,16 @@ def follow(
             states = _RecorderStates(path)
             onlooker.look(lookout.look())
             wanted, n_samples, heard = 0.0, -1, time.monotonic()
+            spacing = Spacing()
             while not recording.closed:
                 began = time.thread_time()
                 estimation.update()
-                if estimation.n_seen >= wanted:
+                if estimation.n_seen >= wanted and spacing.due:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                     onlooker.look(lookout.look_closely())
-                    onlooker.snapshot(estimation.snapshot(), estimation.settings)
+                    with spacing:
+                        snapshot = estimation.snapshot()
+                    onlooker.snapshot(snapshot, estimation.settings)
                 else:
                     now = lookout.look()
                     if lookout.quiet():

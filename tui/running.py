@@ -24,6 +24,7 @@ from tui.patience import patience
 from tui.recorder_process import RecorderProcess
 from tui.reporting import checked, write_report
 from tui.results import reached_cov, result_arrays
+from tui.spacing import Spacing
 from tui.text import clock_time, time_left
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ LONGEST_INTERVAL = 5.0
 BEHIND = 2.0
 """Seconds by which a recording that is looked at may lie behind its sensors, at most."""
 SHARE = 0.03
-"""Of one core, at most, that estimating live may take."""
+"""Of one core, at most, that following may take, by fewer looks."""
 
 
 def run_test(
@@ -130,7 +131,8 @@ def follow_to_end(
     interrupted : bool
         Whether Ctrl-C was pressed.
     """
-    interrupted, snapshot = False, None
+    interrupted, snapshot, news = False, None, False
+    spacing = Spacing()
     with Estimation([recorder.out], settings) as estimation, _progress() as show:
         bench = estimation.recordings[0].bench
         speed = 1.0 if bench is None else bench.speed
@@ -138,8 +140,11 @@ def follow_to_end(
             try:
                 began = time.process_time()
                 gone = recorder.ended  # looked at first: what it wrote last is then seen
-                if estimation.update() or gone or snapshot is None:
-                    snapshot = estimation.snapshot()
+                news = estimation.update() or news
+                if gone or snapshot is None or (news and spacing.due):
+                    with spacing:
+                        snapshot = estimation.snapshot()
+                    news = False
                     show(snapshot, settings, duration)
                     if gone:
                         break
