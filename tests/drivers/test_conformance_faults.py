@@ -116,12 +116,12 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
     """Record all modes; return the faults of each one's device since all were being recorded."""
     world = WorldClock(served.world["epoch_ns"], SPEED)
     stop = asyncio.Event()
-    begun = math.inf
+    begun = done = math.inf
     struck: dict[str, list[str]] = {}
     when_struck: dict[str, int] = {}
 
     def look(status: Status) -> None:
-        nonlocal begun, struck, when_struck
+        nonlocal begun, done, struck, when_struck
         now, samples = world.now(), {name: one.samples for name, one in status.sensors.items()}
         if begun == math.inf and min(samples.values()):
             begun = now
@@ -132,6 +132,8 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
         struck = {m: [one["kind"] for one in served.struck(m) if one["at"] > begun] for m in CASES}
         everything = all(set(kinds) == set(struck[mode]) for mode, kinds in FAULTS.items())
         if everything or now > begun + ROUNDS * ROUND:
+            done = min(done, now)
+        if now > done + LONGER["disconnect"]:  # what grows from now on is there again
             when_struck = samples
 
     sensors = tuple(sensor for mode in CASES for sensor in served.sensors(mode))
