@@ -14,17 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols import brp, epson, gcf, labjack, rtu
+from daq.protocols import brp, epson, gcf, labjack, rtu, scream
 from daq.protocols.block import Block, Event, HostTime
 from daq.protocols.epson import BurstFormat, CommandDecoder, Read
 from daq.protocols.epson_burst import BurstDecoder
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.fifo import FifoDecoder
-from daq.protocols.guralp import SerialDecoder
+from daq.protocols.guralp import ScreamDecoder, SerialDecoder
 from daq.protocols.labjack import Packet, StreamDecoder
 from daq.protocols.labjack_registers import AduFinder
 from daq.protocols.registers import RegisterDecoder, RegisterMap
-from daq.protocols.scream import PacketFinder
 from daq.protocols.text import TextDecoder
 from daq.protocols.text_format import RASPBERRY_SHAKE, TextFormat
 
@@ -118,21 +117,22 @@ def polled_registers(fuzzed: bytes) -> None:
 SYSTEM = gcf.SystemId("DEMO")
 
 
-def _gcf(k: int) -> bytes:
+def _gcf(k: int) -> gcf.SampleBlock:
     counts = np.arange(40, dtype=np.int32) * 1000 + k
     start = (1_790_000_000 + k) * 10**9
-    return gcf.encode_block(gcf.SampleBlock(SYSTEM, "DEMOZ0", start, Fraction(40), counts))
+    return gcf.SampleBlock(SYSTEM, "DEMOZ0", start, Fraction(40), counts)
 
 
-FRAMES = b"".join(brp.encode_frame(k, _gcf(k)) for k in range(4))
+FRAMES = b"".join(brp.encode_frame(k, gcf.encode_block(_gcf(k))) for k in range(4))
 
 
 def guralp_serial(fuzzed: bytes) -> None:
     """Framed GCF blocks over a serial line."""
     decoder = SerialDecoder({"A": ["DEMOZ0"]}, replies=False)
-    _feed(decoder.receive, fuzzed)
+    found = _feed(decoder.receive, fuzzed)
     # a block of the future may have been among them: what is valid now may be too late
-    decoder.receive(bytes(2048) + FRAMES, _at(LATER))
+    found += decoder.receive(bytes(2048) + FRAMES, _at(LATER))
+    _demand(found, 0)
 
 
 def gcf_block(fuzzed: bytes) -> None:
@@ -141,12 +141,25 @@ def gcf_block(fuzzed: bytes) -> None:
         gcf.decode_block(fuzzed)
 
 
+SCREAM = [scream.encode_packet(scream.Packet(k, "DEMO", _gcf(k))) for k in (0, 1, 2, 4, 3)]
+
+
 def scream_tcp(fuzzed: bytes) -> None:
-    """Packets of a Scream server."""
-    finder = PacketFinder()
-    for read, _ in _reads(fuzzed):
-        with contextlib.suppress(RemoteProtocolError):
-            list(finder.receive(read))
+    """Packets of a Scream server, over TCP."""
+    decoder = ScreamDecoder({"A": ["DEMOZ0"]})
+    _demand(_feed(decoder.receive, fuzzed), 0)
+    decoder.receive(bytes(2048) + b"".join(SCREAM), _at(LATER))
+
+
+def scream_udp(fuzzed: bytes) -> None:
+    """Datagrams of a Scream server."""
+    decoder = ScreamDecoder({"A": ["DEMOZ0"]})
+    found: list[object] = []
+    for k, start in enumerate(range(0, len(fuzzed), len(SCREAM[0]))):
+        found += decoder.receive_datagram(fuzzed[start : start + len(SCREAM[0])], _at(k / 10))
+        if k % 3 == 2 and decoder.missing:
+            decoder.not_available(decoder.missing[0])
+    _demand(found, 0)
 
 
 PACKETS = b"".join(
@@ -237,8 +250,9 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
     "epson_commands": (epson_commands, [b"\x02" + epson.read(epson.ID) * 3]),
     "polled_registers": (polled_registers, [b"\x0d" + bytes(range(70)), b"\x0d" + b"\xff" * 56]),
     "guralp_serial": (guralp_serial, [b"\xff" + FRAMES, b"\x07" + FRAMES[30:]]),
-    "gcf_block": (gcf_block, [_gcf(0)]),
-    "scream_tcp": (scream_tcp, [b"\xff" + _gcf(0).ljust(1024, b"\0") + bytes(40)]),
+    "gcf_block": (gcf_block, [gcf.encode_block(_gcf(0))]),
+    "scream_tcp": (scream_tcp, [b"\xff" + b"".join(SCREAM[:3])]),
+    "scream_udp": (scream_udp, [b"".join(SCREAM[:3]), SCREAM[0] + b"".join(SCREAM[3:])]),
     "labjack_stream": (labjack_stream, [b"\xff" + PACKETS, b"\x05" + PACKETS[9:]]),
     "labjack_registers": (labjack_registers, [b"\xff" + bytes.fromhex("000100000006ff0400000002")]),
     "fifo": (fifo, [b"\x10" + rtu.encode(1, bytes((4, 8)) + struct.pack(">4H", 3, 1, 2, 3))]),
