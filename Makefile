@@ -18,8 +18,8 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
 	$(BIN)/huddle demo
 
-test: $(VENV)/.installed-dev  ## the tests
-	$(BIN)/pytest -n 2
+test: $(VENV)/.installed-dev  ## the tests; three at a time on two cores, for many wait for their devices
+	$(BIN)/pytest -n 3
 
 check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 	$(BIN)/ruff format --check $(SOURCES)
