@@ -24,8 +24,8 @@ def table(rows: list[Row]) -> str:
         cells.append(
             (
                 f"{row.what} ({row.note})" if row.note else row.what,
-                f"{row.measured:.3g} {row.unit}",
-                "" if limit is None else f"{sign} {limit:g} {row.unit}",
+                f"{_figure(row.measured)} {row.unit}",
+                "" if limit is None else f"{sign} {_figure(limit)} {row.unit}",
                 {True: "reached", False: "MISSED", None: ""}[row.reached],
             )
         )
@@ -34,6 +34,11 @@ def table(rows: list[Row]) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in cells
     )
+
+
+def _figure(value: float) -> str:
+    """Write three figures, or all before the point."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def main(names: list[str]) -> int:

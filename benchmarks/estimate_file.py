@@ -8,7 +8,6 @@ it no reader can save: inflating, and the imports.
 
 from __future__ import annotations
 
-import re
 import resource
 import subprocess
 import sys
@@ -38,12 +37,12 @@ if TYPE_CHECKING:
 RATE, LENGTH, HOURS = 200, 2000, 3
 SLOW_RATE, SLOW_LENGTH, SLOW_HOURS = 40, 400, 24
 REPEATS = 3
-MEMORY = r"""
-import re, sys
-from pathlib import Path
+MEMORY = """
+import sys
+from benchmarks.row import peak_memory
 from daq.estimation import Settings, estimate
 estimate([sys.argv[1]], Settings(methods=("three-sensor",)))
-print(re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text()).group(1))
+print(peak_memory())
 """
 
 
@@ -293,4 +292,4 @@ def _mlab(channels: np.ndarray) -> None:
 
 def _memory(path: Path) -> float:
     """Return the peak of a process that only estimates, in MB."""
-    return int(re.findall(r"\d+", _run("-c", MEMORY, str(path)))[-1]) / 1024
+    return float(_run("-c", MEMORY, str(path)))

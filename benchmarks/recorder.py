@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.row import Row
+from benchmarks.row import Row, peak_memory
 from daq.bench import Bench, Channel, Sensor, parse
 from daq.estimation import Estimation, Settings
 from daq.protocols import epson
@@ -106,7 +106,7 @@ def measure(bench_file: str, path: str, duration: float) -> None:
 
     status = record(bench, path, duration=duration, acknowledged=acknowledged)
     cpu = (used() - begin[0]) / (time.monotonic() - begin[1])
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = peak_memory()
     missing = sum(sensor.missing for sensor in status.sensors.values())
     samples = sum(sensor.samples for sensor in status.sensors.values())
     print(json.dumps({"cpu": cpu, "memory": memory, "missing": missing, "samples": samples}))

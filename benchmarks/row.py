@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -41,6 +43,12 @@ class Row:
         if self.at_least is not None:
             return self.measured >= self.at_least
         return None
+
+
+def peak_memory() -> float:
+    """Return the peak of this process in MB; what rusage says includes that of its parent."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return int(re.findall(r"VmHWM:\s*(\d+)", status)[0]) / 1024
 
 
 def fastest(*actions: Callable[[], object], repeats: int = 5) -> list[float]:

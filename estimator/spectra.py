@@ -3,8 +3,9 @@
 Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
 in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
 
-Segments are taken a block at a time, so that the work stays in the cache. Two threads take half
-of them each; their sums are added in order, so that the result does not depend on their timing.
+Segments are taken a block at a time, so that the work stays in the cache. Several threads take
+equal shares of them; their sums are added in order, so that the result does not depend on their
+timing.
 """
 
 from __future__ import annotations
@@ -93,13 +94,16 @@ class CrossSpectra:
     ----------
     settings : WelchSettings
     n_channels : int
+    threads : int
+        How many `add` may use: 1 where other threads of the caller's have the processors already.
     """
 
-    def __init__(self, settings: WelchSettings, n_channels: int) -> None:
+    def __init__(self, settings: WelchSettings, n_channels: int, *, threads: int = THREADS) -> None:
         if n_channels < 1:
             raise EstimatorError(f"{n_channels} channels: at least one is needed")
         self.settings = settings
         self.n_channels = n_channels
+        self._threads = threads
         self.n_segments = 0
         length = settings.segment_length
         self._window = get_window(settings.window, length)
@@ -136,7 +140,7 @@ class CrossSpectra:
         self.check(samples, starts)
         if starts.size == 0:
             return
-        workers = min(THREADS, -(-len(starts) // self._block))
+        workers = min(self._threads, -(-len(starts) // self._block))
         if workers == 1:
             self._sum += self._total(samples, starts)
         else:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _Piece = TypeVar("_Piece")
 _Read = TypeVar("_Read")
 
-_VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
+_VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
 _READERS = 2  # pieces being read while one is worked on
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
@@ -79,7 +79,8 @@ class Pass:
             )
         elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
-        self._all = CrossSpectra(self.welch, self.n_channels)
+        # The other processors read ahead.
+        self._all = CrossSpectra(self.welch, self.n_channels, threads=1)
         self._selected: CrossSpectra | None = None
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
