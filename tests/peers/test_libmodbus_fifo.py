@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import time
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +11,10 @@ from daq.bench import Channel, Sensor
 from daq.drivers.registry import driver_type
 from daq.protocols.block import BlockFlag
 from tests.drivers.reading import record
+from tests.peers.libmodbus import build, ready, serial_cable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from pathlib import Path
 
 pytestmark = pytest.mark.peer
 
@@ -28,49 +24,7 @@ RATE = 2000.0
 @pytest.fixture(scope="module")
 def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compile the libmodbus program."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler to build the libmodbus peer with")
-    program = tmp_path_factory.mktemp("libmodbus") / "peer"
-    source = Path(__file__).with_name("fifo_peer.c")
-    built = subprocess.run(
-        [compiler, "-I/usr/include/modbus", str(source), "-lmodbus", "-o", str(program)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if built.returncode and "modbus.h" in built.stderr:
-        pytest.skip("libmodbus (Debian: libmodbus-dev) is not installed")
-    assert built.returncode == 0, built.stderr
-    return program
-
-
-@contextmanager
-def serving(*command: str) -> Iterator[None]:
-    """Run the server until the context ends."""
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout is not None
-            assert server.stdout.readline() == "ready\n"
-            yield
-        finally:
-            server.terminate()
-
-
-@contextmanager
-def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
-    """Two pseudo-terminals joined by socat."""
-    if shutil.which("socat") is None:
-        pytest.skip("socat (Debian: socat) is not installed")
-    ends = (str(folder / "one"), str(folder / "other"))
-    with subprocess.Popen(["socat", *(f"pty,raw,echo=0,link={end}" for end in ends)]) as socat:
-        try:
-            deadline = time.monotonic() + 5
-            while not all(Path(end).exists() for end in ends):
-                assert time.monotonic() < deadline, "socat made no pseudo-terminals"
-            yield ends
-        finally:
-            socat.terminate()
+    return build("fifo_peer.c", tmp_path_factory.mktemp("libmodbus"))
 
 
 @pytest.mark.parametrize("header", ["size", "left"])
@@ -80,7 +34,7 @@ async def test_our_driver_reads_a_fifo_of_libmodbus(
     """Every sample once, in order, whichever meaning the first register has."""
     with (
         serial_cable(tmp_path) as (ours, theirs),
-        serving(str(peer), theirs, header),
+        ready(str(peer), theirs, header),
     ):
         sensor = Sensor(
             name="A",

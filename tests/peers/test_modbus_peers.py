@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import time
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,10 +15,12 @@ from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.protocols.block import Block
 from sim_devices import launch
+from tests.peers.libmodbus import build, ready, running, serial_cable
 from tests.sim_devices.bench import device, scenario, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from sim_devices.launch import RunningDevice
 
@@ -38,21 +37,7 @@ SLAVE = 0x50
 @pytest.fixture(scope="module")
 def peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compile the libmodbus program."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler to build the libmodbus peer with")
-    program = tmp_path_factory.mktemp("libmodbus") / "peer"
-    source = Path(__file__).with_name("libmodbus_peer.c")
-    built = subprocess.run(
-        [compiler, "-I/usr/include/modbus", str(source), "-lmodbus", "-o", str(program)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if built.returncode and "modbus.h" in built.stderr:
-        pytest.skip("libmodbus (Debian: libmodbus-dev) is not installed")
-    assert built.returncode == 0, built.stderr
-    return program
+    return build("libmodbus_peer.c", tmp_path_factory.mktemp("libmodbus"))
 
 
 @pytest.fixture(scope="module", params=["tcp", "rtu"])
@@ -117,15 +102,14 @@ def test_mbpoll_reads_our_slave(slave: tuple[str, RunningDevice], reading: list[
     assert signed([int(value) for value in values]) == reading
 
 
+@pytest.mark.parametrize("slave", ["rtu"], indirect=True)  # it does not speak TCP
 def test_minimalmodbus_reads_our_slave(
     slave: tuple[str, RunningDevice], reading: list[int]
 ) -> None:
     minimalmodbus = pytest.importorskip(
         "minimalmodbus", reason="minimalmodbus (PyPI) is not installed"
     )
-    kind, one = slave
-    if kind == "tcp":
-        pytest.skip("minimalmodbus speaks RTU only")
+    _, one = slave
     instrument = minimalmodbus.Instrument(one.port, SLAVE)
     instrument.serial.baudrate = 9600
     instrument.serial.timeout = 1.0
@@ -136,28 +120,6 @@ def test_minimalmodbus_reads_our_slave(
             instrument.read_register(900)
     finally:
         instrument.serial.close()
-
-
-@contextmanager
-def running(*command: str) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
-        try:
-            yield program
-        finally:
-            program.terminate()
-
-
-@contextmanager
-def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
-    """Two pseudo-terminals joined by socat."""
-    if shutil.which("socat") is None:
-        pytest.skip("socat (Debian: socat) is not installed")
-    ends = (str(folder / "one"), str(folder / "other"))
-    with running("socat", *(f"pty,raw,echo=0,link={end}" for end in ends)):
-        deadline = time.monotonic() + 5
-        while not all(Path(end).exists() for end in ends):
-            assert time.monotonic() < deadline, "socat made no pseudo-terminals"
-        yield ends
 
 
 async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
@@ -193,10 +155,8 @@ async def test_our_driver_reads_a_libmodbus_server_over_tcp(peer: Path, function
 async def test_our_driver_reads_a_libmodbus_server_over_rtu(peer: Path, tmp_path: Path) -> None:
     with (
         serial_cable(tmp_path) as (ours, theirs),
-        running(str(peer), "serve", "rtu", theirs) as server,
+        ready(str(peer), "serve", "rtu", theirs),
     ):
-        assert server.stdout is not None
-        assert server.stdout.readline() == "ready\n"
         rows = await _polled(ours, {"addresses": [0, 7, 9], "device_id": 5, "baud_rate": 115200})
     counts = [row[0] for row in rows]
     assert counts == list(range(counts[0], counts[0] + len(rows)))
