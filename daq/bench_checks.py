@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 from pydantic import BaseModel, ValidationError
 
 from daq.bench_model import EstimateSettings, Limit, RecordingSettings, Sensor, valid_rate
+from daq.drivers.base import Checking
 from daq.durations import format_duration
+from daq.errors import BenchFileError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -146,6 +148,7 @@ def cross_faults(table: Mapping[str, Any], drivers: Mapping[str, DriverType]) ->
         yield from _duplicates(f"{_place(sensor)}.channels", [c.name for c in sensor.channels])
     yield from _duplicates("sensors", [sensor.name for sensor in sensors])
     yield from _port_faults(sensors, drivers)
+    yield from _device_faults(sensors, drivers)
     yield from _limit_faults(table, sensors)
     yield from _simulation_faults(table)
     if estimate is not None:
@@ -207,6 +210,24 @@ def _port_faults(sensors: Sequence[Sensor], drivers: Mapping[str, DriverType]) -
                 sensor.sampling_rate,
                 f"expected {other.sampling_rate:g} Hz, as sensor {other.name!r} on the same clock",
             )
+
+
+def _device_faults(sensors: Sequence[Sensor], drivers: Mapping[str, DriverType]) -> Iterator[Fault]:
+    """Yield what drivers know of their devices, port by port."""
+    ports: dict[tuple[str, str], list[Sensor]] = {}
+    for sensor in sensors:
+        ports.setdefault((sensor.driver, sensor.port), []).append(sensor)
+    for (name, _), group in ports.items():
+        driver = drivers.get(name)
+        if driver is None or any(_valid(driver.settings, s.settings) is None for s in group):
+            continue  # that has been said
+        if isinstance(driver, Checking):
+            try:
+                driver.check(group)
+            except BenchFileError as error:
+                about = next((s for s in group if f"sensor {s.name!r}" in str(error)), group[0])
+                said = str(error).removeprefix(f"sensor {about.name!r}: ")
+                yield Fault(_place(about), _ABSENT, said)
 
 
 def _set_faults(

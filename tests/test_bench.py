@@ -302,6 +302,12 @@ sensitivity = 1
         assert expected in found
 
 
+def test_what_a_device_cannot_do_is_said_without_it() -> None:
+    text = HEAD.replace("200", "201") + sensor_text("A", driver="epson")
+    with pytest.raises(BenchFileError, match=r'sensors\["A"\]: .*sampling_rate = 201'):
+        parse(text)
+
+
 def test_not_toml_says_where() -> None:
     assert "at line 1, column" in faults("name = = 3")[0]
 

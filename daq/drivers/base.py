@@ -132,3 +132,18 @@ class Resuming(Protocol):
         As :meth:`DriverType.open`; ``before`` is over.
         """
         ...
+
+
+@runtime_checkable
+class Checking(Protocol):
+    """A driver (:class:`DriverType`) that can tell from the bench file what would not work."""
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """Refuse what no device of this kind does; ``sensors`` are all those of one port.
+
+        Raises
+        ------
+        BenchFileError
+            Naming the sensor, its key, the value and what was expected.
+        """
+        ...

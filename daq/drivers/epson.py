@@ -136,6 +136,10 @@ class EpsonDriver:
         """Return int32: counts, and those of the temperature too."""
         return np.dtype(np.int32)
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _configured(sensors)
+
     @contextlib.asynccontextmanager
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
