@@ -81,6 +81,8 @@ def follow(
             while not recording.closed:
                 began = time.thread_time()
                 estimation.update()
+                if recording.closed:  # what is said of a closed one is its result
+                    break
                 if estimation.n_seen >= wanted and spacing.due:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                     onlooker.look(lookout.look_closely())

@@ -201,6 +201,24 @@ def test_the_end_is_one_result(tmp_path: Path) -> None:
     assert not noted.troubles
 
 
+def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+
+        class Closing(Noted):
+            def look(self, now: Now) -> None:
+                if not self.nows:  # it has been seen open, and ends before the next look
+                    Bench(writer).send("ABC", 30)
+                    writer.close()
+                super().look(now)
+
+        noted = Closing()
+        follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    (snapshot,) = noted.snapshots
+    assert snapshot.closed
+    assert "advice" in snapshot.diagnostics
+
+
 def test_nobody_waits_for_a_result_that_nobody_wants(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer:

@@ -375,15 +375,14 @@ class HuddleApp(App[None]):
 
     def action_report(self) -> None:
         """Write the report of the test that has ended."""
-        if self._has_result and self._path is not None and self._settings is not None:
-            self.notify("writing the report …", timeout=3)
-            self._report(self._path)
+        path, snapshot, settings = self._path, self.snapshot, self._settings
+        if path is None or snapshot is None or settings is None or not snapshot.closed:
+            return
+        self.notify("writing the report …", timeout=3)
+        self._report(path, snapshot, settings)
 
     @work(thread=True, group="control")
-    def _report(self, path: Path) -> None:
-        snapshot, settings = self.snapshot, self._settings
-        if snapshot is None or settings is None:
-            return
+    def _report(self, path: Path, snapshot: Snapshot, settings: Settings) -> None:
         with self._reading:
             report = self._try(lambda: self._controls.report(path, snapshot, settings))
         if report is not None:
