@@ -5,7 +5,8 @@ a burst request in one and a register write in the other), the modes and their s
 filters, burst fields, tilt, UART_AUTO and bursts on request, no answers to reads while streaming,
 software reset, flash backup, factory defaults, AUTO_START, busy and not-ready bits that last, COUNT
 wrapping, each burst sent when its last bit would have left the UART, sampling by an external
-trigger, and, on an M-A370, in step with 1PPS.
+trigger, and, on an M-A370, in step with 1PPS. An M-A370 has neither reduced noise nor temperature
+stabilisation, and lacks three filters: it ignores their bits and codes, which is assumed.
 
 Connected to the EXT pin is what the bench file's ``external`` says: a generator of triggers at the
 sampling rate that is never off, or the seconds of UTC. With neither, a device that is told to wait
@@ -38,6 +39,7 @@ RESET_TIME, FLASH_TIME, FILTER_TIME, TEST_TIME = 0.97, 0.31, 0.005, 0.2
 """How long the device is not ready or busy, s."""
 TRIGGER, PPS = 0x40, 0x80
 """Bits of MSC_CTRL: samples are taken when a trigger comes, or in step with 1PPS (M-A370)."""
+_NOT_ON_A370 = {epson.FILTERS[name] for name in epson.NOT_ON_A370}
 AHEAD = 1.0
 """How much is simulated at a time, s of world time."""
 
@@ -81,13 +83,14 @@ class EpsonDevice:
         self._baud_rate = int(device.settings.get("baud_rate", 460800))
         serial_number = device.serial_number or f"S{zlib.crc32(self._sensor.encode()) % 10**7:07d}"
         self._fixed: dict[Register, int] = {epson.ID: epson.DEVICE_ID, epson.VERSION: 0x0104}
-        self._has_pps = "370" in device.model
-        self._fixed |= _text(epson.PROD_ID, "A370AD10" if self._has_pps else "A352AD10")
+        self._is_a370 = "370" in device.model
+        self._fixed |= _text(epson.PROD_ID, "A370AD10" if self._is_a370 else "A352AD10")
         self._fixed |= _text(epson.SERIAL_NUM, serial_number)
         self._source = source
         self._sampled = source
         self._commands = CommandDecoder()
-        self._flash = dict(_DEFAULTS)
+        self._defaults = _DEFAULTS | ({epson.SIG_CTRL: 0x8E00} if self._is_a370 else {})
+        self._flash = dict(self._defaults)
         self._times: NDArray[np.float64] = np.empty(0)  # of the samples in _frames, world time
         self._frames = b""
         self._first = self._sent = self._begin = 0
@@ -222,8 +225,12 @@ class EpsonDevice:
             self._busy[register] = (command.value << 8, now + TEST_TIME)
             return
         value = command.value
-        if register == epson.MSC_CTRL and not self._has_pps:
+        if register == epson.MSC_CTRL and not self._is_a370:
             value &= ~PPS
+        if register == epson.SIG_CTRL and not shift and self._is_a370:
+            value &= ~(epson.REDUCED_NOISE | epson.TEMPERATURE_STABILISATION)
+        if register == epson.FILTER_CTRL and self._is_a370 and value in _NOT_ON_A370:
+            return
         kept = self._registers[register] & (0xFF00 if shift == 0 else 0x00FF)
         self._registers[register] = kept | value << shift
         if register == epson.FILTER_CTRL:
@@ -236,7 +243,7 @@ class EpsonDevice:
         elif command == epson.FLASH_BACKUP:
             self._flash = dict(self._registers)
         elif command == epson.FACTORY:
-            self._flash = dict(_DEFAULTS)
+            self._flash = dict(self._defaults)
         if command in _PENDING:
             self._busy[epson.GLOB_CMD] = (_PENDING[command], now + FLASH_TIME)
 

@@ -23,7 +23,13 @@ import numpy as np
 
 from daq.bench import Channel, Sensor
 from daq.drivers.epson_setup import Configuration, Device, EpsonSettings
-from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
+from daq.errors import (
+    BenchFileError,
+    DeviceError,
+    NoAnswerError,
+    NotConnectedError,
+    WrongDeviceError,
+)
 from daq.protocols import epson
 from daq.transport import open_port
 
@@ -148,7 +154,7 @@ class EpsonDriver:
         sensor, configuration = _configured(sensors)
         async with (
             _port(sensor, configuration, clock) as stream,
-            _set_up(sensor, configuration, stream) as session,
+            _set_up(sensor, stream) as session,
         ):
             yield session
 
@@ -175,7 +181,7 @@ class EpsonDriver:
                     return
             if heard is None and not await device.answers():
                 raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
-            async with _set_up(sensor, configuration, stream) as session:
+            async with _set_up(sensor, stream) as session:
                 yield session
 
 
@@ -195,13 +201,15 @@ def _port(
 
 
 @contextlib.asynccontextmanager
-async def _set_up(
-    sensor: Sensor, configuration: Configuration, stream: ByteStream
-) -> AsyncIterator[EpsonSession]:
+async def _set_up(sensor: Sensor, stream: ByteStream) -> AsyncIterator[EpsonSession]:
     device = Device(sensor, stream)
     await device.identify()
     async with _left_quiet(device, stream):
         information = await device.information()
+        try:
+            configuration = Configuration.of(sensor, information.model)
+        except BenchFileError as error:
+            raise WrongDeviceError(f"port {sensor.port}: {error}") from error
         await device.configure(configuration)  # reads back what it sets
         actual = float(configuration.sampling_rate)
         information = replace(information, sampling_rate=actual)

@@ -6,9 +6,9 @@ import asyncio
 import contextlib
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, PositiveFloat, field_validator
+from pydantic import BaseModel, ConfigDict, PositiveFloat, Strict, field_validator
 
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
@@ -45,13 +45,13 @@ EXTERNAL = {
 class EpsonSettings(BaseModel):
     """``[sensors.settings]`` of an Epson accelerometer."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
     """As the device is set (it leaves the factory at 460800)."""
     filter: str | None = None
-    """Name of the filter; the usual one for the sampling rate if not given."""
-    fields: tuple[Field, ...] | None = None
+    """Name of the filter; the usual one for model and sampling rate if not given."""
+    fields: Annotated[tuple[Field, ...], Strict(strict=False)] | None = None
     """What each channel is, in order; x, y, z, and temperature for an auxiliary channel."""
     flags: bool = True
     """Whether bursts carry the error flag."""
@@ -59,8 +59,8 @@ class EpsonSettings(BaseModel):
     """Whether x, y, z are tilt angles instead of accelerations."""
     reduced_noise: bool = False
     """The reduced-noise-floor condition of the M-A352."""
-    temperature_stabilisation: bool = True
-    """Bias stabilisation against thermal shock of the M-A352."""
+    temperature_stabilisation: bool | None = None
+    """Bias stabilisation against thermal shock of the M-A352; on there, if not given."""
     external: Literal["off", "trigger-rising", "trigger-falling", "pps-rising", "pps-falling"] = (
         "off"
     )
@@ -85,11 +85,16 @@ class Configuration:
     fields: tuple[Field, ...]
     burst: BurstFormat
     settings: EpsonSettings
+    is_a370: bool
 
     @classmethod
-    def of(cls, sensor: Sensor) -> Configuration:
-        """Raise BenchFileError for what the device cannot do."""
+    def of(cls, sensor: Sensor, model: str = "") -> Configuration:
+        """Raise BenchFileError for what the device cannot do.
+
+        ``model`` is what the device says it is; until it is asked, what the bench file says holds.
+        """
         settings = EpsonSettings.model_validate(sensor.settings)
+        model = (model or sensor.model).upper()
         who = f"sensor {sensor.name!r}"
         rate = round(sensor.sampling_rate)
         if rate not in epson.RATES or rate != sensor.sampling_rate:
@@ -114,8 +119,11 @@ class Configuration:
                 f"{who}: {rate} Hz of {burst.size} bytes need {needed} baud;"
                 f" settings.baud_rate = {settings.baud_rate} (fewer fields, or a lower rate)"
             )
-        usual = settings.filter or epson.USUAL_FILTER[rate]
-        return cls(rate, usual, fields, burst, settings)
+        if lacking := _lacking(settings, model):
+            raise BenchFileError(f"{who}: {lacking}")
+        is_a370 = "A370" in model
+        usual = epson.USUAL_FILTER[min(rate, 500) if is_a370 else rate]
+        return cls(rate, settings.filter or usual, fields, burst, settings, is_a370)
 
     @property
     def hint(self) -> str:
@@ -137,7 +145,11 @@ class Configuration:
     def writes(self) -> list[tuple[Register, bool, int]]:
         """Return what to set: which register, whether its high byte, and to what."""
         s, burst_ctrl = self.settings, self.burst.burst_ctrl
-        sig_low = 0xE0 * s.tilt | 0x10 * s.reduced_noise | 0x04 * s.temperature_stabilisation
+        stabilises = s.temperature_stabilisation
+        if stabilises is None:
+            stabilises = not self.is_a370
+        sig_low = 0xE0 * s.tilt | epson.REDUCED_NOISE * s.reduced_noise
+        sig_low |= epson.TEMPERATURE_STABILISATION * stabilises
         sig_high = (burst_ctrl >> 8 & 0x07) << 1 | 0x80 * ("temperature" in self.burst)
         return [
             (epson.MSC_CTRL, False, EXTERNAL[s.external] << 5 | 0x06),
@@ -149,6 +161,20 @@ class Configuration:
             (epson.BURST_CTRL, True, burst_ctrl >> 8),
             (epson.BURST_CTRL, False, burst_ctrl & 0xFF),
         ]
+
+
+def _lacking(settings: EpsonSettings, model: str) -> str:
+    """Say what of the settings a model does not have; nothing if it has all, or is not known."""
+    if "A370" in model:
+        if settings.filter in epson.NOT_ON_A370:
+            known = ", ".join(name for name in epson.FILTERS if name not in epson.NOT_ON_A370)
+            return f'settings.filter = "{settings.filter}"; an M-A370 has {known}'
+        for key in ("reduced_noise", "temperature_stabilisation"):
+            if getattr(settings, key):
+                return f"settings.{key} = true; only an M-A352 has it: leave it out"
+    if "A352" in model and settings.external.startswith("pps"):
+        return f'settings.external = "{settings.external}"; only an M-A370 follows 1PPS'
+    return ""
 
 
 class Device:

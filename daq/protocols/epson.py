@@ -72,6 +72,8 @@ NOT_READY = 0x0400
 RESET, FLASH_BACKUP, FACTORY = 0x80, 0x08, 0x04
 """Written to GLOB_CMD's low byte."""
 UART_AUTO, AUTO_START = 0x01, 0x02
+REDUCED_NOISE, TEMPERATURE_STABILISATION = 0x10, 0x04
+"""Bits of SIG_CTRL's low byte, of an M-A352 only; that an M-A370 reads 0 there is assumed."""
 FLAG_ERROR = 0x0001
 """Bit of FLAG: an error is noted in DIAG_STAT."""
 
@@ -90,6 +92,7 @@ FILTERS = {
     "K512_FC210": 0x9,
     "K512_FC460": 0xA,
 }
+NOT_ON_A370 = frozenset({"K64_FC220", "K128_FC350", "K512_FC460"})
 USUAL_FILTER = {
     1000: "K512_FC460",
     500: "K512_FC210",
@@ -97,6 +100,7 @@ USUAL_FILTER = {
     100: "K512_FC16",
     50: "K512_FC9",
 }
+"""Of an M-A352; an M-A370 has at 1000 Hz what is usual at 500 Hz."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from daq.clock import SystemClock
+from daq.drivers.base import Checking
 from daq.drivers.registry import driver_type
-from daq.errors import NoAnswerError, WrongDeviceError
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import epson
 from daq.transport import open_port
 from sim_devices import launch
@@ -124,8 +125,53 @@ async def test_without_a_trigger_there_is_no_sample(running: Running) -> None:
 
 async def test_a_model_without_pps_is_named(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "pps-rising"})
-    with pytest.raises(WrongDeviceError, match="this model does not have that setting"):
+    with pytest.raises(WrongDeviceError, match=r'"pps-rising"; only an M-A370 follows 1PPS'):
         await record(DRIVER, sensor, 1, speed=SPEED)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"filter": "K128_FC350"}, r'settings.filter = "K128_FC350"; an M-A370 has K64_FC83, K128'),
+        ({"reduced_noise": True}, "settings.reduced_noise = true; only an M-A352 has it"),
+        (
+            {"temperature_stabilisation": True},
+            "settings.temperature_stabilisation = true; only an M-A352 has it",
+        ),
+    ],
+)
+async def test_what_an_a370_lacks_is_named(
+    running: Running, settings: dict[str, Any], said: str
+) -> None:
+    """As soon as the model is known: in the bench file, or from the device."""
+    named = connecting(running, "none", settings=settings, model="M-A370")
+    with pytest.raises(BenchFileError, match=f"sensor 'none': {said}"):
+        checked([named])
+    unnamed = connecting(running, "none", settings=settings)
+    checked([unnamed])
+    with pytest.raises(WrongDeviceError, match=f"{unnamed.port}: sensor 'none': {said}"):
+        await record(DRIVER, unnamed, 1, speed=SPEED)
+
+
+def checked(some: list[Sensor]) -> None:
+    assert isinstance(DRIVER, Checking)
+    DRIVER.check(some)
+
+
+@pytest.mark.parametrize(
+    ("name", "register", "expected"),
+    [
+        ("none", epson.SIG_CTRL, 0x00),
+        ("none", epson.FILTER_CTRL, epson.FILTERS["K512_FC210"]),
+        ("A352", epson.SIG_CTRL, 0x04),
+        ("A352", epson.FILTER_CTRL, epson.FILTERS["K512_FC460"]),
+    ],
+)
+async def test_a_model_is_set_to_what_it_has(
+    running: Running, name: str, register: epson.Register, expected: int
+) -> None:
+    """At 1000 Hz, with nothing said of filter and stabilisation."""
+    assert await low_byte(connecting(running, name, sampling_rate=1000.0), register) == expected
 
 
 @pytest.mark.parametrize(
@@ -141,11 +187,16 @@ async def test_a_model_without_pps_is_named(running: Running) -> None:
 async def test_the_register_says_so(running: Running, external: str, bits: int) -> None:
     """MSC_CTRL: bit 6 EXT_SEL, bit 5 EXT_POL; 1PPS is code 4 or 5 in bits 7:5."""
     sensor = connecting(running, "pps", settings={"external": external})
+    assert await low_byte(sensor, epson.MSC_CTRL) == bits << 5 | 0x06
+
+
+async def low_byte(sensor: Sensor, register: epson.Register) -> int:
+    """Return what a register holds after a session."""
     async with DRIVER.open([sensor], SystemClock(SPEED)):
         pass
     async with open_port(sensor.port, SystemClock()) as stream:
-        await stream.write(epson.read(epson.MSC_CTRL))
+        await stream.write(epson.read(register))
         received = b""
-        while (value := epson.find_reply(received, epson.MSC_CTRL.address)) is None:
+        while (value := epson.find_reply(received, register.address)) is None:
             received += (await stream.read())[0]
-    assert value & 0xFF == bits << 5 | 0x06
+    return value & 0xFF
