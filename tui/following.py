@@ -78,10 +78,12 @@ def follow(
             onlooker.look(lookout.look())
             wanted, n_samples, heard = 0.0, -1, time.monotonic()
             spacing = Spacing()
-            while not recording.closed:
+            closed = recording.closed
+            while not closed:
                 began = time.thread_time()
                 estimation.update()
-                if recording.closed:  # what is said of a closed one is its result
+                closed = recording.closed
+                if closed:  # what is said of it from now on is its result
                     break
                 if estimation.n_seen >= wanted and spacing.due:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))

@@ -89,7 +89,6 @@ class HuddleApp(App[None]):
         self._controls = controls
         self._path = path
         self._settings: Settings | None = None
-        self._snapshot_at = 0.0
         self._starting = False
         self._ended = threading.Event()
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
@@ -158,7 +157,6 @@ class HuddleApp(App[None]):
             names = tuple(name for name in message.settings.methods if name != "all")
             names = names or tuple(message.snapshot.results)
             self.choice = replace(self.choice, methods=names if len(names) < 3 else names[:1])
-        self._snapshot_at = 0.0 if self.now is None else self.now.elapsed
         self.snapshot = message.snapshot
         if message.snapshot.closed and before is not None and not before.closed:
             self.action_result()
@@ -196,7 +194,6 @@ class HuddleApp(App[None]):
     def _show(self) -> None:
         if not self.is_running:
             return
-        since = 0.0 if self.now is None else max(0.0, self.now.elapsed - self._snapshot_at)
         board = self.screen_stack[0].query_one(Board)
         board.show(
             Shown(
@@ -207,7 +204,6 @@ class HuddleApp(App[None]):
                 now=self.now,
                 snapshot=self.snapshot,
                 settings=self._settings,
-                since=since,
                 trouble=self.trouble,
                 note=self.note,
             )

@@ -43,8 +43,6 @@ class Shown:
         The recording.
     now, snapshot, settings : Now, Snapshot and Settings, or None
         What is known of it.
-    since : float
-        Seconds from that snapshot to now.
     trouble : str
         Why it is not followed any more.
     note : str
@@ -58,7 +56,6 @@ class Shown:
     now: Now | None = None
     snapshot: Snapshot | None = None
     settings: Settings | None = None
-    since: float = 0.0
     trouble: str = ""
     note: str = ""
 
@@ -127,9 +124,7 @@ class Board(Vertical):
             )
         self._write("#table", table, n_lines=table.row_count + 1)
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
-        progress = view.progress_line(
-            now, snapshot, settings, choice, since=shown.since, width=width
-        )
+        progress = view.progress_line(now, snapshot, settings, choice, width=width)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
         self._write("#advice", view.advice(snapshot, choice))
 
@@ -144,7 +139,7 @@ class Board(Vertical):
         return self._means[1]
 
     def _write_alerts(self, shown: Shown) -> None:
-        alerts = [] if shown.now is None else view.alerts(shown.now)
+        alerts = [] if shown.now is None else view.alerts(shown.now, shown.settings)
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1

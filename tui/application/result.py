@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from tui.application.view import alerts, state
+from tui.application.view import alerts, grouped, state
 from tui.bands import band_edges
 from tui.diagnosis import details as diagnosis_details
 from tui.diagnosis import summary
@@ -43,7 +43,8 @@ def result(
 ) -> RenderableType:
     """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
     parts: list[RenderableType] = [*_verdict(snapshot, settings, bench)]
-    parts += ["", *alerts(now)] if now is not None and alerts(now) else []
+    wrong = [] if now is None else alerts(now, settings)
+    parts += ["", *wrong] if wrong else []
     parts.append("")
     if snapshot.results:
         parts += [_channels(snapshot, settings), ""]
@@ -140,9 +141,9 @@ def _sensors(now: Now) -> Table:
         table.add_row(
             Text(sensor.name, "bold"),
             state(sensor),
-            str(sensor.n_gaps),
-            f"{sensor.n_missing} samples" if sensor.n_missing else "0",
-            f"{sensor.n_clipped} blocks" if sensor.n_clipped else "no",
+            grouped(sensor.n_gaps),
+            f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
+            f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
             sensor.port,
         )
     return table

@@ -106,7 +106,7 @@ def sensor_table(
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
     columns["state"] = [state(sensor) for sensor in now.sensors]
     columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
-    columns["samples"] = [Text(f"{s.n_samples:,}".replace(",", " ")) for s in now.sensors]
+    columns["samples"] = [Text(grouped(s.n_samples)) for s in now.sensors]
     columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
@@ -139,7 +139,12 @@ def _width(columns: dict[str, list[Text]]) -> int:
 def _gaps(sensor: SensorNow) -> Text:
     if not sensor.n_gaps:
         return Text("0")
-    return Text(f"{sensor.n_gaps} ({sensor.n_missing})", "yellow")
+    return Text(f"{grouped(sensor.n_gaps)} ({grouped(sensor.n_missing)})", "yellow")
+
+
+def grouped(count: int) -> str:
+    """Return a count in groups of three digits."""
+    return f"{count:,}".replace(",", "\u202f")
 
 
 def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
@@ -196,12 +201,9 @@ def _flagged(snapshot: Snapshot, column: int) -> str:
 
 
 def progress_line(
-    now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, since: float, width: int
+    now: Now, snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int
 ) -> Text:
-    """Return how far the test is: a bar where its end is known, segments, c.o.v., time left.
-
-    ``since`` is how many seconds ago the snapshot was made.
-    """
+    """Return how far the test is: a bar where its end is known, segments, c.o.v., time left."""
     cov, target = math.nan, settings.target_cov
     if choice.methods and choice.methods[0] in snapshot.results:
         cov = reached_cov(snapshot, settings, choice.methods[0])
@@ -216,7 +218,9 @@ def progress_line(
         parts.append(f"{snapshot.n_dropped} left out")
     if not math.isnan(cov):
         parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
-    left = None if snapshot.time_left is None else max(0.0, snapshot.time_left - since)
+    left = snapshot.time_left
+    if left is not None:
+        left = max(0.0, left - _gone_on(now, snapshot))
     if snapshot.closed:
         if target is not None:
             parts.append("target reached" if cov <= target else "target not reached")
@@ -240,12 +244,19 @@ def progress_line(
     return line
 
 
+def _gone_on(now: Now, snapshot: Snapshot) -> float:
+    """Return seconds that all sensors have sent since the snapshot: none while one is lost."""
+    before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
+    new = ((s.n_samples - before[s.name]) / s.sampling_rate for s in now.sensors)
+    return max(0.0, min(new))
+
+
 def _until_target(left: float | None, now: Now) -> str:
     """Return how long the target still takes; of a run that ends, what it is that takes so long."""
     return f"target in {roughly(left)}" if left and now.ends_in is not None else time_left(left)
 
 
-def alerts(now: Now) -> list[Text]:
+def alerts(now: Now, settings: Settings | None) -> list[Text]:
     """Return what is wrong with which sensor, and what to do; the worst first."""
     found: list[tuple[int, str]] = []
     for sensor in now.sensors:
@@ -255,8 +266,9 @@ def alerts(now: Now) -> list[Text]:
             channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.stuck)
             found.append((3, f"{channels} stands still: no signal; check the cable to it"))
         elif sensor.clips:
-            text = f"{sensor.name} is at the end of its range: segments with that are left out"
-            found.append((4, text))
+            text = f"{sensor.name} is at the end of its range: segments with that are "
+            kept = settings is not None and settings.reject is False
+            found.append((4, text + ("kept: do not trust its noise" if kept else "left out")))
         if sensor.was_stuck:
             channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
             found.append((5, f"{channels} stood still for a while: do not trust its noise"))
