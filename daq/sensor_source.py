@@ -229,9 +229,12 @@ class SensorSource:
         if not self.offset_in_doubt:
             self.clock = known.shared_by(name, end_sample=self.end_sample)
             return
+        # Arrivals are compared with arrivals: the other's clock may be the timeline itself.
+        stated = first.device_utc or first.polled
+        heard = known if stated else first.arrivals.solve(name)
         stretches, by_samples = [], measured is not None
         for begin, end, index, seconds in self.arrivals.earliest():
-            apart = float((known.position(seconds) - index).min())
+            apart = float((heard.position(seconds) - index).min())
             lag = None
             if self.clock_name != first.clock_name:
                 lag = self._lag(first, begin, round(apart))

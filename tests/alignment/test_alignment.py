@@ -164,12 +164,15 @@ def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
         AlignedRecording(recording, sampling_rate=200.0)
 
 
-def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(tmp_path: Path) -> None:
+@pytest.mark.parametrize("begun", [0.0, 8.0])  # seconds after the recording was created
+def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(
+    tmp_path: Path, begun: float
+) -> None:
     raw = counts(5000, 1, 8)
     sensors = {
-        "a": Sensor(raw[:4000], clock="one"),
-        "b": Sensor(raw[137:4600], clock="one", start=1.37, late=1.2e-3),
-        "c": Sensor(raw[60:4700], clock="one", start=0.60, late=2.9e-3, restarts=(2000,)),
+        "a": Sensor(raw[:4000], clock="one", start=begun),
+        "b": Sensor(raw[137:4600], clock="one", start=begun + 1.37, late=1.2e-3),
+        "c": Sensor(raw[60:4700], clock="one", start=begun + 0.60, late=2.9e-3, restarts=(2000,)),
     }
     with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
         aligned = AlignedRecording(recording)
