@@ -113,11 +113,11 @@ def _absent(
     given: Coherency, dims: tuple[int, ...], names: tuple[str, ...], channels: tuple[str, ...]
 ) -> Iterator[Advice]:
     """Channels that are dead or copies, and what can be said without them."""
-    finite = (given.flags & Flag.NOT_FINITE == 0).all(axis=1)
+    valid = given.valid
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     labels = [f"{names[s]}.{name}" for s, name in zip(sensor_of, channels, strict=True)]
-    dead = ((given.flags[finite] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
-    copies = given.duplicates[finite].mean(axis=0)
+    dead = ((given.flags[valid] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
+    copies = given.duplicates[valid].mean(axis=0)
     for sensor, name in enumerate(names):
         own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
         if not len(own):

@@ -17,7 +17,7 @@ from estimator.self_noise import Flag, SelfNoise
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-HERMITIAN_TOLERANCE = 1e-8  # of the geometric mean of both channels' PSDs
+TOLERANCE = 1e-8  # of a coherency matrix that is not quite Hermitian, and of coherence above 1
 DEAD = 1e-28  # of a channel's largest PSD: what rounding leaves of a constant
 DUPLICATE = 1e-13  # one less the coherence of a channel and its copy
 SINGULAR = 1e12  # elements of an inverse coherency from which on they are rounding only
@@ -30,12 +30,12 @@ class Coherency:
     Attributes
     ----------
     matrix : complex128, shape (n_freqs, n_channels, n_channels)
-        Ones on its diagonal; zero for a dead channel, a unit matrix where the cross-spectral
-        matrix is not finite.
+        Ones on its diagonal; zero for a dead channel, a unit matrix at frequencies that are not
+        `valid`.
     psd : float64, shape (n_freqs, n_channels)
-        PSD of every channel in unit**2/Hz; 1 where it is zero or not finite.
+        PSD of every channel in unit**2/Hz; 1 where it is zero or the frequency is not valid.
     flags : int64, shape (n_freqs, n_channels)
-        DEAD_CHANNEL, DUPLICATE and NOT_FINITE of `estimator.self_noise.Flag`.
+        DEAD_CHANNEL, DUPLICATE, NOT_FINITE and INVALID of `estimator.self_noise.Flag`.
     duplicates : bool, shape (n_freqs, n_channels, n_channels)
         True where two different channels are the same.
     """
@@ -44,6 +44,11 @@ class Coherency:
     psd: FloatArray
     flags: IntArray
     duplicates: BoolArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Where the cross-spectral matrix is finite, and one, shape (n_freqs,)."""
+        return np.asarray((self.flags & (Flag.NOT_FINITE | Flag.INVALID) == 0).all(axis=1))
 
     @property
     def absent(self) -> BoolArray:
@@ -75,9 +80,13 @@ def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
         raise InsufficientDataError(f"{len(dims)} sensors: at least {n_sensors} are needed")
 
 
-def check_averages(n_effective: float, d: int) -> None:
-    """Raise unless there are more averages than dimensions of motion."""
-    if not np.isfinite(n_effective) or n_effective <= d:
+def check_averages(n_effective: float, d: int = 0) -> None:
+    """Raise unless averages are a number, and more than the motion has dimensions."""
+    if not (np.isfinite(n_effective) and n_effective > 0):
+        raise InsufficientDataError(
+            f"{n_effective:g} effective averages: expected a finite number above zero"
+        )
+    if n_effective <= d:
         raise InsufficientDataError(
             f"{n_effective:g} effective averages: more than {d} are needed to tell the noise from "
             f"a motion of {d} dimensions; record longer or use shorter segments"
@@ -97,8 +106,9 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     Raises
     ------
     InvalidMatrixError
-        If `csm` is mis-shaped, nowhere finite, not Hermitian, or has a negative PSD. Single
-        frequencies that are not finite, and dead or duplicated channels, are flagged instead.
+        If `csm` is mis-shaped, or at no frequency finite, Hermitian, and free of negative PSDs
+        and of coherence above 1. Single such frequencies, and dead or duplicated channels, are
+        flagged instead.
     """
     csm = np.asarray(csm, dtype=np.complex128)
     n_channels = sum(dims)
@@ -108,42 +118,52 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
             f"(n_freqs, {n_channels}, {n_channels}) for sensors of {dims} channels"
         )
     finite: BoolArray = np.asarray(np.isfinite(csm).all(axis=(1, 2)))
-    if not finite.any():
-        raise InvalidMatrixError("cross-spectral matrix: NaN or infinite at every frequency")
     diagonal = np.einsum("fpp->fp", csm).real
-    psd: FloatArray = np.where(finite[:, None], diagonal, 0.0)
-    negative = np.argwhere(psd < 0)
-    if len(negative):
-        f, p = negative[0]
-        raise InvalidMatrixError(f"PSD of channel {p} at frequency {f} is {psd[f, p]:g}: negative")
+    negative: BoolArray = finite & (diagonal < 0).any(axis=1)
+    usable = finite & ~negative
+    psd: FloatArray = np.where(usable[:, None], diagonal, 0.0)
     dead = psd <= np.maximum(DEAD * psd.max(axis=0), np.finfo(np.float64).tiny)
-    dead &= finite[:, None]
-    psd = np.where(dead | ~finite[:, None], 1.0, psd)
+    dead &= usable[:, None]
+    psd = np.where(dead | ~usable[:, None], 1.0, psd)
     scale = np.where(dead, 0.0, 1 / np.sqrt(psd))
-    matrix = np.where(finite[:, None, None], csm, np.eye(n_channels))
-    matrix *= scale[:, :, None]
-    matrix *= scale[:, None, :]
-    p, q = np.tril_indices(n_channels)
-    deviation = np.abs(matrix[:, p, q] - matrix[:, q, p].conj()).max(axis=1)
-    if (deviation > HERMITIAN_TOLERANCE).any():
+    with np.errstate(over="ignore", invalid="ignore"):  # what comes of this is no coherency
+        matrix: ComplexArray = csm * scale[:, :, None]
+        matrix *= scale[:, None, :]
+        matrix[~usable] = np.eye(n_channels)
+        p, q = np.tril_indices(n_channels)
+        deviation = np.abs(matrix[:, p, q] - matrix[:, q, p].conj()).max(axis=1)
+        coherence = matrix.real**2 + matrix.imag**2
+    skew: BoolArray = ~(deviation <= TOLERANCE)  # NaN included
+    impossible: BoolArray = ~skew & (coherence > 1 + TOLERANCE).any(axis=(1, 2))
+    invalid = negative | skew | impossible
+    if not (finite & ~invalid).any():
+        faults = {
+            "NaN or infinite": ~finite,
+            "negative PSD": negative,
+            "not Hermitian": skew,
+            "coherence above 1": impossible,
+        }
+        counts = [f"{fault} at {where.sum()}" for fault, where in faults.items() if where.any()]
         raise InvalidMatrixError(
-            f"cross-spectral matrix is not Hermitian at frequency {np.argmax(deviation)}: "
-            f"csm[f, p, q] and the conjugate of csm[f, q, p] differ by {deviation.max():.1e} of "
-            "the channels' PSDs"
+            f"cross-spectral matrix: none of {len(csm)} frequencies can be used "
+            f"({', '.join(counts)}); expected csm[f, p, q] = E[X_p conj(X_q)]"
         )
-    duplicates = matrix.real**2 + matrix.imag**2 >= 1 - DUPLICATE
+    matrix[invalid] = np.eye(n_channels)
+    duplicates = coherence >= 1 - DUPLICATE
     duplicates[:, np.arange(n_channels), np.arange(n_channels)] = False
+    duplicates[invalid] = False
     flags = np.zeros(psd.shape, dtype=np.int64)
     flags[dead] |= Flag.DEAD_CHANNEL
     flags[duplicates.any(axis=2)] |= Flag.DUPLICATE
     flags[~finite] = Flag.NOT_FINITE
-    return Coherency(matrix, psd, flags, duplicates)
+    flags[invalid] = Flag.INVALID
+    return Coherency(matrix, np.where(invalid[:, None], 1.0, psd), flags, duplicates)
 
 
 def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
-    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not finite."""
-    lost: BoolArray = ((given.flags & Flag.NOT_FINITE) != 0).any(axis=1) | (frequency <= 0)
-    return np.where(lost[:, None, None], np.nan, given.matrix)
+    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not valid."""
+    known = given.valid & (frequency > 0)
+    return np.where(known[:, None, None], given.matrix, np.nan)
 
 
 def from_parts(

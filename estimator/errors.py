@@ -8,7 +8,7 @@ class EstimatorError(ValueError):
 
 
 class InvalidMatrixError(EstimatorError):
-    """A cross-spectral matrix is mis-shaped, not Hermitian, or not finite throughout."""
+    """A cross-spectral matrix is mis-shaped, or at no frequency finite, Hermitian and possible."""
 
 
 class InsufficientDataError(EstimatorError):

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.self_noise import Flag
-
 if TYPE_CHECKING:
     from estimator.arrays import FloatArray
     from estimator.coherency import Coherency
@@ -55,8 +53,7 @@ def presence(given: Coherency, dims: tuple[int, ...]) -> Presence:
     dims : tuple of int
         Channels of each sensor.
     """
-    finite = (given.flags & Flag.NOT_FINITE == 0).all(axis=1)
-    absent = given.absent[finite].mean(axis=0) > 0.5
+    absent = given.absent[given.valid].mean(axis=0) > 0.5
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     count = np.bincount(sensor_of[~absent], minlength=len(dims))
     return Presence(

@@ -32,6 +32,8 @@ class Flag(enum.IntFlag):
     UNRESOLVED = 256
     """The averages cannot tell all dimensions of the motion from scatter. What there is in the
     others is still in the noise: at most about as much as its standard deviation."""
+    INVALID = 512
+    """No cross-spectral matrix stands here: not Hermitian, a negative PSD or coherence above 1."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -213,6 +213,7 @@ def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
         Flag.DEAD_CHANNEL: "no signal",
         Flag.DUPLICATE: "a copy of another channel",
         Flag.NOT_FINITE: "not finite",
+        Flag.INVALID: "no cross-spectral matrix (not Hermitian, negative or too coherent)",
         Flag.SINGULAR: "nothing can be said, as other channels are missing or do not move enough "
         "to compare with (the matrix is singular)",
         Flag.NO_COUNTERPART: "the other sensors have too few channels to compare with",

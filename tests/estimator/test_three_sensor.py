@@ -329,6 +329,24 @@ def test_sensors_without_noise_give_no_warning(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_one_frequency_that_is_no_cross_spectral_matrix_does_not_stop_the_others(
+    method: str,
+) -> None:
+    good = np.tile(spoilt("nan")[4:], (2, 1, 1))
+    spoils = good.copy()
+    spoils[0, 0, 1] += 1e-3
+    spoils[1, 0, 0] *= -1
+    spoils[2, [0, 3], [3, 0]] = 1.001 * np.sqrt(spoils[2, 0, 0] * spoils[2, 3, 3])
+    spoils[3, [0, 3], [3, 0]] = 1e300
+    found = self_noise(method, spoils, dims=(3, 3, 3), n_effective=60)
+    alone = self_noise(method, good[4:], dims=(3, 3, 3), n_effective=60)
+    assert np.all(found.flags[:4] & Flag.INVALID)
+    assert not np.any(found.flags[4:] & Flag.INVALID)
+    assert np.isnan(found.noise_psd[:4]).all()
+    np.testing.assert_allclose(found.noise_psd[4:], alone.noise_psd, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_what_makes_no_sense_is_refused(method: str) -> None:
     good = spoilt("nan")[:3]
 
@@ -348,8 +366,8 @@ def test_what_makes_no_sense_is_refused(method: str) -> None:
     with pytest.raises(InvalidMatrixError, match="NaN"):
         estimate(np.full_like(good, np.nan))
     lopsided = good.copy()
-    lopsided[1, 0, 4] *= 1.001
-    with pytest.raises(InvalidMatrixError, match="not Hermitian at frequency 1"):
+    lopsided[:, 0, 4] *= 1.001
+    with pytest.raises(InvalidMatrixError, match="not Hermitian at 3"):
         estimate(lopsided)
     with pytest.raises(InvalidMatrixError, match="negative"):
         estimate(-good)
