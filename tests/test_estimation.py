@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.errors import CannotAlignError
+from daq.errors import CannotAlignError, WrongSettingError
 from daq.estimation import Estimation, Settings, estimate
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
@@ -169,6 +170,36 @@ def test_several_recordings_accumulate(tmp_path: Path) -> None:
     odd = write(tmp_path / "3.h5", huddle(unit="m/s"))
     with pytest.raises(CannotAlignError, match="does not match"):
         estimate([first, odd], SETTINGS)
+
+
+def test_one_recording_counts_once_whatever_it_is_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "r.h5", huddle())
+    shutil.copy(path, tmp_path / "copy.h5")
+    (tmp_path / "link.h5").symlink_to(path)
+    (tmp_path / "same.h5").hardlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    for again in ("r.h5", "copy.h5", "link.h5", "same.h5"):
+        with pytest.raises(WrongSettingError, match=rf"{again} and .*r\.h5 are the same recording"):
+            estimate([path, again], SETTINGS)
+
+
+def test_a_start_beyond_the_end_is_told_with_what_the_recordings_cover(tmp_path: Path) -> None:
+    path = write(tmp_path / "r.h5", huddle())
+    origin = datetime.fromtimestamp(ORIGIN.utc_ns / 1e9, tz=UTC)
+    for start, end in ((600.0, None), (30.0, 20.0), (59.5, None)):
+        between = replace(
+            SETTINGS,
+            start=origin + timedelta(seconds=start),
+            end=None if end is None else origin + timedelta(seconds=end),
+        )
+        covers = rf"start {between.start:%FT%T}.*covers {origin:%FT%T} to .*\(1m\)"
+        with pytest.raises(WrongSettingError, match=covers):
+            estimate([path], between)
+    create(tmp_path / "empty.h5", huddle()).close()
+    with pytest.raises(InsufficientDataError, match="record longer"):
+        estimate([tmp_path / "empty.h5"], replace(SETTINGS, start=origin))
 
 
 def test_only_what_lies_between_start_and_end(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 from daq.errors import CannotAlignError
 from daq.estimation.clipping import clipped_shares
 from daq.estimation.diagnosis import diagnosis, synchronisation
+from daq.estimation.matching import check_same, check_span, open_another
 from daq.estimation.results import (
     Dimensions,
     Estimates,
@@ -37,7 +38,6 @@ from daq.estimation.results import (
 from daq.estimation.segments import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Octave, SensorState, Snapshot
-from daq.recording.reader import Recording
 from daq.units import canonical
 from estimator.errors import InsufficientDataError
 from estimator.rejection import Reason, RejectionSettings
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from daq.recording.reader import Recording
     from estimator.multiresolution import Band
 
 Progress = Callable[[int, int], None]
@@ -75,6 +76,8 @@ class Estimation:
         If a file cannot be read.
     CannotAlignError
         If the sensors cannot be brought onto one grid, or the recordings do not match.
+    WrongSettingError
+        If one recording is given twice, or a unit or gain does not fit the sensors.
     """
 
     def __init__(self, paths: Sequence[str | Path], settings: Settings | None = None) -> None:
@@ -83,10 +86,10 @@ class Estimation:
         self._recordings: list[Recording] = []
         try:
             for path in paths:
-                self._recordings.append(Recording.open(path))
+                self._recordings.append(open_another(path, self._recordings))
             self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
             self._passes = [Pass(recording, self.settings) for recording in self._recordings]
-            _check_same(self._passes)
+            check_same(self._passes)
             self._unit = canonical(
                 self.settings.unit or self._passes[0].aligned.channels[0][1].unit
             )
@@ -169,11 +172,14 @@ class Estimation:
         ------
         InsufficientDataError
             If no method can say anything; the message says why.
+        WrongSettingError
+            If nothing lies between start and end.
         """
         for number, each in enumerate(self._passes):
             each.aligned.refresh()
             if each.n_seen and not each.aligned.is_exact:
                 self._passes[number] = Pass(each.recording, self.settings)
+        check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
         done = self.n_seen
 
@@ -373,28 +379,3 @@ def estimate(
     """
     with Estimation(paths, settings) as estimation:
         return estimation.finish(progress)
-
-
-def _check_same(passes: list[Pass]) -> None:
-    first = passes[0]
-    for other in passes[1:]:
-        same = (
-            other.welch == first.welch
-            and other.aligned.dims == first.aligned.dims
-            and _labels(other) == _labels(first)
-        )
-        if not same:
-            raise CannotAlignError(
-                f"{other.recording.path} does not match {first.recording.path}:"
-                f" {_described(other)} against {_described(first)};"
-                " one estimate takes recordings of the same sensors at one sampling rate"
-            )
-
-
-def _labels(each: Pass) -> list[tuple[str, str, str]]:
-    return [(sensor, channel.name, channel.unit) for sensor, channel in each.aligned.channels]
-
-
-def _described(each: Pass) -> str:
-    names = ", ".join(f"{sensor} {channel} in {unit}" for sensor, channel, unit in _labels(each))
-    return f"{names} at {each.welch.sampling_rate:g} Hz"
