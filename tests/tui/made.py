@@ -73,7 +73,9 @@ def made_snapshot(
             for name, n_gaps, last_seen in (("A", 0, 1000.0), ("B", 2, 1000.0), ("C", 0, 988.0))
         ),
         clocks=tuple(
-            ClockState(name, "arrival times", 0.0, ppm, 0.02, 0.1, residual, 1, refined=True)
+            ClockState(
+                name, "arrival times", 0.0, ppm, 0.02, 0.1, residual, 1, refined=residual > 0
+            )
             for name, ppm, residual in zip(SENSORS, PPM, RESIDUALS, strict=True)
         ),
         drift=made_drift(),

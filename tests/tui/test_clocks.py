@@ -10,10 +10,13 @@ import pytest
 
 from daq.bench import parse
 from tests.tui.made import SETTINGS, empty_snapshot, made_snapshot
-from tui.application.clocks import clock_line, drift_lines
+from tui.application.clocks import clock_line, drift_lines, drift_title
+from tui.application.plot import TimeAxis
 from tui.demo import compare
 from tui.devices import scenario_of
-from tui.synchronisation import effect
+from tui.report.evidence import clocks_section
+from tui.report.parts import Paragraph, Table
+from tui.synchronisation import effect, effect_by_sensor
 
 
 def test_effect_is_the_share_of_the_band_s_noise() -> None:
@@ -26,6 +29,12 @@ def test_effect_is_the_share_of_the_band_s_noise() -> None:
     )
     shares = effect(snapshot, SETTINGS)
     np.testing.assert_allclose(shares, [0, 0, 0, 0.2, 0, 0, 0, 0, 0], atol=1e-12)
+
+
+def test_effect_is_not_known_where_no_frequency_tells() -> None:
+    snapshot = made_snapshot(clock_share=np.nan)
+    assert np.isnan(effect(snapshot, SETTINGS)).all()
+    assert set(map(np.isnan, effect_by_sensor(snapshot, SETTINGS).values())) == {True}
 
 
 @pytest.mark.parametrize(
@@ -74,6 +83,40 @@ def test_drift_is_what_a_constant_rate_leaves() -> None:
     assert len(drift_lines(made_snapshot(), chosen="B", n_points=20)[0].x) <= 30
 
 
+def test_drift_is_against_the_reference_where_motion_measures_it() -> None:
+    snapshot = made_snapshot()
+    late = snapshot.drift.copy()
+    late[:, 1:] += 100e-6 * np.sin(late[:, [0]])  # the host was, and took them all for late
+    swinging = replace(snapshot, drift=late)
+    for told, before in zip(
+        drift_lines(swinging, chosen="B", n_points=200),
+        drift_lines(snapshot, chosen="B", n_points=200),
+        strict=True,
+    ):
+        np.testing.assert_allclose(told.y, before.y, atol=1e-6)
+    assert "behind that of A," in drift_title(swinging)
+    alone = tuple(replace(clock, refined=False) for clock in snapshot.clocks)
+    by_arrivals = replace(swinging, clocks=alone)
+    assert "behind the computer's clock," in drift_title(by_arrivals)
+    assert min(np.ptp(line.y) for line in drift_lines(by_arrivals, chosen="", n_points=60)) > 150
+
+
+@pytest.mark.parametrize("share", [0.004, 0.03, 0.07, 0.22])
+def test_report_and_application_judge_clocks_alike(share: float) -> None:
+    snapshot = made_snapshot(clock_share=share)
+    late = replace(snapshot.clocks[0], residual=7e-6)  # against the host
+    snapshot = replace(snapshot, clocks=(late, *snapshot.clocks[1:]))
+    section = clocks_section(snapshot, SETTINGS)
+    verdict = next(part for part in section.parts if isinstance(part, Paragraph))
+    colour = {"good": "green", "doubtful": "yellow", "bad": "bold #ff6b6b"}[verdict.tone]
+    assert clock_line(snapshot, SETTINGS, width=100).spans[-1].style == colour
+    (table,) = (part for part in section.parts if isinstance(part, Table))
+    left = table.header.index("left (µs rms)")
+    assert [row[left] for row in table.rows] == ["–", "0.40", "0.60"]
+    said = next(p.text for p in section.parts if isinstance(p, Paragraph) and "Drift" in p.text)
+    assert "that of A," in said
+
+
 @pytest.mark.parametrize(("share", "added"), [(0.0, 0.0), (0.1, 0.4), (3.0, 1.0)])
 def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
@@ -86,3 +129,11 @@ def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
         wanted = added * noise[after.sensor, after.channel]  # by either method
         assert before.low - after.low == pytest.approx(wanted, rel=1e-6, abs=1e-20)
         assert after.high == before.high
+
+
+@pytest.mark.parametrize("minutes", [0.4, 1.7, 2.4, 14.0, 31.0, 240.0, 900.0, 6e3, 9e4])
+def test_labels_of_time_have_room_in_sixty_columns(minutes: float) -> None:
+    axis = TimeAxis()
+    ticks, labels = axis.get_ticks_and_labels(0.08, minutes)
+    assert 2 <= len(ticks) <= 6
+    assert sum(len(label) + 1 for label in labels) <= 49

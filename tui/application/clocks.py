@@ -10,15 +10,23 @@ from rich.table import Table
 from rich.text import Text
 
 from tui.application.curves import Line
-from tui.synchronisation import effect, residuals
+from tui.synchronisation import (
+    HARMLESS,
+    MATTERS,
+    NOTHING,
+    effect_by_sensor,
+    grade,
+    lags,
+    reference,
+    residuals,
+)
 
 if TYPE_CHECKING:
     from daq.clock_model import ClockState
     from daq.estimation import Settings, Snapshot
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
-NOTHING, HARMLESS, MATTERS = 0.001, 0.01, 0.05
-"""Share of the noise that comes from the clocks: below it nothing, negligible, small."""
+STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
 _FEWEST_POINTS = 3
 
@@ -49,17 +57,19 @@ def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
 
 
 def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
-    shares = effect(snapshot, settings)
-    if not np.isfinite(shares).any():
+    shares = [s for s in effect_by_sensor(snapshot, settings).values() if math.isfinite(s)]
+    if not shares:
         return "effect not known yet", MUTED
-    worst = float(np.nanmax(shares))
+    worst = max(shares)
     if worst < NOTHING:
-        return f"no effect on noise ({percent(worst)})", GOOD
-    if worst < HARMLESS:
-        return f"negligible, {percent(worst)} of the noise", GOOD
-    if worst < MATTERS:
-        return f"small, {percent(worst)} of the noise", DOUBTFUL
-    return f"they matter here, {percent(worst)} of the noise", BAD
+        said = f"no effect on noise ({percent(worst)})"
+    elif worst < HARMLESS:
+        said = f"negligible, {percent(worst)} of the noise"
+    elif worst < MATTERS:
+        said = f"small, {percent(worst)} of the noise"
+    else:
+        said = f"they matter here, {percent(worst)} of the noise"
+    return said, STYLES[grade(worst)]
 
 
 def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:
@@ -70,33 +80,29 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
     for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "left", "of noise"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("known by", no_wrap=True)
-    shares, left = effect(snapshot, settings), residuals(snapshot)
-    by_motion = any(clock.refined for clock in snapshot.clocks)
-    names = [label.sensor for label in snapshot.channels]
+    shares, left = effect_by_sensor(snapshot, settings), residuals(snapshot)
+    against = reference(snapshot)
     for number, clock in enumerate(snapshot.clocks):
-        mine = [share for share, name in zip(shares, names, strict=True) if name == clock.sensor]
-        known = [share for share in mine if math.isfinite(share)]
-        share = max(known, default=math.nan)
+        share = shares.get(clock.sensor, math.nan)
         name = Text(f"━ {clock.sensor}", _colour(number))
         if clock.sensor == chosen:
             name.stylize("reverse", 2)
         rate = _ppm(clock.ppm) + (f" ±{_small(clock.ppm_std)}" if clock.ppm_std > 0 else "")
         wander = _small(clock.wander_ppm) if clock.wander_ppm > 0 else "–"
-        style = GOOD if share < HARMLESS else DOUBTFUL if share < MATTERS else BAD
         table.add_row(
             name,
             rate,
             *((wander,) if wide else ()),
             microseconds(left[clock.sensor]) if left.get(clock.sensor, 0.0) > 0 else "–",
-            Text(percent(share), style) if known else Text("?", MUTED),
-            _source(clock, by_motion=by_motion),
+            Text("?", MUTED) if math.isnan(share) else Text(percent(share), STYLES[grade(share)]),
+            _source(clock, is_reference=clock.sensor == against),
         )
     return table
 
 
-def _source(clock: ClockState, *, by_motion: bool) -> str:
+def _source(clock: ClockState, *, is_reference: bool) -> str:
     source = clock.source.replace("arrival times", "arrivals")
-    motion = ", motion" if clock.refined else "; the reference" if by_motion else ""
+    motion = ", motion" if clock.refined else "; the reference" if is_reference else ""
     restarts = clock.n_epochs - 1
     return f"{source}{motion}" + (f"; {restarts} restart{'s' * (restarts > 1)}" * (restarts > 0))
 
@@ -109,7 +115,9 @@ def drift_title(snapshot: Snapshot) -> str:
     """Return what the plot of the drift shows."""
     if len(snapshot.drift) < _FEWEST_POINTS:
         return "clock drift: seen from the third segment on"
-    return "clock drift: lag of each clock, its constant rate taken out"
+    against = reference(snapshot)
+    behind = "the computer's clock" if against is None else f"that of {against}"
+    return f"clock drift: lag of each clock behind {behind}, its constant rate taken out"
 
 
 def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]:
@@ -117,7 +125,7 @@ def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]
 
     Minutes and microseconds; at most one point per column.
     """
-    drift = snapshot.drift
+    drift = lags(snapshot)
     if len(drift) < _FEWEST_POINTS:
         return []
     step = max(1, len(drift) // n_points)

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 DOTS_PER_ROW = 4  # of a Braille character
 MARKED = 12  # points from one mark of a curve to the next
 LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the screen
-SHORT, LONG = 2.0, 300.0  # minutes: below seconds, above hours
+SHORT, LONG, DAYS = 2.0, 300.0, 7200.0  # minutes: below seconds, from there on hours, days
+TIME_STEPS = (1 / 60, 1 / 30, 1 / 12, 1 / 6, 0.25, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720)
 LARGE = 2000.0  # µs: above milliseconds
 
 
@@ -68,13 +69,21 @@ class LevelAxis(AxisFormatter):
         return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
 
 
-class TimeAxis(NumericAxisFormatter):
-    """Ticks on an axis of minutes."""
+class TimeAxis(AxisFormatter):
+    """Ticks on an axis of minutes: few enough for their labels in sixty columns."""
+
+    def get_ticks(self, min_: float, max_: float, max_ticks: int = 6) -> list[float]:
+        """Return tick positions at round steps of seconds, minutes, hours or days."""
+        least = (max_ - min_) / (min(max_ticks, 6) - 1)
+        step = next((s for s in TIME_STEPS if s >= least), 1440 * math.ceil(least / 1440))
+        return [float(t) for t in np.arange(math.ceil(min_ / step) * step, max_ + 1e-9, step)]
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
-        """Return minutes, or hours where these are many, or seconds where they are few."""
+        """Return minutes, or hours or days where these are many, or seconds where they are few."""
         if ticks and max(ticks) < SHORT:
             return [f"{60 * tick:.3g} s" for tick in ticks]
+        if ticks and max(ticks) >= DAYS:
+            return [f"{tick / 1440:.3g} d" for tick in ticks]
         if ticks and max(ticks) >= LONG:
             return [f"{tick / 60:.3g} h" for tick in ticks]
         return [f"{tick:.3g} min" for tick in ticks]

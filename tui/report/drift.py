@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from tui.report import drawing
 from tui.report.parts import Plot
+from tui.synchronisation import lags
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +30,8 @@ _TIMES = ((300, "s", 1), (10800, "min", 60), (259200, "h", 3600), (math.inf, "da
 
 def drift_plot(snapshot: Snapshot) -> Plot | None:
     """Return each clock's drift but for its own straight line; None where no clock drifts."""
-    drift = snapshot.drift[np.isfinite(snapshot.drift).all(axis=1)]
+    drift = lags(snapshot)
+    drift = drift[np.isfinite(drift).all(axis=1)]
     if len(drift) < 3 or np.ptp(drift[:, 1:], axis=0).max() < 1e-9:
         return None
     drift = drift[:: max(1, len(drift) // POINTS)]

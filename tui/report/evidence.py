@@ -22,6 +22,7 @@ from tui.report.wording import (
     span,
 )
 from tui.results import band_of, faulty_channels, left_out
+from tui.synchronisation import effect_by_sensor, grade, reference, residuals
 from tui.text import several, utc
 
 if TYPE_CHECKING:
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
-MATTERS, SPOILS = 0.01, 0.1
-"""Shares of the noise from which an error of the clocks is worth a word, and worth doing more."""
 _USUAL = {"started", "connected", "stopped", "mark"}
 
 
@@ -165,39 +164,40 @@ def alignment_section(snapshot: Snapshot) -> Section:
 
 def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
     """Return what is known of each clock, and what it does to the noise."""
-    effects = _clock_effects(snapshot, settings)
+    effects = effect_by_sensor(snapshot, settings)
     worst = max((effect for effect in effects.values() if math.isfinite(effect)), default=math.nan)
     parts: list[Part] = []
     if math.isfinite(worst):
         band = span(*band_of(settings, snapshot))
-        if worst < MATTERS:
-            text = f"What is left between the clocks adds {share(worst)} to the noise at most"
-            parts.append(Paragraph(f"{text}, within {band}: they do not matter here.", "good"))
-        else:
-            decibels = f"{10 * math.log10(1 + worst):.2g} dB"
-            text = (
-                f"What is left between the clocks may add {share(worst)} ({decibels}) to the noise"
-            )
-            text += f" within {band}."
-            if worst > SPOILS:
-                text += " Give the sensors one clock, or record longer for their rates to be known."
-            parts.append(Paragraph(text, "doubtful" if worst <= SPOILS else "bad"))
+        tone = grade(worst)
+        text = f"What is left between the clocks makes up {share(worst)} of the noise within {band}"
+        text += " at most: they do not matter here." if tone == "good" else " in the worst channel."
+        if tone == "bad":
+            text += " Give the sensors one clock, or record longer for their rates to be known."
+        parts.append(Paragraph(text, tone))
+    left, against = residuals(snapshot), reference(snapshot)
     rows = [
-        _clock_row(clock, effects.get(clock.sensor, math.nan), snapshot)
+        _clock_row(
+            clock,
+            effects.get(clock.sensor, math.nan),
+            left.get(clock.sensor, math.nan),
+            is_reference=clock.sensor == against,
+        )
         for clock in snapshot.clocks
     ]
     header = (
         "sensor", "time from", "offset (ms)", "rate (ppm)", "±", "wander (ppm)",
-        "left (µs rms)", "refined by motion", "adds to noise",
+        "left (µs rms)", "refined by motion", "of the noise",
     )  # fmt: skip
     if rows:
         parts.append(Table(header, tuple(rows), left=frozenset({0, 1, 7})))
     plot = drift_plot(snapshot)
     if plot is not None:
+        behind = "the computer's" if against is None else f"that of {against}"
         parts += [
             Paragraph(
-                "Drift: by how much each sensor's own count of time lags behind the host's, "
-                "without its straight line (the rate in ppm) and without the steps of restarts.",
+                f"Drift: by how much each sensor's clock lags behind {behind}, "
+                "without its straight line (a constant rate) and without the steps of restarts.",
                 "quiet",
             ),
             plot,
@@ -278,26 +278,10 @@ def _reversed(snapshot: Snapshot, sensor: str, response: RelativeResponse) -> st
     return ", ".join(channels[number] for number in response.reversed_channels)
 
 
-def _clock_effects(snapshot: Snapshot, settings: Settings) -> dict[str, float]:
-    """Return what the clocks' errors add to each sensor's noise within the band, at worst."""
-    bias = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
-    if bias is None:
-        return {}
-    low, high = band_of(settings, snapshot)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    effects: dict[str, float] = {}
-    for column, label in enumerate(snapshot.channels):
-        values = bias[inside, column]
-        values = values[np.isfinite(values)]
-        if values.size:  # a median: single frequencies scatter with the noise they are shares of
-            effect = max(0.0, float(np.median(values)))
-            effects[label.sensor] = max(effects.get(label.sensor, 0.0), effect)
-    return effects
-
-
-def _clock_row(clock: ClockState, effect: float, snapshot: Snapshot) -> tuple[str, ...]:
-    others = any(each.refined for each in snapshot.clocks)
-    refined = "yes" if clock.refined else "the others against it" if others else "no"
+def _clock_row(
+    clock: ClockState, effect: float, left: float, *, is_reference: bool
+) -> tuple[str, ...]:
+    refined = "the others against it" if is_reference else "yes" if clock.refined else "no"
     return (
         clock.sensor,
         clock.source
@@ -306,7 +290,7 @@ def _clock_row(clock: ClockState, effect: float, snapshot: Snapshot) -> tuple[st
         plain_number(clock.ppm, "+.3f"),
         f"{clock.ppm_std:.2g}",
         scientific(clock.wander_ppm, 2),
-        plain_number(clock.residual * 1e6, ".2f"),
+        "–" if left == 0 else plain_number(left * 1e6, ".2f"),
         refined,
         share(effect),
     )
