@@ -11,7 +11,7 @@ from estimator.coherency import check_dims, coherency
 from estimator.errors import InsufficientDataError
 from estimator.factor_analysis import Maximum, check_factors, max_factors, maximise
 from estimator.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
-from estimator.resolution import resolved
+from estimator.resolution import alone, resolved
 from estimator.self_noise import Flag, SelfNoise
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ def maximum_likelihood(
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor. A frequency that is not finite or not positive definite
-        is flagged, and NaN; so are channels that are dead or equal, without loss to the others.
+        is flagged, and NaN; so are channels that are dead or equal, without loss to the others,
+        and those that no other sensor can check (NO_COUNTERPART, see `resolution.alone`).
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
@@ -98,6 +99,10 @@ def maximum_likelihood(
     check_factors(int(factors.max()), p)
     matrix, absent = _without_dead_and_copies(given)
     few = factors > max_factors(p - absent.sum(axis=1))
+    lone = np.zeros_like(absent)
+    lone[~few] = alone(matrix[~few], absent[~few], dims=dims, n_effective=n_effective)
+    lone &= given.flags == 0
+    shared = factors - lone.sum(axis=1)  # dimensions that a channel alone feels are in no other
     kind = kinds(given, dims)
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
     flags = given.flags.copy()
@@ -125,12 +130,14 @@ def maximum_likelihood(
             noise_psd[here] = psi * gain
             low[here], high[here] = fisher.interval(noise_psd[here], error * gain)
             flags[here] |= np.where(fit.boundary, Flag.BOUNDARY, 0)
-            flags[here] |= np.where(good & (fit.n_factors < q), Flag.UNRESOLVED, 0)
+            missed = good & (fit.n_factors < shared[here, None])
+            flags[here] |= np.where(missed, Flag.UNRESOLVED, 0)
             undetermined = ~np.isfinite(error) & ~fit.boundary & good
             flags[here] |= np.where(undetermined, Flag.SINGULAR, 0)
             lost = ~fit.converged & ~fit.singular
             flags[here] |= np.where(lost, Flag.NOT_CONVERGED, 0)[:, None]
-    unknown = (given.flags | (flags & Flag.SINGULAR)) != 0
+    flags[lone] = Flag.NO_COUNTERPART
+    unknown = (given.flags | (flags & (Flag.SINGULAR | Flag.NO_COUNTERPART))) != 0
     for result in (noise_psd, cov, low, high):
         result[unknown] = np.nan
     return SelfNoise(

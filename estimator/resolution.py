@@ -4,6 +4,9 @@ Factors that the averages cannot find are fitted to scatter, and what is fitted 
 noise: without motion 17 to 30 % at n = 20, 6 to 15 % still at n = 1080. A model without these
 factors has no such bias. So the weakest factor counts only where it improves the fit by more than
 scatter would, then the next. Motion left out with it stays in the noise: `docs/decisions/0033`.
+
+That is for motion that several sensors could feel. What one channel alone feels looks like its
+noise: `alone` finds the channels of which nothing else can be said.
 """
 
 from __future__ import annotations
@@ -12,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.factor_analysis import maximise
+from estimator.coherency import inverse
+from estimator.factor_analysis import max_factors, maximise
 from estimator.model_test import model_test
 
 if TYPE_CHECKING:
@@ -25,6 +29,8 @@ SCATTER = 1.2
 """Standard deviations by which a factor must lower the test statistic beyond its own number of
 parameters. With more, motion is left in the noise, with less, scatter is taken from it: at 1.2 the
 mean error for three to five sensors of one to three channels, n = 20 to 1080, is least."""
+SURELY = 3.0
+"""The same where a wrong answer is all of a channel's motion: at most one in 500 frequencies."""
 CERTAIN = 8.0
 """A factor whose strength exceeds this times the root of channels over averages is not tested."""
 CAPTURED = 0.15
@@ -65,6 +71,78 @@ def resolved(
         yield rows[stays], maximum.take(stays)
         rows, maximum = rows[~stays], fewer.take(enough)
     yield rows, maximum
+
+
+def alone(
+    csm: ComplexArray, absent: BoolArray, *, dims: tuple[int, ...], n_effective: float
+) -> BoolArray:
+    """Say which channels' noise might as well be motion that no other sensor feels.
+
+    Only the sensor with most channels can have such: as many as it has more than any other. They
+    are those that the other sensors predict least. All of such a channel is taken for motion, and
+    it is alone where that fits the averages as well as any noise does, but for scatter. So a
+    channel that others reach from the side, by sensors that point in many directions, is not.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Coherency, channels grouped by sensor.
+    absent : bool, shape (n_freqs, n_channels)
+        Channels that are dead or copies.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+        Averages; with no more than channels nothing is told apart.
+
+    Returns
+    -------
+    bool, shape (n_freqs, n_channels)
+    """
+    found = np.zeros(absent.shape, np.bool_)
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    place = np.concatenate([np.arange(d) for d in dims])
+    for pattern in np.unique(absent, axis=0):
+        present = np.flatnonzero(~pattern)
+        count = np.bincount(sensor[present], minlength=len(dims))
+        excess = int(np.diff(np.sort(count)[-2:])[0])
+        if excess == 0:
+            continue
+        largest = sensor[present] == count.argmax()
+        own, others = present[largest], present[~largest]
+        rows = np.flatnonzero((absent == pattern).all(axis=1))
+        cross = csm[np.ix_(rows, own, others)]
+        among, _ = inverse(csm[np.ix_(rows, others, others)])
+        left = 1 - np.einsum("fio,fop,fip->fi", cross, among, cross.conj()).real
+        # Where little is predicted, the channel that has no like one is the likeliest.
+        left *= np.where(np.isin(place[own], place[others]), 1, 2)
+        least = own[np.argsort(-left, axis=1)[:, :excess]]
+        for channel in own:
+            here = rows[(least == channel).any(axis=1)]
+            found[here, channel] = _may_be_motion(
+                csm[np.ix_(here, present, present)],
+                int(np.searchsorted(present, channel)),
+                d=int(count.max()),
+                n_effective=n_effective,
+            )
+    return found
+
+
+def _may_be_motion(csm: ComplexArray, channel: int, *, d: int, n_effective: float) -> BoolArray:
+    """Whether motion of d dimensions fits as well with no noise in a channel, shape (n_freqs,).
+
+    The others, that channel taken off, then have a factor less, and an average.
+    """
+    p = csm.shape[1]
+    q = min(d, int(max_factors(p)))
+    if q == 0 or n_effective <= p:
+        return np.ones(len(csm), np.bool_)
+    rest = np.delete(np.arange(p), channel)
+    seen = csm[:, rest, channel]
+    taken_off = csm[:, rest][:, :, rest] - seen[:, :, None] * seen[:, None].conj()
+    misfit, _ = _misfit(maximise(taken_off, q - 1), n_effective - 1)
+    before, _ = _misfit(maximise(csm, q), n_effective)
+    parameters = 2 * (p - q) + 1
+    return np.asarray(misfit - before < parameters + SURELY * np.sqrt(2 * parameters))
 
 
 def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArray]:

@@ -26,6 +26,12 @@ if TYPE_CHECKING:
     from estimator.arrays import ComplexArray, FloatArray
 
 
+def tilted(degrees: float) -> FloatArray:
+    """Rotation about x."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
 def equal_noise(seed: int, *, dims: tuple[int, ...], snr: float) -> ComplexArray:
     rng = np.random.default_rng(seed)
     return random_bench(rng, dims=dims, snr=snr, noise_psd=np.ones(sum(dims)))
@@ -362,6 +368,62 @@ def test_a_channel_left_alone_has_no_noise_to_tell(d: int) -> None:
     found = maximum_likelihood(csm, dims=(d,) * 3, n_effective=200)
     assert found.flags[0, 0] == Flag.NO_COUNTERPART
     assert np.isnan(found.noise_psd[0]).all()
+    assert not found.flags[1].any()
+
+
+@pytest.mark.parametrize(
+    ("dims", "tilt", "alone"),
+    [
+        ((3, 2, 2), 0.0, [2]),
+        ((3, 2, 2), 5.0, [2]),
+        ((2, 1, 1), 0.0, [1]),
+        ((1, 1, 1, 3), 0.0, [4, 5]),
+        ((3, 2, 1), 2.0, [2]),
+    ],
+)
+@pytest.mark.parametrize("n_averages", [100, 1080])
+def test_motion_that_one_channel_alone_feels_is_not_called_its_noise(
+    dims: tuple[int, ...], tilt: float, alone: list[int], n_averages: int
+) -> None:
+    """Aligned, or planes tilted a little: nothing else tells what that channel's noise is."""
+    rng = np.random.default_rng(41)
+    p = sum(dims)
+    directions = np.concatenate([tilted(i * tilt)[:k] for i, k in enumerate(dims)])
+    csm = common_motion(directions[:, : max(dims)], np.ones(p), snr=1e3)
+    found = maximum_likelihood(
+        wishart(csm, n_averages, rng, n_draws=200), dims=dims, n_effective=n_averages
+    )
+    assert np.mean(found.flags[:, alone] == Flag.NO_COUNTERPART) >= 0.98
+    others = np.delete(np.arange(p), alone)
+    assert np.isfinite(found.noise_psd[:, others]).all()
+    assert not np.any(found.flags[:, others] & (Flag.UNRESOLVED | Flag.NO_COUNTERPART))
+    covered = (found.low <= 1) & (found.high >= 1)
+    assert np.all(covered[:, others].mean(axis=0) > 0.9)
+
+
+@pytest.mark.parametrize("dims", [(3, 2, 2), (3, 2, 1), (3, 3, 3)])
+def test_others_that_point_many_ways_tell_the_noise_of_a_channel_without_its_like(
+    dims: tuple[int, ...],
+) -> None:
+    csm = random_bench(np.random.default_rng(4), dims=dims, snr=1e3, noise_psd=np.ones(sum(dims)))
+    drawn = wishart(csm, 1080, np.random.default_rng(42), n_draws=300)
+    dead = [5, 8] if dims == (3, 3, 3) else []
+    drawn[:, dead], drawn[:, :, dead] = 0, 0
+    found = maximum_likelihood(drawn, dims=dims, n_effective=1080)
+    alive = np.delete(np.arange(sum(dims)), dead)
+    assert not found.flags[:, alive].any()
+    covered = ((found.low <= 1) & (found.high >= 1))[:, alive].mean(axis=0)
+    assert np.all(covered > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 300))
+
+
+def test_a_channel_whose_like_ones_are_dead_is_known_where_they_live() -> None:
+    rng = np.random.default_rng(43)
+    csm = common_motion(np.tile(np.eye(3), (3, 1)), np.ones(9), snr=1e3)
+    csm = wishart(csm, 200, rng, n_draws=2)
+    csm[0, [5, 8]], csm[0, :, [5, 8]] = 0, 0
+    found = maximum_likelihood(csm, dims=(3, 3, 3), n_effective=200)
+    expected = [0, 0, Flag.NO_COUNTERPART, 0, 0, Flag.DEAD_CHANNEL, 0, 0, Flag.DEAD_CHANNEL]
+    assert found.flags[0].tolist() == expected
     assert not found.flags[1].any()
 
 
