@@ -9,7 +9,9 @@ block that is lost whole makes the next come just then. After further patience (
 if blocks came less evenly) it is **lost**: the one who waits for the port is interrupted, or, where
 others on the port go on, only told.
 
-When the event loop was held up, or nobody waits because writing lags, no device is to blame.
+When the event loop was held up, or nobody waits because writing lags, no device is to blame. Nor is
+one that says it recovers, from an overflow of its buffer: for as long as ``LONGEST_RECOVERY`` it is
+late, and not lost.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ LEAST_LATE = 0.1
 LEAST_PATIENCE = 0.5
 LATENESS = 0.25
 """What a late block may still come after, s: one that is lost whole must not look like a stall."""
+LONGEST_RECOVERY = 10.0
+"""How long no block may come from a device that says it recovers, s."""
 HELD_UP = 0.2
 """A timer that comes so late, s, tells of a busy host."""
 _LEAST_INTERVAL = 0.02
@@ -89,14 +93,21 @@ class Watch:
         Of each sensor, in samples per second of the event loop's clock.
     say : callable of sensor, stage and seconds since its last block
         Called once a stage; returns whether it could be said, and is asked again if not.
+    recovers : callable
+        Whether the device has said that it lives, though it sends no samples for now.
     """
 
     def __init__(
-        self, sampling_rates: Mapping[str, float], say: Callable[[str, Stage, float], bool]
+        self,
+        sampling_rates: Mapping[str, float],
+        say: Callable[[str, Stage, float], bool],
+        *,
+        recovers: Callable[[], bool] = lambda: False,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._rates = sampling_rates
         self._say = say
+        self._recovers = recovers
         now = self._loop.time()
         first = FIRST_PATIENCE + LONGEST_FIRST_BLOCK / min(sampling_rates.values())
         self._port = Patience(now, first)
@@ -108,8 +119,8 @@ class Watch:
 
     @property
     def seconds(self) -> float:
-        """How long a block may take before the port is lost."""
-        return self._port.lost_after
+        """Since the last block."""
+        return self._loop.time() - self._port.last
 
     async def __aenter__(self) -> Self:
         await self._timeout.__aenter__()
@@ -153,10 +164,11 @@ class Watch:
                 patience.excuse(now)
         else:
             self._tell(now, "late")
-            if now >= self._port.last + self._port.lost_after:
-                self._timeout.reschedule(now)
-                return
-            self._tell(now, "lost")
+            if now >= self._port.last + LONGEST_RECOVERY or not self._recovers():
+                if now >= self._port.last + self._port.lost_after:
+                    self._timeout.reschedule(now)
+                    return
+                self._tell(now, "lost")
         self._arm(now)
 
     def _tell(self, now: float, stage: Stage) -> None:

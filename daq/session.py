@@ -199,7 +199,11 @@ class Connection:
             return True
 
         speed, begun_ns = self._clock.speed, self._clock.now().monotonic_ns
-        watch = Watch({s.name: s.sampling_rate * speed for s in self.sensors}, say)
+        watch = Watch(
+            {s.name: s.sampling_rate * speed for s in self.sensors},
+            say,
+            recovers=lambda: getattr(session, "recovers", False),
+        )
         checked = Checked(self.driver, self.sensors)
         suspended = self._clock.suspended
         async with contextlib.aclosing(_generator(session)) as items:

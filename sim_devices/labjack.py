@@ -360,7 +360,7 @@ class StreamPort:
             return ()
         stream.advance(now)
         size, sent = self._labjack.packet_size, []
-        while stream.n_waiting >= size or stream.ended:
+        while stream.n_waiting >= size or stream.is_due or stream.ended:
             packet = stream.take_out(size)
             sent.append(
                 encode_packet(

@@ -43,6 +43,8 @@ class Stream:
         self._recovering = False
         self._full_until = -NEVER
         self._skipped = 0
+        self.is_due = False
+        """Whether a packet is, though it is not full."""
         self._mark: int | None = None  # scans skipped before the mark that is in the buffer
         self.wanted: int | None = None
         """Scans of a burst."""
@@ -62,8 +64,12 @@ class Stream:
             self._take(end)
 
     def overflow(self, until: float) -> None:
-        """Take no more scans before world time ``until``, as if the buffer were full."""
-        self._recovering, self._full_until = True, until
+        """Take no more scans before world time ``until``, as if the buffer were full.
+
+        What is in it goes out at once, however little, and says so.
+        """
+        self._recovering = self.is_due = True
+        self._full_until = until
 
     def _take(self, end: int) -> None:
         full = self._samples.time(self._next) < self._full_until
@@ -96,7 +102,7 @@ class Stream:
     def next_full(self) -> float:
         """World time at which the next packet is full, or the stream ends."""
         rows = -(-(self._packet_size - self.n_waiting) // self._columns.n)
-        if self.ended or rows <= 0:
+        if self.ended or self.is_due or rows <= 0:
             return -NEVER
         last = self._next + rows - 1
         for limit in (self.wanted, self.breaks_off and self.breaks_off[0]):
@@ -107,6 +113,7 @@ class Stream:
     def take_out(self, n_samples: int) -> Packet:
         """Return at most so many samples, with the status that goes with them."""
         taken, self._buffer = self._buffer[:n_samples], self._buffer[n_samples:]
+        self.is_due = False
         status = information = 0
         if self._mark is not None:
             status, information, self._mark = AUTO_RECOVER_END, self._mark, None

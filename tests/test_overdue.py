@@ -116,6 +116,30 @@ async def test_nobody_is_late_while_nobody_waits(said: Said) -> None:
     assert not said.items
 
 
+async def test_a_device_that_recovers_is_late_and_not_lost(
+    said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.overdue.LONGEST_RECOVERY", 1.0)
+    rates = {"a": RATE, "b": RATE}
+
+    async def wait(watch: Watch) -> None:
+        async with watch:
+            for sensor in rates:
+                watch.block_came(block(sensor, 10))
+            with watch.waiting():
+                await asyncio.Event().wait()
+
+    recovering = Watch(rates, said, recovers=lambda: True)
+    with pytest.raises(TimeoutError):
+        await wait(recovering)
+    assert recovering.seconds >= 1.0  # not for ever
+    assert sorted(item[:2] for item in said.items) == [("a", "late"), ("b", "late")]
+    stalled = Watch(rates, said, recovers=lambda: False)
+    with pytest.raises(TimeoutError):
+        await wait(stalled)
+    assert stalled.seconds < 1.0
+
+
 def test_one_lost_block_is_no_stall() -> None:
     """The next of a second each comes two seconds after the last, and a little: no sooner."""
     patience = Patience(0.0, 10.0)

@@ -160,3 +160,44 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
         before = sensor.blocks[sensor.blocks["first_sample"] < stalled["first_sample"]][-1]
         noticed = (by_kind["late"].received.monotonic_ns - before["monotonic_ns"]) / 1e9
         assert 2 * PERIOD - 0.01 < noticed < 2 * PERIOD + 1.0 * speed  # a busy machine's second
+
+
+@pytest.mark.timeout(120)
+async def test_a_digitizer_that_recovers_from_an_overflow_is_waited_for(tmp_path: Path) -> None:
+    """Its own count of what it skipped is the gap, longer though it is than a stall may be."""
+    speed = 4.0
+    modes = {"S": "spontaneous", "C": "command-response"}
+    tables = [
+        {**table(name, "labjack"), "settings": {"mode": mode}} for name, mode in modes.items()
+    ]
+    told = spec(*tables, speed=speed, age=0.0)
+    told["faults"] = [{"kind": "overflow", "at": 12.0, "every": 16.0, "duration": 5.0}]
+    stop = asyncio.Event()
+
+    def acknowledged(status: Status) -> None:
+        if status.sensors and all(
+            s.gaps and s.state == "recording" for s in status.sensors.values()
+        ):
+            stop.set()
+
+    path = tmp_path / "r.h5"
+    async with started(told) as running:
+        bench = Bench(
+            name="simulated",
+            sampling_rate=200.0,
+            sensors=tuple(
+                sensor
+                for one, its_table in zip(running, tables, strict=True)
+                for sensor in sensors(one, its_table)
+            ),
+        )
+        await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
+    with Recording.open(path) as recording:
+        for sensor in recording.sensors:
+            kinds = [e.kind for e in recording.events if e.sensor == sensor.name]
+            assert kinds == ["connected", "overflow", "overflow"], sensor.name
+            (gap,) = sensor.gaps
+            assert (gap["reason"], gap["estimated"]) == (b"buffer overflow", 0)
+            assert gap["missing"] == pytest.approx(5.0 * 200, abs=1)
+            ticks = sensor.blocks["device_counter"] - sensor.blocks["first_sample"] * 200_000
+            assert len(set(ticks.tolist())) == 1

@@ -80,6 +80,14 @@ class LabJackSession:
         self._stream_address = stream_address
         self._patience = STALLED + 2 * packet_seconds
 
+    @property
+    def recovers(self) -> bool:
+        """Whether no samples need come for now: the buffer has overflowed, and the device goes on.
+
+        Who supervises decides how long that may take (:mod:`daq.overdue`).
+        """
+        return self.decoder.recovers
+
     async def read(self) -> AsyncIterator[Block | Event]:
         """Start the stream and yield its blocks; start it anew where it breaks off."""
         if self._settings.mode == "command-response":
@@ -111,7 +119,7 @@ class LabJackSession:
             await self._start()
             while True:
                 try:
-                    async with asyncio.timeout(self._patience):
+                    async with asyncio.timeout(None if self.recovers else self._patience):
                         received, at = await stream.read()
                 except TimeoutError as error:
                     raise NoAnswerError(
@@ -126,7 +134,7 @@ class LabJackSession:
         while True:
             values, at = await self._registers.exchange(read)
             packet = labjack.decode_response(values)
-            if len(packet.samples):
+            if len(packet.samples) or packet.status == labjack.AUTO_RECOVER_ACTIVE:
                 silent_since = at.monotonic_ns
             elif (at.monotonic_ns - silent_since) * 1e-9 > self._patience:
                 raise NoAnswerError(

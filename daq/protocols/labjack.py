@@ -217,7 +217,8 @@ class StreamDecoder:
         self._offset = 0  # samples to drop until a scan begins
         self._transactions: SampleCounter | None = None
         self._packet_size = 0
-        self._recovering = False
+        self.recovers = False
+        """Whether the device said last that its buffer has overflowed, and that it will go on."""
         self._newest: int | None = None  # timer of the last scan that came
         self._newest_ns = 0  # when it did
         self.fatal: int | None = None
@@ -272,10 +273,10 @@ class StreamDecoder:
             found += self._blocks(rows, at)
             found.append(Event(self._name, "resynchronised", several(lost, "packet", "lost"), at))
             self._skip_samples(lost * self._packet_size)
-        self._packet_size = len(packet.samples) or self._packet_size
-        if packet.status == AUTO_RECOVER_ACTIVE and not self._recovering:
+        self._packet_size = max(len(packet.samples), self._packet_size)
+        if packet.status == AUTO_RECOVER_ACTIVE and not self.recovers:
             found.append(Event(self._name, "overflow", "the device's buffer overflowed (2940)", at))
-        self._recovering = packet.status == AUTO_RECOVER_ACTIVE
+        self.recovers = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
         if packet.status != AUTO_RECOVER_END:  # which may begin with a scan of 0xFFFF
             scans = scans[self._n_repeated(scans, at) :]
@@ -305,6 +306,8 @@ class StreamDecoder:
         if packet.transaction is None:
             return 0
         if self._transactions is None:
+            if packet.status == AUTO_RECOVER_ACTIVE:  # it may not be full
+                return 0
             packet_rate = self._rate * self._n_columns / max(1, len(packet.samples))
             self._transactions = SampleCounter(65536, packet_rate)
         runs, n_repeated = self._transactions.place(np.array([packet.transaction]), at)
