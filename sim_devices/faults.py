@@ -50,12 +50,13 @@ import itertools
 import math
 import zlib
 from collections import deque
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Field,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -68,10 +69,11 @@ from pydantic import (
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from typing import Self
 
     from numpy.typing import NDArray
+    from pydantic_core import ErrorDetails
 
     from sim_devices.arrays import FloatArray
 
@@ -97,7 +99,7 @@ class Fault(BaseModel):
     kind: Kind
     at: NonNegativeFloat
     every: PositiveFloat | None = None
-    sensors: tuple[str, ...] | None = None
+    sensors: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     count: PositiveInt = 1
     duration: NonNegativeFloat = 1.0
     level: float = 0.0
@@ -121,13 +123,13 @@ class Fault(BaseModel):
 _SCRIPT = TypeAdapter(list[Fault])
 
 
-def parse(tables: Sequence[Any], sensors: Sequence[str] | None = None) -> tuple[Fault, ...]:
+def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...]:  # noqa: ANN401
     """Read a fault script.
 
     Parameters
     ----------
-    tables
-        As in a TOML file's ``[[faults]]``.
+    script
+        A list of tables, as in a TOML file's ``[[faults]]``.
     sensors
         Leave only what strikes one of these.
 
@@ -137,18 +139,46 @@ def parse(tables: Sequence[Any], sensors: Sequence[str] | None = None) -> tuple[
         Naming every key that is wrong, its value and what was expected.
     """
     try:
-        faults = _SCRIPT.validate_python(list(tables))
+        faults = _SCRIPT.validate_python(script)
     except ValidationError as error:
-        raise ScenarioError(
-            "\n".join(
-                f"faults[{fault['loc'][0]}]{''.join(f'.{key}' for key in fault['loc'][1:])}"
-                f" = {fault['input']!r}: {fault['msg']}"
-                for fault in error.errors(include_url=False)
-            )
-        ) from error
+        raise ScenarioError("\n".join(map(_told, error.errors(include_url=False)))) from error
     if sensors is None:
         return tuple(faults)
     return tuple(f for f in faults if f.sensors is None or set(f.sensors) & set(sensors))
+
+
+def _told(fault: ErrorDetails) -> str:
+    place = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in fault["loc"])
+    expected = fault["msg"]
+    if fault["type"] == "list_type":
+        expected = "expected a list of tables, [[faults]]"
+    elif fault["type"] == "extra_forbidden":
+        expected = f"there is no such key; expected {', '.join(Fault.model_fields)}"
+    return f"faults{place} = {fault['input']!r}: {expected}"
+
+
+def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
+    """Check that there is what a script strikes, given how many channels each sensor has.
+
+    Raises
+    ------
+    ScenarioError
+        Naming every sensor and channel that is not there, and those that are.
+    """
+    wrong = []
+    for number, fault in enumerate(faults):
+        place, named = f"faults[{number}]", fault.sensors or ()
+        wrong += [
+            f"{place}.sensors = {name!r}: there is no such sensor; expected {', '.join(n_channels)}"
+            for name in named
+            if name not in n_channels
+        ]
+        counts = [n_channels[name] for name in named if name in n_channels]
+        least = min(counts, default=math.inf) if named else max(n_channels.values())
+        if fault.channel is not None and fault.channel >= least:
+            wrong.append(f"{place}.channel = {fault.channel}: expected 0 to {least - 1}")
+    if wrong:
+        raise ScenarioError("\n".join(wrong))
 
 
 class SampleFaults:

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from daq.bench import dump, load, parse
 from daq.errors import BenchFileError
 from sim_devices.errors import ScenarioError
+from sim_devices.faults import check
 from sim_devices.faults import parse as parse_faults
 from sim_devices.launch import start
 from sim_devices.scenario import Scenario
@@ -64,13 +65,15 @@ def specification(bench: Bench, *, speed: float, log: Path | None = None) -> dic
     Each fault that strikes and all that is sent is noted in ``log``.
     """
     scenario = scenario_of(bench).to_dict()
+    faults = bench.simulation.get("faults", [])
+    _check_faults(bench, faults, f"{bench.source or 'bench'}: simulation")
     for sensor in bench.sensors:
         scenario["sensors"][sensor.name]["sampling_rate"] = sensor.sampling_rate
     return {
         "epoch_ns": time.monotonic_ns() + HEAD_START_NS,
         "speed": speed,
         "scenario": scenario,
-        "faults": bench.simulation.get("faults", []),
+        "faults": faults,
         "fault_log": str(log) if log else None,
         "sent_log": str(log) if log else None,
         "devices": [_device(sensors) for sensors in bench.ports().values()],
@@ -154,11 +157,31 @@ def with_faults(bench: Bench, path: Path) -> Bench:
         With every fault of the script.
     """
     try:
-        script = tomllib.loads(path.read_text(encoding="utf-8")).get("faults", [])
-        parse_faults(script)
-    except (tomllib.TOMLDecodeError, ScenarioError) as error:
-        raise BenchFileError(f"{path}: {error}") from error
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or error
+        raise BenchFileError(f"{path}: cannot be read: {reason}; expected a fault script") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BenchFileError(
+            f"{path}: {error}; expected a fault script, a TOML file of [[faults]]"
+        ) from None
+    unknown = ", ".join(sorted(table.keys() - {"faults"}))
+    if unknown:
+        raise BenchFileError(f"{path}: {unknown}: there is no such key; expected [[faults]]")
+    script = table.get("faults", [])
+    _check_faults(bench, script, str(path))
     return bench.model_copy(update={"simulation": bench.simulation | {"faults": script}})
+
+
+def _check_faults(bench: Bench, script: object, source: str) -> None:
+    """Check that a fault script is one, and strikes what the bench has."""
+    try:
+        check(
+            parse_faults(script), {sensor.name: sensor.n_main_channels for sensor in bench.sensors}
+        )
+    except ScenarioError as error:
+        lines = str(error).splitlines()
+        raise BenchFileError("\n".join(f"{source}: {line}" for line in lines)) from error
 
 
 def serve_devices(

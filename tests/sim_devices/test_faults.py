@@ -255,3 +255,38 @@ def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
     script.write_text("[[faults]]\nat = -3.0\n", encoding="utf-8")
     with pytest.raises(BenchFileError, match=r"(?s)faults\.toml: faults\[0\].*at = -3"):
         with_faults(bench, script)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        (b"faults = 5", r"faults = 5: expected a list"),
+        (b"faults = [5]", r"faults\[0\] = 5: "),
+        (b"[[fault]]\nat = 3.0", r"fault: there is no such key; expected \[\[faults\]\]"),
+        (b'[[faults]]\nkind = "dead"\nat = 1\nwhen = 3', r"faults\[0\]\.when = 3: .*expected kind"),
+        (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = ["NOPE"]', r"'NOPE': .*expected A, B, C"),
+        (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = []', r"sensors = \[\]: "),
+        (b'[[faults]]\nkind = "dead"\nat = 1\nchannel = 3', r"channel = 3: expected 0 to 2"),
+        (b"# \xff\nfaults = []", r"expected a fault script"),
+        (b"faults = ", r"expected a fault script"),
+        (None, r"cannot be read"),
+    ],
+)
+def test_a_script_that_would_strike_nothing_is_refused(
+    tmp_path: Path, script: bytes | None, said: str
+) -> None:
+    template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    path = tmp_path / "faults.toml"
+    if script is not None:
+        path.write_bytes(script)
+    with pytest.raises(BenchFileError, match=r"faults\.toml: .*" + said):
+        with_faults(parse_bench(template), path)
+
+
+@pytest.mark.parametrize("faults", [5, [{"kind": "drop", "at": 1.0, "sensors": ["NOPE"]}]])
+def test_a_script_in_the_bench_file_is_checked_as_well(faults: object) -> None:
+    template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    bench = parse_bench(template)
+    bench = bench.model_copy(update={"simulation": bench.simulation | {"faults": faults}})
+    with pytest.raises(BenchFileError, match=r"simulation: faults.* = .*expected"):
+        specification(bench, speed=1.0)
