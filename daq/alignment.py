@@ -89,6 +89,7 @@ class AlignedRecording:
         self._set_at = (0, 0)
         self._end = math.inf
         self._at_face_value = at_face_value
+        self._measured_against: int | None = None
         self.refresh()
 
     @property
@@ -158,19 +159,19 @@ class AlignedRecording:
 
     @property
     def measurable(self) -> tuple[int, ...]:
-        """Sensors whose delay the samples could tell: the reference, then one of each free clock.
+        """Sensors whose delay the samples could tell: the best reference, and one of each clock.
 
         And those that share a clock, where it is in doubt how many samples apart they began.
         Empty where no clock has to be estimated. Sensors are numbered in order.
         """
         if self.is_exact:
             return ()
-        reference = self._reference
+        reference = self._preferred
         seen = {self._sources[reference].clock_name}
         free = []
         for number, source in enumerate(self._sources):
-            stated = source.device_utc or source.polled
-            if not stated and (source.clock_name not in seen or source.offset_in_doubt):
+            known = source.device_utc or source.polled or number == reference
+            if not known and (source.clock_name not in seen or source.offset_in_doubt):
                 free.append(number)
                 seen.add(source.clock_name)
         return (reference, *free) if free else ()
@@ -184,15 +185,20 @@ class AlignedRecording:
         ----------
         at : float64, shape (n,)
             Grid positions in samples, increasing from call to call.
-        delays, std : float64, shape (n, n_measurable - 1)
-            By how much each sensor that is `measurable` lags the reference, in seconds; an
-            infinite standard deviation where that is not known.
-        frame_delays : float64, shape (n_measurable - 1,)
+        delays, std : float64, shape (n, n_measurable)
+            By how much each sensor that is `measurable` lags the one whose standard deviation is
+            zero, in seconds; an infinite one where that is not known.
+        frame_delays : float64, shape (n_measurable,)
             What is to be added to all delays since `forget`, in seconds.
         """
+        if len(at) == 0:
+            return
+        certain = np.flatnonzero((std == 0).all(axis=0))
+        if len(certain):
+            self._measured_against = self.measurable[int(certain[0])]
         seconds = (self._start or 0.0) + at / self.sampling_rate
         at_reference = self._sources[self._reference].known_clock.position(seconds)
-        for column, number in enumerate(self.measurable[1:]):
+        for column, number in enumerate(self.measurable):
             source = self._sources[number]
             index = source.known_clock.position(seconds)
             source.frame_delay = float(frame_delays[column])
@@ -352,7 +358,12 @@ class AlignedRecording:
 
     @property
     def _reference(self) -> int:
-        """The sensor others are measured against: one with its own UTC, else the first."""
+        """The sensor others are measured against."""
+        return self._preferred if self._measured_against is None else self._measured_against
+
+    @property
+    def _preferred(self) -> int:
+        """The sensor others are best measured against: one with its own UTC, else the first."""
         for number, source in enumerate(self._sources):
             if source.device_utc:
                 return number

@@ -17,6 +17,8 @@ frequencies under the window, and s the share of that sum which P's own noise do
 P is averaged over segments already freed of their delays. The first batch does so by iteration and
 thereby defines a frame; later batches are measured in that frame, which makes the delays of a whole
 recording comparable. The frame's own delay is the one that makes P most nearly real.
+
+The reference is the first sensor, unless that one shares the motion with fewer of the others.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3
 _FEWEST_SEGMENTS = 6  # in the first batch, per channel of the reference: P is a mean of those
+_SHARED = 0.1  # samples to which most segments tell the delay of sensors that share a motion
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
 _OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
@@ -65,20 +68,21 @@ class _Frame:
 
 @dataclass(slots=True, eq=False)
 class DelayMeter:
-    """Measures each sensor's delay against the first of `columns`.
+    """Measures each sensor's delay against one of them.
 
     Attributes
     ----------
     sampling_rate : float
     window : float64, shape (segment_length,)
     columns : tuple of slice
-        Which columns of the samples belong to the reference, and to each sensor to be measured.
+        Which columns of the samples belong to each sensor, the preferred reference first.
     """
 
     sampling_rate: float
     window: FloatArray
     columns: tuple[slice, ...]
-    _frames: list[_Frame] = field(default_factory=list)
+    _reference: int = 0
+    _frames: dict[int, _Frame] = field(default_factory=dict)
 
     @property
     def fewest(self) -> int:
@@ -109,51 +113,80 @@ class DelayMeter:
 
         Returns
         -------
-        delays, std : float64, shape (n_segments, n_sensors - 1)
-            In seconds; positive if the sensor lags the reference. NaN and infinite where the
-            coherent motion is too weak to tell.
+        delays, std : float64, shape (n_segments, n_sensors)
+            In seconds; positive if the sensor lags the reference, whose own are all zero. NaN and
+            infinite where the coherent motion is too weak to tell.
         """
-        shape = (len(starts), len(self.columns) - 1)
+        shape = (len(starts), len(self.columns))
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
         if len(starts) == 0 or (not self.has_frame and len(starts) < self.fewest):
             return delays, std
         spectra = self._spectra(samples, starts)
-        x0 = spectra[:, :, self.columns[0]]
-        first = not self._frames
-        for number, columns in enumerate(self.columns[1:]):
-            xj = spectra[:, :, columns]
-            if first:
-                frame, tau = _empty(x0, xj), np.zeros(len(starts))
-                for _ in range(_FIRST_ITERATIONS):
-                    frame = _empty(x0, xj)
-                    frame.add(x0, self._advanced(xj, tau))
-                    tau, spread = self._delays(frame, x0, xj)
-                    tau = np.where(np.isfinite(spread), tau, 0.0)
-                    tau -= tau.mean()
-                self._frames.append(_empty(x0, xj))
-            else:
-                tau, spread = self._delays(self._frames[number], x0, xj)
+        sensors = [spectra[:, :, columns] for columns in self.columns]
+        if self.has_frame:
+            x0 = sensors[self._reference]
+            found = {
+                number: self._delays(frame, x0, sensors[number])
+                for number, frame in self._frames.items()
+            }
+        else:
+            self._reference, found = self._begun(sensors)
+            x0 = sensors[self._reference]
+            self._frames = {number: _empty(x0, sensors[number]) for number in found}
+        delays[:, self._reference] = std[:, self._reference] = 0.0
+        for number, (tau, spread) in found.items():
+            frame, xj = self._frames[number], sensors[number]
             known = np.isfinite(spread)
-            if first or known.any():
+            if frame.n_segments == 0 or known.any():
                 used = known if known.any() else np.ones(len(starts), dtype=bool)
-                self._frames[number].add(
-                    x0[:, used], self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
-                )
+                frame.add(x0[:, used], self._advanced(xj[:, used], np.where(known, tau, 0.0)[used]))
             delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
         return delays, std
 
+    def _begun(
+        self, sensors: list[ComplexArray]
+    ) -> tuple[int, dict[int, tuple[FloatArray, FloatArray]]]:
+        """Return the reference, and delays and standard deviations of the others against it."""
+        best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
+        most = -1
+        for reference, x0 in enumerate(sensors):
+            found = {
+                number: self._first_delays(x0, xj)
+                for number, xj in enumerate(sensors)
+                if number != reference
+            }
+            spreads = [float(np.median(spread)) for _, spread in found.values()]
+            n_shared = sum(spread * self.sampling_rate < _SHARED for spread in spreads)
+            if n_shared > most:
+                best, most = (reference, found), n_shared
+            if n_shared == len(found):
+                break
+        return best
+
+    def _first_delays(self, x0: ComplexArray, xj: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Measure delays in the frame of these segments, which the delays define in turn."""
+        tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
+        for _ in range(_FIRST_ITERATIONS):
+            frame = _empty(x0, xj)
+            frame.add(x0, self._advanced(xj, tau))
+            tau, spread = self._delays(frame, x0, xj)
+            tau = np.where(np.isfinite(spread), tau, 0.0)
+            tau -= tau.mean()
+        return tau, spread
+
     def frame_delays(self) -> FloatArray:
-        """Return the delay of each frame, that of a real relative response, in seconds."""
-        delays = np.zeros(len(self.columns) - 1)
-        for number, frame in enumerate(self._frames):
+        """Return the delay of each sensor's frame, that of a real relative response, in seconds."""
+        delays = np.zeros(len(self.columns))
+        for number, frame in self._frames.items():
             response, left = _prediction(frame)
             # A rotation with gains is real: the sum of squares turns with twice the delay.
             squares = np.einsum("fpq,fpq->f", response, response)
             size = np.einsum("fpq,fpq->f", response, response.conj()).real
             own = np.einsum("fpp->f", frame.own).real / frame.n_segments
             # How much of the sensor is predicted, as a weight that noise cannot raise.
-            weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
-            turned = (weight * squares / size)[:, None]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
+                turned = np.nan_to_num(weight * squares / size)[:, None]  # nothing, of no signal
             delays[number] = self._peak(turned, beyond=len(self.window) / 2)[0] / 2
         return delays
 
@@ -190,7 +223,7 @@ class DelayMeter:
         # Of P's own noise, which predicts nothing: the mean of Wishart matrices has d0 dj / n.
         spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = max(1 - spurious / float(informative.mean()), 0.0)
+            share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
         # What P leaves over is scattered itself: the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)

@@ -211,6 +211,27 @@ def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path:
     assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
 
 
+def test_a_first_sensor_that_hears_noise_only_keeps_no_other_from_being_refined(
+    tmp_path: Path,
+) -> None:
+    motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
+
+    def seen(seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
+        return np.round(1e5 * (motion + 0.01 * noise)).astype(np.int32)
+
+    sensors = {
+        "a": Sensor(counts(12_000, 1, 4)),
+        "b": Sensor(seen(1)),
+        "c": Sensor(seen(2)),
+        "d": Sensor(seen(3), late=27e-3),  # nearly three samples
+    }
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], Settings(segment=4.0))
+    assert [clock.refined for clock in snapshot.clocks] == [False, False, True, True]
+    apart = snapshot.drift[:, 3:] - snapshot.drift[:, 2:3]
+    assert np.abs(apart).max() < 1e-4  # 2.7e-2 by arrival times
+
+
 def test_an_hour_of_suspend_is_a_short_gap_and_clocks_meet_again_behind_it(tmp_path: Path) -> None:
     # CLOCK_MONOTONIC stands still in suspend; the sensors' counters do not.
     hour, n_before, n_after = 3600.0, 30_000, 30_000
