@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
+from estimator.coherency import check_averages
 from estimator.errors import InvalidMatrixError
 
 if TYPE_CHECKING:
@@ -92,15 +93,25 @@ def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: flo
     Raises
     ------
     InvalidMatrixError
-        If a noise PSD is not positive.
+        If shapes do not fit, something is not finite, or a noise PSD is not positive.
+    InsufficientDataError
+        If `n_effective` is not a finite number above zero.
 
     Notes
     -----
     Root of the diagonal of the inverse information divided by `n_effective`. The number of
     factors is the rank of ``csm - diag(noise_psd)``, whitened, above its rounding.
     """
-    if not np.all(noise_psd > 0):
-        raise InvalidMatrixError("the Cramér-Rao bound needs a positive noise PSD in every channel")
+    check_averages(n_effective)
+    if noise_psd.ndim != 2 or csm.shape != (*noise_psd.shape, noise_psd.shape[1]):
+        raise InvalidMatrixError(
+            f"cross-spectral matrix of shape {csm.shape} and noise of shape {noise_psd.shape}: "
+            "expected (n_freqs, p, p) and (n_freqs, p)"
+        )
+    if not (np.isfinite(csm).all() and np.isfinite(noise_psd).all() and np.all(noise_psd > 0)):
+        raise InvalidMatrixError(
+            "the Cramér-Rao bound needs finite matrices, and a positive noise PSD in every channel"
+        )
     scale = 1 / np.sqrt(noise_psd)
     w, u = np.linalg.eigh(csm * scale[:, :, None] * scale[:, None, :])
     free = w < 1 + 1e-9 * np.maximum(w[:, -1:], 1.0)

@@ -224,6 +224,11 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
     shown = huddle("plan", str(bench), "--cov", "0.05")
     assert "efficiency" in shown
+    assert "motion too weak" not in shown
+    assert "motion too weak" in huddle("plan", str(bench), "--snr", "1e-5")
+    for snr in ("inf", "1e30", "nan"):
+        refused = CliRunner().invoke(app, ["plan", str(bench), "--snr", snr])
+        assert refused.exit_code == 2
 
 
 def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:

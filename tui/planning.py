@@ -10,6 +10,7 @@ from rich.table import Table
 from daq.bench import format_duration, load
 from estimator.planning import plan, planned_csm
 from estimator.spectra import WelchSettings
+from estimator.wording import percent
 from tui.devices import scenario_of
 from tui.output import for_people, write_json
 from tui.text import signed
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from daq.bench import Bench
     from estimator.planning import Plan
     from tui.bands import FloatArray
+
+YEAR = 365 * 86400.0  # s: nobody records for longer because the motion is weak
 
 
 def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
@@ -46,6 +49,17 @@ def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
         f"{format_duration(bench.estimate.segment)} {settings.window} segments:"
     )
     screen.print(table)
+    if any(entry.weak.any() for entry in plans):
+        screen.print(
+            "The motion is weak: to tell it from the noise takes longer than the precision alone "
+            "would, and nothing can be predicted of shorter recordings. Without any method the "
+            f"spectra are the noise, too high by the motion: {percent(snr)} here."
+        )
+    if _worst(plans[0].duration) < _worst(plans[-1].duration):
+        screen.print(
+            f"{plans[0].method} is told the channels' gains, which the bound does not take for "
+            "known: only so can it be shorter."
+        )
     write_json(
         json,
         {
@@ -58,6 +72,7 @@ def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
                     "segments": _worst(entry.n_segments),
                     "bias": entry.bias[0].tolist(),
                     "efficiency": entry.efficiency[0].tolist(),
+                    "weak": bool(entry.weak.any()),
                 }
                 for entry in plans
             ],
@@ -82,11 +97,14 @@ def _row(entry: Plan) -> tuple[str, str, str, str]:
     duration, segments = _worst(entry.duration), _worst(entry.n_segments)
     if np.isnan(duration):
         return "says nothing", "", "", ""
+    if entry.weak.any() and duration > YEAR:
+        return "motion too weak", "", "", ""
     low, high = float(entry.bias.min()), float(entry.bias.max())
     none = max(-low, high) < 1e-3
+    efficiency = float(entry.efficiency.min())
     return (
         format_duration(duration),
         f"{segments:.0f}",
         "none" if none else f"{signed(low, '+.0%')} to {signed(high, '+.0%')}",
-        f"{entry.efficiency.min():.0%}" if none else "",
+        f"{efficiency:.0%}" if none and np.isfinite(efficiency) else "",
     )

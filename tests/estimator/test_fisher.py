@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimator import fisher
-from estimator.errors import InvalidMatrixError
+from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import maximise
 from estimator.three_sensor import three_sensor
 from tests.estimator.models import common_motion, planar_sensors, random_bench, wishart
@@ -66,6 +66,13 @@ def test_what_cannot_be_identified_has_no_bound() -> None:
     assert np.isinf(bound[0, 4])
     with pytest.raises(InvalidMatrixError, match="positive"):
         fisher.cramer_rao_cov(csm[:, :3, :3], np.zeros((1, 3)), n_effective=100)
+    with pytest.raises(InvalidMatrixError, match="finite"):
+        fisher.cramer_rao_cov(csm * np.nan, np.ones((1, 5)), n_effective=100)
+    with pytest.raises(InvalidMatrixError, match=r"\(1, 4\)"):
+        fisher.cramer_rao_cov(csm, np.ones((1, 4)), n_effective=100)
+    for n in (0, -1, np.nan, np.inf):
+        with pytest.raises(InsufficientDataError, match="averages"):
+            fisher.cramer_rao_cov(csm, np.ones((1, 5)), n_effective=n)
 
 
 def test_interval_in_the_logarithm_and_at_zero() -> None:

@@ -59,6 +59,52 @@ def test_what_is_planned_is_what_comes_out(method: str) -> None:
         assert relative.std() == pytest.approx(0.2, rel=0.08)
 
 
+@pytest.mark.parametrize("method", ["three-channel", "three-sensor", "maximum-likelihood"])
+@pytest.mark.parametrize(("snr", "cov"), [(0.1, 0.05), (1, 0.2)])
+def test_what_is_planned_for_weak_motion_is_kept(method: str, snr: float, cov: float) -> None:
+    # with the averages that the precision alone would need, c.o.v. of 0.06 to 0.15, and 0.22
+    rng = np.random.default_rng(0)
+    directions = np.tile(np.eye(3), (3, 1))
+    csm, noise_psd = planned_csm(directions, snr=snr)
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 3, 3), settings=PAPER, cov=cov)}
+    planned = plans[method]
+    assert planned.weak.all()
+    n = round(planned.n_effective.max())
+    sample = wishart(csm[0], n, rng, n_draws=1000)
+    found = self_noise(method, sample, dims=(3, 3, 3), n_effective=n)
+    assert found.noise_psd.std(axis=0).max() < 1.05 * cov
+    # 1000 estimates, nine channels
+    np.testing.assert_allclose(
+        found.noise_psd.mean(axis=0), 1, atol=3 * cov / np.sqrt(1000) + 0.005
+    )
+    np.testing.assert_allclose(
+        planned.efficiency, plans[BOUND].n_effective / planned.n_effective, rtol=0.05
+    )
+
+
+def test_maximum_likelihood_needs_the_best_sensors_only_to_find_the_motion() -> None:
+    noise = np.repeat([1.0, 1.0, 1.0, 100.0, 100.0], 3)
+    csm, noise_psd = planned_csm(np.tile(np.eye(3), (5, 1)), snr=0.1, noise_psd=noise)
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=(3,) * 5, settings=PAPER, cov=0.05)}
+    assert plans["maximum-likelihood"].n_effective.max() < 3000
+    assert plans["three-sensor"].n_effective.max() > 1e6
+
+
+def test_two_channel_is_not_measured_by_a_bound_that_knows_less() -> None:
+    csm, noise_psd = planned_csm(np.tile(np.eye(2), (3, 1)), snr=0.1)
+    found = plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)
+    assert (found[0].n_effective < found[-1].n_effective).all()
+    assert np.isnan(found[0].efficiency).all()
+
+
+def test_methods_that_such_sensors_do_not_allow_say_nothing() -> None:
+    directions = np.vstack([np.eye(3), np.eye(3)[:1], np.eye(3)[:1]])
+    csm, noise_psd = planned_csm(directions, snr=10)
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 1, 1), settings=PAPER, cov=0.05)}
+    assert np.isnan(plans["maximum-likelihood"].n_effective).all()
+    assert np.isfinite(plans["three-channel"].n_effective[0, [0, 3, 4]]).all()
+
+
 @pytest.mark.parametrize("overlap", [0.0, 0.5, 0.75])
 def test_segments_needed_is_the_least_number_that_is_enough(overlap: float) -> None:
     window = get_window("hann", 200)
@@ -84,6 +130,9 @@ def test_plans_that_make_no_sense_are_refused() -> None:
         plan(csm[:, :4, :4], noise_psd[:, :4], dims=(2, 2), settings=PAPER, cov=0.1)
     for arguments in (
         {"snr": 0.0},
+        {"snr": np.inf},
+        {"snr": np.nan},
+        {"snr": 1.0, "motion": np.full((2, 2), np.nan)},
         {"snr": 1.0, "noise_psd": np.zeros(6)},
         {"snr": 1.0, "noise_psd": np.ones(5)},
         {"snr": 1.0, "motion": np.eye(3)},

@@ -145,7 +145,11 @@ def plan(
     snr: Annotated[
         float,
         typer.Option(
-            "--snr", metavar="RATIO", min=1e-6, help="Motion over noise, as ratio of PSDs."
+            "--snr",
+            metavar="RATIO",
+            min=1e-6,
+            max=1e9,
+            help="Motion over noise, as ratio of PSDs.",
         ),
     ] = 1000.0,
     cov: Annotated[
