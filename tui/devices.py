@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 import tomllib
@@ -184,6 +185,16 @@ def _check_faults(bench: Bench, script: object, source: str) -> None:
         raise BenchFileError("\n".join(f"{source}: {line}" for line in lines)) from error
 
 
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C while the context lasts: what has been started is ended."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def serve_devices(
     path: Path,
     *,
@@ -193,12 +204,12 @@ def serve_devices(
     out: Path | None,
     json: str | None,
 ) -> None:
-    """Serve a bench's devices until interrupted, and tell how to reach them."""
+    """Serve a bench's devices until SIGINT or SIGTERM, and tell how to reach them."""
     bench = load(path)
     if faults is not None:
         bench = with_faults(bench, faults)
     speed = bench.speed if speed is None else speed
-    with simulated(bench, speed=speed, log=log) as reachable:
+    with _terminated_as_interrupted(), simulated(bench, speed=speed, log=log) as reachable:
         text = dump(reachable)
         if out is not None:
             out.write_text(text, encoding="utf-8")
