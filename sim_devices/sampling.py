@@ -22,6 +22,9 @@ AHEAD = 1.0
 class Samples:
     """Samples of sensors that one clock takes, by index, their channels side by side.
 
+    Times and counts are held apart: a device that buffers looks at the time of the samples it takes
+    and at the counts of those it gives.
+
     Parameters
     ----------
     source
@@ -34,7 +37,7 @@ class Samples:
         self._source = source
         self._sensors = tuple(sensors)
         self._length = max(16, math.ceil(AHEAD * source.sampling_rate))
-        self._first = 0
+        self._first_time = self._first_count = 0
         self._times: FloatArray = np.empty(0)
         self._counts: NDArray[np.float64] = np.empty((0, 0))
 
@@ -49,33 +52,38 @@ class Samples:
 
     def time(self, index: int) -> float:
         """World time at which a sample is taken, s."""
-        self._hold(index)
-        return float(self._times[index - self._first])
+        self._hold_times(index)
+        return float(self._times[index - self._first_time])
 
     def end_before(self, now: float, start: int) -> int:
         """Index after the last sample, from ``start`` on, that has been taken by ``now``."""
-        self._hold(start)
+        self._hold_times(start)
         if self._times[-1] <= now:  # not stretch by stretch: nobody may have asked for hours
-            self._hold(self.first_after(now))
-        return self._first + int(np.searchsorted(self._times, now, side="right"))
+            self._hold_times(self.first_after(now))
+        return self._first_time + int(np.searchsorted(self._times, now, side="right"))
 
     def counts(self, first: int, n: int) -> NDArray[np.float64]:
         """Return samples in counts, neither rounded nor clipped, shape (n, n_channels)."""
         pieces: list[NDArray[np.float64]] = []
         while n > 0:
-            self._hold(first)
-            row = first - self._first
+            self._hold_counts(first)
+            row = first - self._first_count
             pieces.append(self._counts[row : row + n])
             first += len(pieces[-1])
             n -= len(pieces[-1])
         return np.concatenate(pieces) if pieces else self._counts[:0]
 
-    def _hold(self, index: int) -> None:
+    def _hold_times(self, index: int) -> None:
+        """Work out the times of the stretch that holds a sample."""
+        if not 0 <= index - self._first_time < len(self._times):
+            self._first_time = index // self._length * self._length
+            self._times = self._source.times(self._sensors[0], self._first_time, self._length)
+
+    def _hold_counts(self, index: int) -> None:
         """Simulate the stretch that holds a sample."""
-        if not self._first <= index < self._first + len(self._times):
-            self._first = index // self._length * self._length
-            self._times = self._source.times(self._sensors[0], self._first, self._length)
-            columns = [self._source.counts(s, self._first, self._length) for s in self._sensors]
+        if not 0 <= index - self._first_count < len(self._counts):
+            first = self._first_count = index // self._length * self._length
+            columns = [self._source.counts(s, first, self._length) for s in self._sensors]
             self._counts = np.concatenate(columns, axis=1)
 
 

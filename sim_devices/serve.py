@@ -65,7 +65,10 @@ FAMILIES = {
 """Driver name → ``module:function`` that makes its simulated device."""
 
 LEAST_INTERVAL = 0.004
-"""Least time between two sends of one line, s: what is due in between goes together."""
+"""Least time between two sends of one line, s: what is due in between goes together.
+
+Not between two answers: who asks is not held up.
+"""
 
 
 class Served:
@@ -105,6 +108,7 @@ class Served:
 
     def received(self, received: bytes) -> None:
         """Bytes came."""
+        self._last = 0.0
         self._send(self._endpoint.receive(received, self._clock.now()))
         self._schedule()
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import rtu
-from daq.protocols.fifo import MAX_WORDS, RATE_REGISTER, FifoDecoder
+from daq.protocols.fifo import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.protocols.rtu import ReplyFinder
 from daq.transport import open_port
 
@@ -34,16 +35,19 @@ if TYPE_CHECKING:
     from daq.transport import ByteStream
 
 ATTEMPTS = 3
+HIGHEST_RATE = 65_535
 MOST_UNANSWERED = 5
 """Reads without a reply, one after the other, after which the device is gone."""
 STALLED = 2.0
 """Without a sample for so long, in s, the device has stopped."""
+NOT_LESS = 3.0
+"""While as many words wait for so long, in s, the FIFO fills as fast as it is read."""
 
 
 class FifoSettings(BaseModel):
     """``[sensors.settings]`` of a device with a block FIFO."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: PositiveInt = 3_000_000
     parity: Literal["N", "E", "O"] = "N"
@@ -82,6 +86,7 @@ class FifoSession:
         """Read the FIFO and yield its blocks."""
         loop = asyncio.get_running_loop()
         unanswered, fed = 0, loop.time()
+        least, lessened = math.inf, loop.time()
         while True:
             items, answered = await self._once()
             for item in items:
@@ -94,6 +99,14 @@ class FifoSession:
             elif loop.time() - fed > STALLED:
                 raise NoAnswerError(
                     f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
+                )
+            if self._decoder.started or self._decoder.level < least:
+                least, lessened = self._decoder.level, loop.time()
+            elif loop.time() - lessened > NOT_LESS:
+                raise NoAnswerError(
+                    f"{self._stream.label}: the FIFO is never read up, {self._decoder.level} words"
+                    " wait: the link is too slow for the sampling rate (a higher"
+                    " settings.baud_rate on both ends, or a lower rate)"
                 )
             if self._decoder.level < MAX_WORDS:
                 await asyncio.sleep(self._settings.poll_interval)
@@ -126,21 +139,14 @@ class FifoDriver:
         """Return int16."""
         return np.dtype(np.int16)
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _checked(sensors)
+
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
         """Open the port, see that the device answers, and set its sampling rate."""
-        sensor = sensors[0]
-        settings = FifoSettings.model_validate(sensor.settings)
-        if len(sensors) > 1:
-            names = ", ".join(repr(other.name) for other in sensors)
-            raise BenchFileError(
-                f"port {sensor.port} is given to {names}; reading one FIFO takes all of a line"
-            )
-        if settings.set_rate and not 1 <= sensor.sampling_rate == round(sensor.sampling_rate):
-            raise BenchFileError(
-                f"sensor {sensor.name!r}: sampling_rate = {sensor.sampling_rate:g}; expected whole"
-                " Hz, as the device's register holds (or settings.set_rate = false)"
-            )
+        sensor, settings = _checked(sensors)
         async with open_port(
             sensor.port,
             clock,
@@ -164,6 +170,37 @@ class FifoDriver:
                 details={"unit": str(settings.unit), "header": settings.header},
             )
             yield FifoSession(stream, settings, decoder, information=information, clock=clock)
+
+
+def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
+    """Return the sensor and its settings; raise BenchFileError for what cannot be."""
+    sensor = sensors[0]
+    settings = FifoSettings.model_validate(sensor.settings)
+    if len(sensors) > 1:
+        names = ", ".join(repr(other.name) for other in sensors)
+        raise BenchFileError(
+            f"port {sensor.port} is given to {names}; reading one FIFO takes all of a line"
+        )
+    who, rate = f"sensor {sensor.name!r}", sensor.sampling_rate
+    if settings.set_rate and not 1 <= rate == round(rate) <= HIGHEST_RATE:
+        raise BenchFileError(
+            f"{who}: sampling_rate = {rate:g}; expected whole Hz up to {HIGHEST_RATE}, as the"
+            " device's register holds (or settings.set_rate = false)"
+        )
+    n_channels = len(sensor.channels)
+    samples_a_read = MAX_WORDS // n_channels
+    if not samples_a_read:
+        raise BenchFileError(
+            f"{who}: {n_channels} channels; a read takes {MAX_WORDS} words at most"
+        )
+    bytes_a_sample = 2 * n_channels + READ_OVERHEAD / samples_a_read
+    needed = math.ceil(rate * bytes_a_sample * (10 if settings.parity == "N" else 11))
+    if needed > settings.baud_rate:
+        raise BenchFileError(
+            f"{who}: {rate:g} Hz of {n_channels} channels need {needed} baud;"
+            f" settings.baud_rate = {settings.baud_rate} (or a lower rate)"
+        )
+    return sensor, settings
 
 
 async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:

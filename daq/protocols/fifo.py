@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 RATE_REGISTER = 0x01
 FIFO_REGISTER = 0x02
 MAX_WORDS = 123
+READ_OVERHEAD = 15
+"""Bytes on the line for each read but for its words: the request, and of the reply the rest."""
 BLOCK_SAMPLES = 1024
 """A block is handed over when the FIFO is read up, or when it has grown to this."""
 
@@ -95,6 +97,11 @@ class FifoDecoder:
         self._reason = ""
         self.level = 0
         """Words known to wait."""
+
+    @property
+    def started(self) -> bool:
+        """Whether the FIFO has been read up once, so that what comes is recorded."""
+        return self._started
 
     @property
     def waiting(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +12,15 @@ import pytest
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols import rtu
 from daq.protocols.block import Block, BlockFlag, Event
+from daq.transport import open_port
 from sim_devices import launch
+from sim_devices.device import Source
+from sim_devices.faults import LineFaults
+from sim_devices.fifo import create
+from sim_devices.pacing import WorldClock
+from sim_devices.serve import Served, device_spec
 from tests.drivers.reading import reading
 from tests.sim_devices.bench import device, scenario, sensors, spec
 
@@ -21,6 +29,7 @@ if TYPE_CHECKING:
 
     from daq.bench import Sensor
     from sim_devices.launch import RunningDevice
+    from sim_devices.scenario import Scenario
 
 RATE = 2000.0
 COUNTS = 100_000.0
@@ -28,8 +37,8 @@ DRIVER = driver_type("fifo")
 CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]
 
 
-def table(name: str, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
-    return device(name, "fifo", channels={name: CHANNELS}, sampling_rate=RATE, **changes)
+def table(name: str, *, rate: float = RATE, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
+    return device(name, "fifo", channels={name: CHANNELS}, sampling_rate=rate, **changes)
 
 
 TABLES = [
@@ -85,14 +94,58 @@ async def test_the_fifo_is_read_as_fast_as_it_fills(
     counts = np.concatenate([b.counts for b in blocks])[:1500]
     assert counts.dtype == np.int16
     assert counts.std(axis=0) == pytest.approx(np.full(3, COUNTS * 0.03), rel=0.3)
-    truth = scenario("AB", sampling_rate=RATE)
-    name = "AB"[index]
-    elapsed = round((blocks[0].received.monotonic_ns - SPEC["epoch_ns"]) * 1e-9 * RATE)
+    assert_felt(scenario("AB", sampling_rate=RATE), "AB"[index], blocks, SPEC)
+
+
+def assert_felt(
+    truth: Scenario, name: str, blocks: list[Block], world: dict[str, Any], n: int = 1500
+) -> None:
+    """See that counts are what the sensor felt, one after the other."""
+    rate = world["devices"][0]["sampling_rate"]
+    counts = np.concatenate([b.counts for b in blocks])[:n]
+    elapsed = round((blocks[0].received.monotonic_ns - world["epoch_ns"]) * 1e-9 * rate)
     first = max(0, elapsed - 6000)
-    world = truth.samples(name, first, elapsed - first + 200) * COUNTS
-    start = int(np.abs(world - counts[0]).max(axis=1).argmin())
-    expected = truth.samples(name, first + start, 1500) * COUNTS
+    felt = truth.samples(name, first, elapsed - first + 200) * COUNTS
+    start = int(np.abs(felt - counts[0]).max(axis=1).argmin())
+    expected = truth.samples(name, first + start, n) * COUNTS
     assert np.abs(expected - counts).max() <= 0.5
+
+
+async def test_at_the_rate_it_leaves_the_factory_with_every_sample_comes() -> None:
+    """7812 Hz of three channels: 191 reads a second."""
+    one = table("A", rate=7812.0, settings={"capacity": 65_535})
+    world = spec(one, sampling_rate=7812.0, age=0.0)
+    with launch.start(world) as (running,):
+        blocks, events = await record(sensors(running, one)[0], 4000)
+    assert not events
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    assert_felt(scenario("A", sampling_rate=7812.0), "A", blocks, world, 4000)
+
+
+async def test_who_asks_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However rarely a device sends what is due."""
+    monkeypatch.setattr("sim_devices.serve.LEAST_INTERVAL", 1e3)
+    described = device_spec(table("A"))
+    (line,) = create(described, Source(scenario("A", sampling_rate=RATE), described))
+    clock = WorldClock(time.monotonic_ns())
+    served = Served(line, clock, LineFaults((), "A", begin=0.0), lambda *_: None)
+    await served.wire.open()
+    async with asyncio.timeout(10), open_port(served.wire.address, SystemClock()) as stream:
+        for _ in range(3):
+            await stream.write(rtu.read_request(1, 2, 1))
+            assert (await stream.read())[0]
+    await served.close()
+
+
+async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daq.drivers.fifo.NOT_LESS", 0.4)
+    one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
+    with launch.start(spec(one, sampling_rate=RATE)) as (running,):
+        slow = sensors(running, one, settings={})[0]
+        with pytest.raises(
+            NoAnswerError, match=r"never read up, 58\d\d words wait: the link is too"
+        ):
+            await record(slow, 1)
 
 
 async def test_an_overflow_is_told_and_the_gap_estimated(

@@ -41,7 +41,7 @@ async def test_our_driver_reads_a_fifo_of_libmodbus(
             driver="fifo",
             port=ours,
             sampling_rate=RATE,
-            settings={"header": header, "baud_rate": 115200},
+            settings={"header": header, "baud_rate": 230400},
             channels=tuple(Channel(name=name, sensitivity=835.35) for name in "xyz"),
         )
         blocks, events = await record(driver_type("fifo"), sensor, 3000)

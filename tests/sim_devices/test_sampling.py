@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from sim_devices.guralp import create as create_guralp
 from sim_devices.sampling import Samples
 from sim_devices.serve import device_spec
 from tests.sim_devices.bench import device, scenario
+
+if TYPE_CHECKING:
+    import pytest
+    from numpy.typing import NDArray
 
 RATE = 200.0
 
@@ -38,6 +43,24 @@ def test_a_fifo_nobody_read_for_a_day_answers_at_once() -> None:
     (reply,) = unit.due(86_401.0)
     assert time.process_time() - began < 2.0
     assert int.from_bytes(reply[3:5], "big") == 3000
+
+
+def test_a_fifo_that_lags_simulates_each_second_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it reads is two seconds older than what it takes."""
+    made: list[int] = []
+    counts = Source.counts
+
+    def counting(self: Source, sensor: str, first: int, n: int) -> NDArray[np.float64]:
+        made.append(first)
+        return counts(self, sensor, first, n)
+
+    monkeypatch.setattr(Source, "counts", counting)
+    spec = device_spec(device("A", "fifo", sampling_rate=RATE))
+    unit = FifoDevice(spec, Source(scenario("A"), spec))
+    for k in range(40):
+        unit.receive(rtu.read_request(1, 2, 1 + 30), 2.0 + k * 0.05)
+        assert unit.due(2.04 + k * 0.05)
+    assert len(made) == len(set(made))
 
 
 def test_a_scream_server_whose_client_is_gone_rests() -> None:
