@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from estimator.spectra import CrossSpectra
 from sim_devices import scenarios
@@ -27,9 +29,6 @@ from tui.numerical_studies import (
 )
 from tui.reproduce import STUDIES, reproduce, run
 from tui.studies import Panel, Point, Series, Study
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 QUICK = 0.05
 """Share of the paper's length: 54 and 180 segments."""
@@ -195,6 +194,27 @@ def test_the_command_line_refuses_an_unknown_study() -> None:
     )
     assert said.returncode == 2
     assert "no study 'fig6'" in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ({"json": "nowhere/points.json"}, "there is no folder"),
+        ({"out": "a_file"}, "expected a folder"),
+        ({"out": "a_file/figures"}, "expected a folder"),
+    ],
+)
+def test_places_are_checked_before_anything_is_simulated(
+    place: dict[str, str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_file").touch()
+    monkeypatch.setattr(
+        "tui.reproduce._studies", lambda *_: (pytest.fail("simulated") for _ in ".")
+    )
+    out = Path(place["out"]) if "out" in place else tmp_path / "figures"
+    with pytest.raises(typer.BadParameter, match=said):
+        run(["fig4"], out=out, json=place.get("json"))
 
 
 def test_naming_a_study_loads_no_matplotlib() -> None:

@@ -54,19 +54,23 @@ def for_people(json_file: str | None, csv_file: str | None = None) -> Console:
 
 
 def check_places(*files: str | None) -> None:
-    """Refuse, before anything is measured, files for which there is no folder.
+    """Refuse, before anything is measured, files that could not be written.
 
     Raises
     ------
     typer.BadParameter
-        With the folder.
+        If one has no folder or is one, or two results are to go to standard output.
     """
+    if files.count(STANDARD_OUTPUT) > 1:
+        raise typer.BadParameter("- is standard output, which takes one result; name a file")
     for file in files:
         if file in {None, STANDARD_OUTPUT}:
             continue
         folder = Path(str(file)).absolute().parent
         if not folder.is_dir():
             raise typer.BadParameter(f"{file}: there is no folder {folder}; make it first")
+        if Path(str(file)).is_dir():
+            raise typer.BadParameter(f"{file}: a folder; expected the name of a file")
 
 
 def write_text(file: str, text: str, *, append: bool = False) -> None:

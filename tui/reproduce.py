@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
 from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -14,7 +15,7 @@ from sim_devices.errors import ScenarioError
 from tui.clock_study import clocks
 from tui.laboratory import LABORATORY, Laboratory
 from tui.numerical_studies import NUMERICAL, Ingredients
-from tui.output import for_people, progress, write_json
+from tui.output import check_places, for_people, progress, write_json
 from tui.studies import TOLERANCE
 
 if TYPE_CHECKING:
@@ -86,17 +87,29 @@ def run(
         File for every point, or ``-``.
     length
         Share of the paper's length to simulate.
+
+    Raises
+    ------
+    typer.BadParameter
+        If there is no place for figures or points, before anything is simulated.
     """
+    check_places(json)
     folder = DEFAULT_FOLDER if out is None else out
     started = time.monotonic()
     studies: list[Study] = []
     files: list[Path] = []
     with _Progress() as told:
-        for study in reproduce(names, told=told, length=length):
+        wanted = reproduce(names, told=told, length=length)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise typer.BadParameter(
+                f"--out {folder}: {error.strerror}; expected a folder"
+            ) from None
+        for study in wanted:
             from tui.study_figures import save  # noqa: PLC0415 - matplotlib takes a second
 
             told(f"{study.name}: figure", 1.0)
-            folder.mkdir(parents=True, exist_ok=True)
             files += save(study, folder)
             studies.append(study)
     elapsed = time.monotonic() - started

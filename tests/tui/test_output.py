@@ -71,6 +71,21 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(
 
 
 @pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--json", "-", "--csv", "-"), "which takes one result"),
+        (("--json", "."), "expected the name of a file"),
+    ],
+)
+def test_places_that_cannot_take_a_result_are_told_before_anything_is_measured(
+    options: tuple[str, ...], said: str
+) -> None:
+    result = CliRunner().invoke(app, ["estimate", "nothing.h5", *options])
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+@pytest.mark.parametrize(
     ("source", "said"),
     [
         ("arrays.npz", "huddle import arrays.npz --out arrays.h5"),
