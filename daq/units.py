@@ -28,16 +28,22 @@ _MOTION = {
     "µm": (0, 1e-6),
     "nm": (0, 1e-9),
 }
+_SPELLINGS = {
+    **{unit: unit for unit in ("m/s²", "m/s", "m")},
+    **{unit.replace("µ", "u"): unit for unit in _MOTION if "µ" in unit},
+    "gal": "Gal",
+    "cm/s²": "Gal",
+}
+"""By what they are in small letters, where those cannot be mistaken."""
 
 
 def canonical(unit: str) -> str:
-    """Return the unit as this program spells it: ``m/s**2`` and ``M/S^2`` are ``m/s²``."""
+    """Return the unit as this program spells it: ``M/S^2`` is ``m/s²``, ``ug`` is ``µg``."""
     spelled = unit.strip().replace("**2", "²").replace("^2", "²").replace("s2", "s²")
     spelled = spelled.replace("S**2", "²").replace("S2", "S²").replace("μ", "µ")
     if spelled in _MOTION:
         return spelled
-    lower = spelled.lower()
-    return lower if lower in {"m/s²", "m/s", "m"} else spelled
+    return _SPELLINGS.get(spelled.lower(), spelled)
 
 
 def conversion(unit: str, wanted: str, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -12,6 +12,7 @@ import pytest
 
 from daq.errors import CannotAlignError, WrongSettingError
 from daq.estimation import Estimation, Settings, estimate
+from daq.units import canonical
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra import CrossSpectra, WelchSettings
@@ -230,6 +231,8 @@ def test_velocity_becomes_acceleration_by_omega_and_responses_are_taken_out(
     velocity = estimate([path], SETTINGS)
     acceleration = estimate([path], replace(SETTINGS, unit="m/s**2"))
     assert (velocity.unit, acceleration.unit) == ("m/s", "m/s²")
+    for spelled, unit in {"ug": "µg", "GAL": "Gal", "cm/s^2": "Gal", "um/s": "µm/s"}.items():
+        assert canonical(spelled) == unit
     omega = 2 * np.pi * velocity.frequency[1:, None]
     np.testing.assert_allclose(
         acceleration.data_psd[1:], velocity.data_psd[1:] * omega**2, rtol=1e-9
