@@ -47,6 +47,8 @@ WINDOWS = (
     "parzen",
     "triang",
 )
+PARAMETRIC_WINDOWS = ("chebwin", "dpss", "gaussian", "general_hamming", "kaiser", "tukey")
+"""Of one parameter each, as in ``kaiser,8``."""
 
 
 def _name(value: str) -> str:
@@ -62,7 +64,16 @@ def _method(value: str) -> str:
 
 
 def _window(value: str) -> str:
-    return _one_of(value, WINDOWS)
+    name, _, parameter = value.partition(",")
+    if name not in PARAMETRIC_WINDOWS:
+        return _one_of(value, WINDOWS)
+    try:
+        positive = 0 < float(parameter) < math.inf
+    except ValueError:
+        positive = False
+    if not positive:
+        raise ValueError(f"expected its parameter as well, above 0, as in {name},0.5")
+    return value
 
 
 def _one_of(value: str, known: tuple[str, ...]) -> str:

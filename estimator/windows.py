@@ -20,8 +20,8 @@ def get_window(window: Window, length: int) -> FloatArray:
     Parameters
     ----------
     window : str, tuple or float64 array of shape (length,)
-        ``"hann"``, ``"rectangular"``, anything ``scipy.signal.get_window`` knows, or the
-        samples of the window themselves.
+        ``"hann"``, ``"rectangular"``, anything ``scipy.signal.get_window`` knows, with
+        parameters as in ``"kaiser,8"`` or ``("kaiser", 8.0)``, or the samples themselves.
     length : int
         Number of samples.
 
@@ -44,7 +44,11 @@ def get_window(window: Window, length: int) -> FloatArray:
         from scipy import signal  # noqa: PLC0415 - takes a second to import; Hann needs none of it
 
         try:
-            taps = np.asarray(signal.get_window(window, length), dtype=np.float64)  # type: ignore[arg-type]  # any name; unknown ones raise below
+            known: str | tuple[str | float, ...] = window
+            if isinstance(window, str) and "," in window:
+                name, *parameters = window.split(",")
+                known = (name, *map(float, parameters))
+            taps = np.asarray(signal.get_window(known, length), dtype=np.float64)  # type: ignore[arg-type]  # any name; unknown ones raise below
         except (ValueError, TypeError) as error:
             raise EstimatorError(f"window {window!r}: {error}") from error
     else:

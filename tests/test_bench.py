@@ -145,6 +145,7 @@ psd = [[1, 2], [3, 4]]
             'sensors["d"].port = "": expected a port, such as /dev/ttyUSB0',
         ),
         ('[estimate]\nwindow = "han"\n', "(did you mean 'hann'?)"),
+        ('[estimate]\nwindow = "kaiser"\n', "its parameter as well, above 0, as in kaiser,0.5"),
         ('[estimate]\nmethod = "three_sensor"\n', "(did you mean 'three-sensor'?)"),
         (
             '[estimate]\nsegmnt = "1s"\n',

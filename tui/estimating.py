@@ -12,9 +12,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
 from daq.bench import parse_duration
+from daq.durations import format_duration
 from daq.estimation import Settings, estimate
 from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
+from estimator.factor_analysis import max_factors
 from estimator.windows import get_window
 from tui.diagnosis import details, summary
 from tui.limits import exceeded
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from daq.recording.reader import SensorRecord
 
 LIMIT_NOT_MET = 1
+_FEWEST_SAMPLES = 4  # of a segment: one frequency between 0 and half the rate
 
 
 def estimate_recordings(
@@ -68,7 +71,7 @@ def estimated(
     with Recording.open(files[0]) as recording:
         bench = recording.bench
         settings = chosen(Settings.of(bench), **wanted)
-        check_gains(settings, recording.sensors)
+        check_fit(settings, recording.sensors)
         settings = replace(
             settings,
             start=_instant(start, recording.created),
@@ -105,9 +108,10 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
     settings = replace(settings, **changes)
     try:
         get_window(settings.window, 16)
-    except EstimatorError:
+    except EstimatorError as error:
         raise typer.BadParameter(
-            f"--window {settings.window!r}: scipy.signal.get_window knows none of this name"
+            f"--{error}; expected one of scipy.signal.get_window, as in hann or, with a parameter,"
+            " kaiser,8"
         ) from None
     for option, needed in (("dimension", "maximum-likelihood"), ("gains", "two-channel")):
         if option not in changes or {needed, "all"} & set(settings.methods):
@@ -119,14 +123,36 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
     return settings
 
 
-def check_gains(settings: Settings, sensors: Sequence[Sensor | SensorRecord]) -> None:
-    """Refuse gains of what is not there.
+def check_fit(settings: Settings, sensors: Sequence[Sensor | SensorRecord]) -> None:
+    """Refuse gains, a dimension and segments that are not for these sensors.
 
     Raises
     ------
     typer.BadParameter
-        With the names of the sensors.
+        With what would be.
     """
+    taking_part = [
+        (sensor, n_channels)
+        for sensor in sensors
+        if (n_channels := sum(not channel.auxiliary for channel in sensor.channels))
+    ]
+    if not taking_part:  # which is told with the file's name
+        return
+    rate = min(sensor.sampling_rate for sensor, _ in taking_part)
+    if round(settings.segment * rate) < _FEWEST_SAMPLES:
+        raise typer.BadParameter(
+            f"--segment {format_duration(settings.segment)}: expected at least"
+            f" {format_duration(_FEWEST_SAMPLES / rate)}, {_FEWEST_SAMPLES} samples at"
+            f" {rate:g} Hz"
+        )
+    n_channels = sum(n for _, n in taking_part)
+    most = max_factors(n_channels)
+    by_factors = {"maximum-likelihood", "all"} & set(settings.methods)
+    if by_factors and isinstance(settings.dimension, int) and settings.dimension > most:
+        raise typer.BadParameter(
+            f"--dimension {settings.dimension}: expected at most {most}: more cannot be told from"
+            f" the noise of {n_channels} channels"
+        )
     known = {sensor.name for sensor in sensors}
     known |= {f"{sensor.name}.{channel.name}" for sensor in sensors for channel in sensor.channels}
     for name, gain in settings.gains.items():

@@ -11,6 +11,8 @@ import typer
 
 from daq.durations import parse_duration
 
+_MOST_DIGITS = 3  # of a dimension: no bench has a thousand channels
+
 
 class Method(StrEnum):
     """Self-noise methods, and all of them."""
@@ -50,7 +52,7 @@ def factors(value: str | None) -> int | str | None:
     """Read how many factors the common motion has: a number, or ``auto``."""
     if value is None or value == "auto":
         return value
-    if value.isdecimal():
+    if value.isdecimal() and len(value) <= _MOST_DIGITS:
         return int(value)
     raise typer.BadParameter(f"--dimension {value!r}: expected a number such as 3, or auto")
 
@@ -72,9 +74,11 @@ def gains(values: list[str] | None) -> dict[str, float] | None:
     """Read gains such as ``B=1.02`` or ``B.X=1.02``."""
     if not values:
         return None
-    found = {}
+    found: dict[str, float] = {}
     for value in values:
         name, _, number = value.rpartition("=")
+        if name in found:
+            raise typer.BadParameter(f"--gain {value!r}: {name} has {found[name]:g} already")
         try:
             found[name] = float(number)
         except ValueError:
@@ -144,7 +148,12 @@ OverlapOption: TypeAlias = Annotated[
     ),
 ]
 WindowOption: TypeAlias = Annotated[
-    str | None, typer.Option("--window", metavar="NAME", help="Any window of scipy, as in hann.")
+    str | None,
+    typer.Option(
+        "--window",
+        metavar="NAME",
+        help="Any window of scipy: hann, or with a parameter as in kaiser,8.",
+    ),
 ]
 DetrendOption: TypeAlias = Annotated[
     Detrend | None,

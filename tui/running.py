@@ -18,7 +18,7 @@ from daq.errors import HuddleError
 from daq.estimation import Estimation, Settings
 from daq.recorder import recording_path
 from daq.recording.healing import heal, write_results
-from tui.estimating import LIMIT_NOT_MET, check_gains, chosen, show_result
+from tui.estimating import LIMIT_NOT_MET, check_fit, chosen, show_result
 from tui.output import check_places, for_people, notices, progress
 from tui.patience import patience
 from tui.recorder_process import RecorderProcess
@@ -66,7 +66,7 @@ def run_test(
     """
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
-    check_gains(settings, bench.sensors)
+    check_fit(settings, bench.sensors)
     check_places(json, csv)
     if until_cov is not None:
         settings = replace(settings, target_cov=until_cov)

@@ -24,9 +24,13 @@ def test_rectangular_is_boxcar_and_samples_pass_through() -> None:
     np.testing.assert_array_equal(
         get_window(("kaiser", 8.0), 9), signal.get_window(("kaiser", 8.0), 9)
     )
+    np.testing.assert_array_equal(get_window("kaiser,8", 9), get_window(("kaiser", 8.0), 9))
 
 
-@pytest.mark.parametrize("window", ["hat", np.ones(3), np.zeros(4), np.array([1, np.nan, 1, 1])])
+@pytest.mark.parametrize(
+    "window",
+    ["hat", "kaiser", "kaiser,x", "hann,1", np.ones(3), np.zeros(4), np.array([1, np.nan, 1, 1])],
+)
 def test_a_window_that_is_none_is_refused(window: str | np.ndarray) -> None:
     with pytest.raises(EstimatorError, match="window"):
         get_window(window, 4)

@@ -11,7 +11,9 @@ import typer
 
 from daq.bench import parse
 from daq.estimation import Settings, estimate
-from tui.estimating import chosen
+from estimator.spectra import WelchSettings
+from tui.estimating import check_fit, chosen
+from tui.options import factors, gains
 from tui.simulate import simulate_recording
 
 if TYPE_CHECKING:
@@ -62,6 +64,43 @@ def test_options_go_before_the_bench_file() -> None:
     assert chosen(plain, dimension=2).methods == ("maximum-likelihood",)
     with pytest.raises(typer.BadParameter, match="maximum-likelihood"):
         chosen(settings, method="three-sensor", dimension=2)
+
+
+def test_a_window_may_have_a_parameter_and_one_that_lacks_it_is_told_so() -> None:
+    settings = chosen(Settings(), window="kaiser,8")
+    spectra = WelchSettings(100.0, 64, window=settings.window)
+    assert spectra.window == "kaiser,8"
+    said = "--window 'kaiser': 'kaiser' must have parameters.*kaiser,8"
+    for wrong, why in {"kaiser": said, "hann,1": "does not allow", "kaiser,x": "float"}.items():
+        with pytest.raises(typer.BadParameter, match=why):
+            chosen(Settings(), window=wrong)
+
+
+def test_what_the_sensors_do_not_allow_is_refused_with_what_they_do() -> None:
+    sensors = bench().sensors  # three triaxial ones at 200 Hz
+    check_fit(Settings(segment=0.02, dimension=7), sensors)
+    for settings, said in (
+        (
+            Settings(segment=0.01),
+            r"--segment 0\.01s: expected at least 0\.02s, 4 samples at 200 Hz",
+        ),
+        (
+            Settings(dimension=7, methods=("all",)),
+            "--dimension 7: expected at most 6: .* 9 channels",
+        ),
+        (Settings(gains={"Z": 1.0}), "--gain Z=1: expected one of the sensors A, B, C"),
+    ):
+        with pytest.raises(typer.BadParameter, match=said):
+            check_fit(settings, sensors)
+
+
+def test_numbers_beyond_reason_and_two_for_one_are_refused() -> None:
+    assert factors("999") == 999
+    with pytest.raises(typer.BadParameter, match="--dimension"):
+        factors("9" * 20)
+    assert gains(["A=1", "A.X=2"]) == {"A": 1.0, "A.X": 2.0}
+    with pytest.raises(typer.BadParameter, match="'A=3': A has 1 already"):
+        gains(["A=1", "A=3"])
 
 
 def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
