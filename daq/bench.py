@@ -70,7 +70,11 @@ def load(path: str | Path) -> Bench:
         reason = error.strerror or error
         raise BenchFileError(f"{source}: cannot be read: {reason}; expected a bench file") from None
     except UnicodeDecodeError as error:
-        raise BenchFileError(f"{source}: byte {error.start} is not UTF-8 text") from None
+        if source.suffix.lower() in {".h5", ".hdf5"}:
+            found = "is a recording"
+        else:
+            found = f"byte {error.start} is not UTF-8 text"
+        raise BenchFileError(f"{source}: {found}; expected a bench file (.toml)") from None
     return parse(text, source)
 
 

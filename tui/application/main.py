@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import typer
 from rich.table import Table
 
 from daq.bench import load
@@ -155,6 +157,8 @@ def open_application(source: Path, *, method: str | None) -> None:
     ------
     BenchFileError
         It is neither, or a bench file with faults.
+    typer.BadParameter
+        There is no terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
         open_recording(source, method=method)
@@ -186,6 +190,11 @@ def open_bench(path: Path, *, methods: tuple[str, ...] | None = None) -> None:
 
 def _run(app: HuddleApp, *, again: Path) -> None:
     """Run it; say afterwards where a recording lies, and that it goes on."""
+    if not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
+        raise typer.BadParameter(
+            "the application needs a terminal; huddle watch RECORDING and huddle run BENCH do"
+            " without"
+        )
     app.run()
     if app.path is None:
         return
