@@ -58,6 +58,7 @@ _ASLEEP = 0.05  # seconds that a block may come too early before the host must h
 _RATE_OFF = 0.02  # share by which a rate may be off
 _STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
 _LEVEL = 10  # groups over which a slope can be told from jitter
+_FAR = 10.0  # medians of lateness; beyond, it is no longer how latency scatters
 _UTC_JUMP = 0.01  # samples
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
@@ -158,7 +159,8 @@ class ArrivalTimes:
         index = np.concatenate([self._index[-1:], index])
         late = np.concatenate([self._late[-1:], late])
         epoch = np.concatenate([self._epoch[-1:], epoch])
-        kept = _earliest(index, late, epoch, self.sampling_rate)
+        seconds = (index / self.sampling_rate).astype(np.int64)
+        kept = _earliest(seconds, self._level(index, late, epoch), epoch)
         self._index = np.concatenate([self._index[:-1], index[kept]])
         self._late = np.concatenate([self._late[:-1], late[kept]])
         self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
@@ -254,6 +256,34 @@ class ArrivalTimes:
             float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
         ]
 
+    def _level(self, index: IntArray, late: FloatArray, epoch: IntArray) -> FloatArray:
+        """Return lateness without the slope of each epoch where that hides what came early.
+
+        A sensor whose rate is off by per cent would otherwise keep each second's last, or first.
+        """
+        late = late.copy()
+        for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(epoch)) + 1):
+            half = len(rows) // 2
+            if np.ptp(index[rows]) > _LEVEL * self.sampling_rate:
+                rise = late[rows[half:]] - late[rows[: len(rows) - half]]
+                apart = index[rows[half:]] - index[rows[: len(rows) - half]]
+                slope = float(np.median(rise / apart))
+                if abs(slope * self.sampling_rate) > _STEEP:
+                    late[rows] -= slope * index[rows]
+        return late
+
+    def _stretches(self, length: float) -> IntArray:
+        """Return which stretch of `length` samples of its epoch each arrival lies in.
+
+        What is left at the end counts as one if it is half as long, else with the one before: few
+        blocks may all be late.
+        """
+        starts = np.array(self._epoch_starts)
+        last = self._index[np.searchsorted(self._epoch, np.arange(len(starts)), side="right") - 1]
+        whole = np.maximum(np.round((last - starts) / length), 1)
+        number = (self._index - starts[self._epoch]) // length
+        return np.asarray(np.minimum(number, whole[self._epoch] - 1), dtype=np.int64)
+
     def _filtered(
         self,
         sensor: str,
@@ -269,8 +299,9 @@ class ArrivalTimes:
         node = max(_NODE, duration / _MOST_NODES)
         if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
             node, step = max(node, SURELY * beat), 0.0  # the earliest of those is early indeed
-        kept = _earliest(self._index, left, self._epoch, self.sampling_rate * node)
-        begins = np.diff(self._index // (self.sampling_rate * node), prepend=-1.0) != 0
+        group = self._stretches(self.sampling_rate * node)
+        kept = _earliest(group, left, self._epoch)
+        begins = np.diff(group, prepend=-1) != 0
         begins |= np.diff(self._epoch, prepend=-1) != 0
         scatter = _scatter_of_least(left, left[kept], begins)
         index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
@@ -337,14 +368,8 @@ class ArrivalTimes:
         return Clock(tuple(epochs), state)
 
 
-def _earliest(index: IntArray, late: FloatArray, epoch: IntArray, length: float) -> IntArray:
-    """Return, in order, the row of least lateness in every `length` samples of each epoch."""
-    group = (index / length).astype(np.int64)
-    # A sensor whose rate is off by per cent would otherwise keep each group's last, or first.
-    if len(index) > 2 and np.ptp(index) > _LEVEL * length:
-        slope = float(np.polynomial.polynomial.polyfit(index - index[0], late, 1)[1])
-        if abs(slope * length) > _STEEP:
-            late = late - slope * index
+def _earliest(group: IntArray, late: FloatArray, epoch: IntArray) -> IntArray:
+    """Return, in order, the row of least lateness in every group of each epoch."""
     order = np.lexsort((late, group, epoch))
     kept = np.ones(len(order), dtype=bool)
     kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)
@@ -359,6 +384,8 @@ def _scatter_of_least(late: FloatArray, least: FloatArray, begins: BoolArray) ->
     """
     others = max(len(late) - len(least) - 1, 1)  # one more lies on the line that was taken out
     above = late - least[np.cumsum(begins) - 1]
+    if above.any():
+        above = np.minimum(above, _FAR * np.median(above[above > 0]))
     # Known from few, it may be too little by as much.
     return float(above.sum() / others * (1 + 3 / others) * len(least) / len(late))
 

@@ -110,13 +110,44 @@ def test_restarts_begin_anew_and_keep_the_rate() -> None:
     assert np.abs(clock.at(index) - expected).max() < 20e-6
 
 
+def test_a_late_block_that_begins_an_epoch_does_not_pin_it() -> None:
+    # Of the second epoch, that block alone lies before a multiple of ten seconds.
+    rng = np.random.default_rng(5)
+    flags = np.zeros(6000, np.int32)
+    flags[[0, 2099]] = BlockFlag.CLOCK_RESTART
+    taken = last_samples(6000, 18.0)
+    arrivals = taken + rng.exponential(1e-3, 6000)
+    arrivals[2099] += 20e-3
+    clock = solved(block_rows(np.maximum.accumulate(arrivals), flags))
+    error = clock.at(BLOCK * np.arange(1.0, 6001) - 1) - taken
+    assert error[:2099].std() < 5e-6
+    assert error[2099:].std() < 5e-6
+
+
+@pytest.mark.parametrize("n_late", [1, 3, 10])
+def test_a_few_blocks_that_are_seconds_late_tell_nothing_of_the_others(n_late: int) -> None:
+    rng = np.random.default_rng(13)
+    taken = last_samples(6000, 12.0)
+    late = 4e-4 + rng.exponential(1e-3, 6000)
+    usual = solved(block_rows(np.maximum.accumulate(taken + late))).state.residual
+    late[rng.choice(6000, n_late, replace=False)] += rng.uniform(0.5, 3.0, n_late)
+    clock = solved(block_rows(np.maximum.accumulate(taken + late)))
+    error = clock.at(BLOCK * np.arange(1.0, 6001) - 1) - taken
+    assert error.std() < 5e-6
+    assert clock.state.residual < 1.5 * usual
+
+
 def test_a_host_that_slept_does_not_bend_the_clock() -> None:
     rng = np.random.default_rng(6)
-    taken = last_samples(6000, -12.0) + rng.exponential(5e-4, 6000)
-    taken[4000:] -= 37.0  # CLOCK_MONOTONIC stands still in suspend, the device's counter does not
-    clock = solved(block_rows(taken))
+    taken = last_samples(6000, -12.0)
+    arrivals = taken + rng.exponential(5e-4, 6000)
+    arrivals[4000:] -= 37.0  # CLOCK_MONOTONIC stands still in suspend, the device's counter not
+    clock = solved(block_rows(arrivals))
     assert [epoch.first_sample for epoch in clock.epochs] == [0, 80_000]
-    assert clock.state.ppm == pytest.approx(-12.0, abs=0.15)
+    assert clock.state.ppm == pytest.approx(-12.0, abs=0.02)
+    error = clock.at(BLOCK * np.arange(1.0, 6001) - 1) - taken
+    assert error[:4000].std() < 4e-6
+    assert error[4000:].std() < 4e-6
 
 
 def test_utc_stepped_by_ntp_or_a_leap_second_changes_nothing() -> None:
