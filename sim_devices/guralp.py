@@ -24,6 +24,7 @@ from daq.protocols.brp import Transmitter
 from daq.protocols.gcf import SampleBlock, StatusBlock, SystemId
 from daq.protocols.scream import Packet
 from sim_devices.device import NEVER, Line
+from sim_devices.errors import ScenarioError
 from sim_devices.sampling import Samples, whole
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ CLIENT_PATIENCE = 60.0
 HISTORY = 256
 _NS = 1_000_000_000
 _COMPONENTS = "ZNEX1234"
+_ABOVE = sorted(float(rate) for rate, _ in gcf.RATES.values() if rate > 250)
 
 
 def stream_ids(device: DeviceSpec, sensor: str) -> tuple[str, ...]:
@@ -62,7 +64,10 @@ class Digitizer:
         self._rate = Fraction(device.sampling_rate).limit_denominator(1000)
         self._parts = next((parts for rate, parts in gcf.RATES.values() if rate == self._rate), 0)
         if not self._parts:
-            raise ValueError(f"GCF has no code for {device.sampling_rate} Hz")
+            raise ScenarioError(
+                f"sensor {device.sensors[0]!r}: sampling_rate = {device.sampling_rate:g}; GCF has"
+                f" {', '.join(f'{rate:g}' for rate in _ABOVE)} Hz and whole Hz up to 250"
+            )
         self._utc_ns = -(-device.utc_ns // _NS) * _NS  # of sample 0: a whole second
         offset = (self._utc_ns - device.utc_ns) / _NS
         self._samples = Samples(source.disciplined(offset), device.sensors)
@@ -115,7 +120,7 @@ class Digitizer:
         return gcf.encode_block(block, width=self._width)
 
     def _status(self) -> StatusBlock:
-        stream = self._streams[0][:4] + "00"
+        stream = self._streams[0][:-2] + "00"
         start_ns = self._utc_ns + round(self._next * _NS / self._rate) // _NS * _NS
         text = "GPS: 3D fix\r\nClock: locked\r\nMass positions: 0 0 0\r\n"
         return StatusBlock(self._system, stream, start_ns, text)

@@ -24,12 +24,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 
 from daq.drivers.base import DeviceInformation
-from daq.drivers.guralp_links import Connector
+from daq.drivers.guralp_links import open_link
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event
+from daq.protocols.gcf import component, serial_number
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -43,7 +44,10 @@ MARGIN = 3.0
 """Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""
 COMPONENTS = "ZNEX1234"
 
-StreamId = Annotated[str, Field(pattern="^[0-9A-Z]{1,6}$")]
+StreamId = Annotated[
+    str, Field(pattern="^[0-9A-Z]{1,6}$"), AfterValidator(lambda text: text.lstrip("0") or "0")
+]
+"""Without leading zeros, which no block tells."""
 
 
 class GuralpSettings(BaseModel):
@@ -144,13 +148,10 @@ class GuralpDriver:
         names = ", ".join(repr(sensor.name) for sensor in sensors)
         label = f"sensor {names} on {first.port}"
         ids = _configured(sensors)
-        async with contextlib.AsyncExitStack() as stack:
-            connect = Connector(first.port, settings, clock, label)
-            link = await connect(stack, ids or {})
+        async with open_link(first.port, settings, clock, ids, label=label) as link:
             heard: list[Block | Event] = []
-            if ids is None:
-                ids = {first.name: await _discover(link, first, settings, label, heard)}
-                link = connect.again(ids)
+            if not ids[first.name]:
+                await _discover(link, first, settings, label, heard)
             by_name = {sensor.name: sensor for sensor in sensors}
             yield GuralpSession(
                 link,
@@ -161,13 +162,13 @@ class GuralpDriver:
             )
 
 
-def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]] | None:
-    """Return the streams of each sensor; None where the one sensor leaves them to be found."""
+def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
+    """Return the streams of each sensor; of the only one perhaps none, which are to be found."""
     ids: dict[str, tuple[str, ...]] = {}
     for sensor in sensors:
         settings = GuralpSettings.model_validate(sensor.settings)
         if settings.streams is None and len(sensors) == 1:
-            return None
+            return {sensor.name: ()}
         if settings.streams is None or len(settings.streams) != len(sensor.channels):
             raise BenchFileError(
                 f"sensor {sensor.name!r}: settings.streams = {settings.streams};"
@@ -186,7 +187,7 @@ async def _discover(
     settings: GuralpSettings,
     label: str,
     heard: list[Block | Event],
-) -> tuple[str, ...]:
+) -> None:
     """Listen until one digitizer has sent as many streams as the sensor has channels."""
     n_channels = len(sensor.channels)
     with contextlib.suppress(TimeoutError):
@@ -194,18 +195,17 @@ async def _discover(
             while True:
                 found = await link.receive()
                 heard += [
-                    replace(item, sensor=sensor.name)
-                    for item in found
-                    if isinstance(item, Event) and item.kind != "refused"
+                    replace(item, sensor=sensor.name) for item in found if isinstance(item, Event)
                 ]
                 if not link.streams.repeated:
                     continue
                 by_serial: dict[str, list[str]] = {}
                 for stream in link.streams.unknown:
-                    by_serial.setdefault(stream[:4], []).append(stream)
+                    by_serial.setdefault(serial_number(stream), []).append(stream)
                 for streams in by_serial.values():
                     if len(streams) == n_channels:
-                        return tuple(sorted(streams, key=_component))
+                        heard += link.streams.found(sensor.name, sorted(streams, key=_component))
+                        return
     streams_heard = ", ".join(sorted(link.streams.unknown)) or "nothing"
     raise NoAnswerError(
         f"{label}: expected {n_channels} streams of one digitizer, heard {streams_heard} in"
@@ -214,7 +214,7 @@ async def _discover(
 
 
 def _component(stream: str) -> tuple[int, str]:
-    return COMPONENTS.find(stream[4:5]) % (len(COMPONENTS) + 1), stream
+    return COMPONENTS.find(component(stream)) % (len(COMPONENTS) + 1), stream
 
 
 async def _listen(
@@ -255,7 +255,7 @@ def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation
     system = streams.system(sensor.name)
     wanted = GuralpSettings.model_validate(sensor.settings).system_id
     for what, expected, found in (
-        ("serial number", sensor.serial_number, ids[0][:4]),
+        ("serial number", sensor.serial_number, serial_number(ids[0])),
         ("system ID", wanted, system),
     ):
         if expected and expected != found:
@@ -268,7 +268,7 @@ def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation
     return DeviceInformation(
         sensor=sensor.name,
         model="Güralp digitizer",
-        serial_number=ids[0][:4],
+        serial_number=serial_number(ids[0]),
         sampling_rate=rate,
         details={"system ID": system, "streams": ", ".join(ids)},
     )

@@ -11,7 +11,6 @@ import contextlib
 from typing import TYPE_CHECKING, Protocol
 
 from daq.datagrams import open_datagrams
-from daq.errors import DeviceError
 from daq.protocols import scream
 from daq.protocols.block import Block, Event
 from daq.protocols.gcf import BLOCK_SIZE
@@ -19,6 +18,8 @@ from daq.protocols.guralp import ScreamDecoder, SerialDecoder
 from daq.transport import host_and_port, open_port
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from daq.clock import HostClock
     from daq.datagrams import DatagramStream
     from daq.drivers.guralp import GuralpSettings
@@ -148,50 +149,32 @@ async def _packet(reader: asyncio.StreamReader) -> bytes | None:
     return data + await reader.readexactly(size - len(data))
 
 
-class Connector:
-    """Opens the port once, and makes links on it."""
-
-    def __init__(self, port: str, settings: GuralpSettings, clock: HostClock, label: str) -> None:
-        self._port = port
-        self._settings = settings
-        self._clock = clock
-        self._label = label
-        self._bytes: ByteStream | None = None
-        self._datagrams: DatagramStream | None = None
-
-    async def __call__(
-        self, stack: contextlib.AsyncExitStack, ids: dict[str, tuple[str, ...]]
-    ) -> Link:
-        """Open the port for as long as the stack stands; return a link that joins streams."""
-        if self._port.startswith("udp://"):
-            self._datagrams = await stack.enter_async_context(
-                open_datagrams(self._port, self._clock, listen=False, label=self._label)
-            )
-            asking = asyncio.create_task(_keep_asking(self._datagrams), name=self._label)
-            stack.push_async_callback(_stop_asking, asking, self._datagrams)
+@contextlib.asynccontextmanager
+async def open_link(
+    port: str,
+    settings: GuralpSettings,
+    clock: HostClock,
+    ids: dict[str, tuple[str, ...]],
+    *,
+    label: str,
+) -> AsyncIterator[Link]:
+    """Open a port; yield a link that joins the streams of each sensor."""
+    if port.startswith("udp://"):
+        async with open_datagrams(port, clock, listen=False, label=label) as datagrams:
+            host, number = host_and_port(port)
+            recovery = number if settings.recovery_port is None else settings.recovery_port
+            asking = asyncio.create_task(_keep_asking(datagrams), name=label)
+            try:
+                yield _UdpLink(datagrams, ids, clock, (host, recovery) if recovery else None)
+            finally:
+                await _stop_asking(asking, datagrams)
+        return
+    async with open_port(port, clock, label=label, baud_rate=settings.baud_rate) as stream:
+        if settings.link == "scream":
+            await stream.write(scream.TCP_SEND)
+            yield _TcpLink(stream, ids)
         else:
-            self._bytes = await stack.enter_async_context(
-                open_port(
-                    self._port, self._clock, label=self._label, baud_rate=self._settings.baud_rate
-                )
-            )
-            if self._settings.link == "scream":
-                await self._bytes.write(scream.TCP_SEND)
-        return self.again(ids)
-
-    def again(self, ids: dict[str, tuple[str, ...]]) -> Link:
-        """Return a link that joins other streams on the same port."""
-        if self._datagrams is not None:
-            host, number = host_and_port(self._port)
-            recovery = self._settings.recovery_port
-            recovery = number if recovery is None else recovery
-            where = (host, recovery) if recovery else None
-            return _UdpLink(self._datagrams, ids, self._clock, where)
-        if self._bytes is None:
-            raise DeviceError(f"{self._label}: the port is not open")
-        if self._settings.link == "scream":
-            return _TcpLink(self._bytes, ids)
-        return _SerialLink(self._bytes, ids, replies=self._settings.acknowledge)
+            yield _SerialLink(stream, ids, replies=settings.acknowledge)
 
 
 async def _keep_asking(stream: DatagramStream) -> None:

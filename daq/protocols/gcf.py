@@ -141,6 +141,16 @@ def decode_id(number: int) -> str:
     return characters
 
 
+def serial_number(stream_id: str) -> str:
+    """Return the four characters of a stream ID before component and tap; it may lack zeros."""
+    return stream_id[:-2].rjust(4, "0")
+
+
+def component(stream_id: str) -> str:
+    """Return the character of a stream ID before its last."""
+    return stream_id[-2:-1]
+
+
 def encode_system_id(system: SystemId) -> int:
     """Pack a system ID in its form."""
     number = encode_id(system.text)

@@ -11,6 +11,9 @@ column a stream. The sampling clock is disciplined by GPS and stated in every bl
 A hole in a stream is left open while the link may still recover it (``awaiting``), then becomes a
 gap, exact because blocks carry their time. Blocks seen twice are dropped. A device whose time jumps
 by more than an hour has had its clock set: its grid starts anew (``BlockFlag.CLOCK_RESTART``).
+
+A sensor whose streams are still to be found has none at first. Blocks of streams that are nobody's
+are then kept, until :meth:`Streams.found` says whose they are.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.gcf import SampleBlock, StatusBlock
+from daq.protocols.gcf import SampleBlock, StatusBlock, serial_number
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -34,6 +37,8 @@ _NS = 1_000_000_000
 _HOUR_NS = 3600 * _NS
 MAX_PENDING = 64
 """Blocks a stream may be ahead of the others."""
+MOST_KEPT = 1024
+"""Blocks kept while it is not known whose they are."""
 FULL_SCALE_COUNTS = (1 << 23) - 1
 """Of a 24-bit digitizer."""
 
@@ -137,7 +142,7 @@ class _Sensor:
     def take(self, at: HostTime, *, awaiting: bool, reason: str) -> Iterator[Block]:
         """Yield what all streams have; across a hole only if nothing is awaited."""
         streams = self._streams.values()
-        while all(stream.pending for stream in streams):
+        while streams and all(stream.pending for stream in streams):
             start = max(stream.pending[0][0] for stream in streams)
             if awaiting and self._taken_to is not None and start > self._taken_to:
                 return
@@ -184,7 +189,8 @@ class Streams:
     Parameters
     ----------
     sensors : mapping of str to sequence of str
-        For each sensor the stream ID of each channel, in the order of its channels.
+        For each sensor the stream ID of each channel, in the order of its channels; none where they
+        are still to be found.
     """
 
     def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
@@ -192,6 +198,8 @@ class Streams:
         self._sensors = {name: _Sensor(name, stream_ids) for name, stream_ids in ids.items()}
         self._owner = {stream: name for name, streams in ids.items() for stream in streams}
         self._unknown: Counter[str] = Counter()
+        self._kept: deque[tuple[SampleBlock, HostTime]] = deque(maxlen=MOST_KEPT)
+        self._searching = not all(ids.values())
         self._name = only(ids)
         self._lost = "block missing"
 
@@ -235,17 +243,36 @@ class Streams:
             yield from self._status(block, at)
         elif block.stream_id in self._owner:
             yield from self._sensors[self._owner[block.stream_id]].add(block, at)
-        elif block.stream_id in self._unknown:
+        elif block.stream_id in self._unknown or len(self._unknown) < MAX_PENDING:
             self._unknown[block.stream_id] += 1
-        elif len(self._unknown) < MAX_PENDING:
-            self._unknown[block.stream_id] = 1
-            yield Event(self._name, "refused", f"stream {block.stream_id} is of no sensor here", at)
+            if self._searching:
+                self._kept.append((block, at))
+            elif self._unknown[block.stream_id] == 1:
+                yield self._nobodys(block.stream_id, at)
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
 
+    def found(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[Block | Event]:
+        """Give a sensor its streams; yield what has come of them, up to a hole."""
+        ids = tuple(stream_ids)
+        own = self._sensors[sensor] = _Sensor(sensor, ids)
+        self._owner |= dict.fromkeys(ids, sensor)
+        kept, self._searching = list(self._kept), False
+        self._kept.clear()
+        for block, at in kept:
+            if block.stream_id in ids:
+                self._unknown.pop(block.stream_id, None)
+                yield from own.add(block, at)
+                yield from own.take(at, awaiting=True, reason=self._lost)
+        for stream_id in sorted(self._unknown):
+            yield self._nobodys(stream_id, kept[-1][1])
+
+    def _nobodys(self, stream_id: str, at: HostTime) -> Event:
+        return Event(self._name, "refused", f"stream {stream_id} is of no sensor here", at)
+
     def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event]:
-        serial = block.stream_id[:4]
-        owners = {name for stream, name in self._owner.items() if stream[:4] == serial} or {""}
+        serial = serial_number(block.stream_id)
+        owners = {n for stream, n in self._owner.items() if serial_number(stream) == serial} or {""}
         for line in block.text.splitlines():
             text = "".join(c if c.isprintable() else "?" for c in line).strip()
             if text:

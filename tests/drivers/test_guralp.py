@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -12,15 +13,20 @@ import pytest
 from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
+from daq.protocols import scream
 from daq.protocols.block import Block, BlockFlag, Event
-from sim_devices import launch
+from daq.protocols.gcf import SampleBlock, SystemId
+from sim_devices import guralp, launch
+from sim_devices.device import DeviceSpec
+from sim_devices.errors import ScenarioError
 from tests.drivers import reading
 from tests.sim_devices.bench import device, sensors, spec
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Iterator, Sequence
 
     from daq.bench import Sensor
+    from sim_devices.device import Source
     from sim_devices.launch import RunningDevice
 
 SPEED = 8.0
@@ -127,6 +133,12 @@ async def test_what_does_not_fit_is_named(
         await record(sensor(running, 0, **changes), 1)
 
 
+def test_a_rate_that_gcf_has_no_code_for_is_named() -> None:
+    device = DeviceSpec(("A",), "guralp", "pty", 301.0, {})
+    with pytest.raises(ScenarioError, match=r"'A': sampling_rate = 301; GCF has 400, 500, .* 5000"):
+        guralp.create(device, cast("Source", None))
+
+
 async def test_nothing_listens() -> None:
     gone = launch.RunningDevice(("D",), "guralp", "udp://127.0.0.1:9", {}, None)  # type: ignore[arg-type]  # no process
     with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: nothing listens"):
@@ -141,6 +153,53 @@ async def test_a_digitizer_that_vanishes_ends_the_session() -> None:
             with pytest.raises(NotConnectedError, match="the port closed"):
                 async for _ in items:
                     pass
+
+
+@contextlib.asynccontextmanager
+async def sending(streams: Sequence[str], n_blocks: int) -> AsyncIterator[str]:
+    """Yield the port of a Scream server that sends so many blocks of each stream, and no more."""
+    ended = asyncio.Event()
+    tasks: list[asyncio.Task[None] | None] = []
+    begin_ns = 1_700_000_000 * 10**9
+
+    async def send(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        tasks.append(asyncio.current_task())
+        assert await reader.read(1) == scream.TCP_SEND
+        for k in range(n_blocks * len(streams)):
+            number = k // len(streams)
+            counts = np.arange(200, dtype=np.int32) + 200 * number
+            block = SampleBlock(
+                SystemId("SIM"),
+                streams[k % len(streams)],
+                begin_ns + number * 10**9,
+                Fraction(200),
+                counts,
+            )
+            writer.write(scream.encode_packet(scream.Packet(k, "test", block)))
+        await ended.wait()
+        writer.close()
+
+    async with await asyncio.start_server(send, "127.0.0.1", 0) as server:
+        yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        ended.set()
+    await asyncio.gather(*filter(None, tasks))
+
+
+@pytest.mark.parametrize("named", [False, True])
+async def test_nothing_that_comes_while_streams_are_found_is_lost(named: bool) -> None:
+    streams = ["0123Z2", "0123N2", "0123E2"]  # a block tells 123Z2
+    settings = {"link": "scream", "patience": 5.0} | ({"streams": streams} if named else {})
+    async with sending(streams, 2) as port:
+        one = launch.RunningDevice(("C",), "guralp", port, settings, None)  # type: ignore[arg-type]  # no process
+        changes = {"settings": settings, "serial_number": "0123"}
+        async with reading.reading(DRIVER, sensors(one, TABLES[2], **changes)) as items:
+            blocks: list[Block] = []
+            while sum(block.n_samples for block in blocks) < 400:
+                item = await anext(items)
+                assert isinstance(item, Block), item
+                blocks.append(item)
+    counts = np.concatenate([block.counts for block in blocks])
+    assert np.array_equal(counts, np.repeat(np.arange(400)[:, None], 3, axis=1))
 
 
 @contextlib.asynccontextmanager

@@ -46,6 +46,12 @@ def test_identifiers_of_the_guide() -> None:
     assert gcf.decode_id(1) == "1"
 
 
+def test_an_id_tells_serial_number_and_component_without_its_leading_zeros() -> None:
+    for stream in ("DEMOZ2", "0123Z2", "000BZ2"):
+        told = gcf.decode_id(gcf.encode_id(stream))
+        assert (gcf.serial_number(told), gcf.component(told)) == (stream[:4], "Z")
+
+
 def test_header_of_a_real_digitizer() -> None:
     """First bytes of a recording of a DM24 (ObsPy's test file 20160603_1955n.gcf)."""
     header = bytes.fromhex("880450c1 15a0ba00 4bbf1814 066404c8".replace(" ", ""))

@@ -16,6 +16,7 @@ from daq.protocols import brp, gcf, scream
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.gcf import SampleBlock, StatusBlock, SystemId
+from daq.protocols.gcf_streams import Streams
 from daq.protocols.guralp import ScreamDecoder, SerialDecoder
 
 if TYPE_CHECKING:
@@ -231,6 +232,31 @@ def test_status_becomes_events_and_foreign_streams_are_named_once() -> None:
     assert len(events[1].text) == 200
     assert decoder.streams.unknown == {"OTHRZ2"}
     assert decoder.streams.silent == STREAMS
+
+
+def test_streams_that_are_found_have_all_their_blocks_and_others_are_named() -> None:
+    streams = Streams({"A": ()})
+    names = (*STREAMS, "OTHRZ2")
+    sent = [
+        SampleBlock(SYSTEM, name, START_NS + k * 10**9, Fraction(100), np.full(100, k, np.int32))
+        for k in (0, 1, 3, 2)
+        for name in names
+    ]
+    for block in sent[: 3 * len(names)]:
+        assert list(streams.receive(block, AT, awaiting=True)) == []
+    assert streams.repeated
+    found = list(streams.found("A", STREAMS))
+    assert [i.text for i in found if isinstance(i, Event)] == ["stream OTHRZ2 is of no sensor here"]
+    for block in sent[3 * len(names) :]:  # a block that was asked for again
+        found += streams.receive(block, AT, awaiting=True)
+    blocks = [item for item in found if isinstance(item, Block)]
+    assert [(b.first_sample, b.reason) for b in blocks] == [
+        (0, ""),
+        (100, ""),
+        (200, ""),
+        (300, ""),
+    ]
+    assert [b.counts[0, 0] for b in blocks] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("extreme", [8_388_607, -8_388_607])
