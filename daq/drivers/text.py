@@ -15,14 +15,22 @@ import contextlib
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    Strict,
+    field_validator,
+)
 
 from daq.datagrams import open_datagrams
 from daq.drivers.base import DeviceInformation
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.block import Block, Event
 from daq.protocols.text import TextDecoder
-from daq.protocols.text_format import LILY, RASPBERRY_SHAKE, TextFormat
+from daq.protocols.text_format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
 from daq.transport import open_port
 
 if TYPE_CHECKING:
@@ -41,7 +49,7 @@ PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat(
 class TextSettings(BaseModel):
     """``[sensors.settings]`` of a device that sends text."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
     layout: Literal["row", "channel"] | None = None
@@ -52,9 +60,9 @@ class TextSettings(BaseModel):
     suffix: str | None = None
     tag: str | None = None
     """What the first field of a row must be."""
-    columns: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    columns: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Strict(strict=False)] | None = None
     """Field of each channel, counted from 0 (layout "row"); the first ones, if not given."""
-    channel_names: tuple[str, ...] | None = None
+    channel_names: Annotated[tuple[str, ...], Strict(strict=False)] | None = None
     """Name of each channel in the messages (layout "channel"); the channels' own, if not given."""
     time_column: Annotated[int, Field(ge=0)] | None = None
     time_format: str | None = None
@@ -75,14 +83,25 @@ class TextSettings(BaseModel):
     patience: PositiveFloat = 2.0
     """How long nothing may come, s, beyond twice the time between messages."""
 
+    @field_validator("time_format")
+    @classmethod
+    def _readable(cls, value: str | None) -> str | None:
+        if value not in {None, "epoch"} and not is_readable(value):
+            raise ValueError(
+                'expected "epoch", or date and time as Python\'s strptime has them,'
+                ' such as "%Y-%m-%d %H:%M:%S.%f"'
+            )
+        return value
+
     def format_for(self, sensor: Sensor) -> TextFormat:
         """Return the format these settings come to.
 
         Raises
         ------
         BenchFileError
-            There is not one column, or one name, for each channel.
+            There is not one column, or one name, for each channel; or messages could not be read.
         """
+        who = f"sensor {sensor.name!r}"
         given = {
             field.name: value
             for field in fields(TextFormat)
@@ -99,8 +118,17 @@ class TextSettings(BaseModel):
         if len(places) != n_channels:
             what = "channel_names" if format_.layout == "channel" else "columns"
             raise BenchFileError(
-                f"sensor {sensor.name!r}: settings.{what} = {list(places)};"
+                f"{who}: settings.{what} = {list(places)};"
                 f" expected one for each of its {n_channels} channels"
+            )
+        if format_.terminator in format_.delimiter:
+            raise BenchFileError(
+                f"{who}: settings.terminator = {format_.terminator!r} is in settings.delimiter ="
+                f" {format_.delimiter!r}; expected one that ends a message and not a field"
+            )
+        if format_.device_time and format_.layout == "row" and format_.time_column is None:
+            raise BenchFileError(
+                f"{who}: settings.device_time = true; expected settings.time_column with it"
             )
         return format_
 
@@ -210,16 +238,15 @@ class TextDriver:
         """Return int32 for whole numbers, float64 else."""
         return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _checked(sensors)
+
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[TextSession]:
         """Open the port."""
-        sensor = sensors[0]
-        settings = TextSettings.model_validate(sensor.settings)
-        if len(sensors) > 1:
-            names = ", ".join(repr(other.name) for other in sensors)
-            raise BenchFileError(f"port {sensor.port} is given to {names}; text comes from one")
+        sensor, settings, format_ = _checked(sensors)
         label = f"sensor {sensor.name!r} on {sensor.port}"
-        format_ = settings.format_for(sensor)
         decoder = TextDecoder(
             sensor.name, format_, sampling_rate=sensor.sampling_rate, joins=not settings.start
         )
@@ -241,6 +268,22 @@ class TextDriver:
                 if settings.stop:
                     with contextlib.suppress(DeviceError):
                         await source.send(settings.stop.encode())
+
+
+def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
+    """Return the sensor, its settings and format; raise BenchFileError for what cannot be."""
+    sensor = sensors[0]
+    settings = TextSettings.model_validate(sensor.settings)
+    if len(sensors) > 1:
+        names = ", ".join(repr(other.name) for other in sensors)
+        raise BenchFileError(f"port {sensor.port} is given to {names}; text comes from one")
+    for key in ("start", "stop"):
+        if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
+            raise BenchFileError(
+                f"sensor {sensor.name!r}: settings.{key} = {value!r}; at {sensor.port} it is only"
+                " listened, and nothing sent: leave it out"
+            )
+    return sensor, settings, settings.format_for(sensor)
 
 
 @contextlib.asynccontextmanager

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 MAX_MESSAGE = 16_384
 """Bytes without a terminator after which a message is given up."""
 _NS = 1_000_000_000
+_EPOCH = datetime.fromtimestamp(0, UTC)
 _LATEST_S = 9e9  # in ns it still fits 64 bits
 
 
@@ -97,7 +98,7 @@ def encode_time(utc_ns: int, format_: TextFormat) -> str:
     """Write a time as the format has it."""
     if format_.time_format == "epoch":
         return f"{utc_ns / _NS:.3f}"
-    return datetime.fromtimestamp(utc_ns // _NS, UTC).strftime(format_.time_format)
+    return (_EPOCH + timedelta(microseconds=utc_ns // 1000)).strftime(format_.time_format)
 
 
 def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
@@ -117,6 +118,18 @@ def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
     if not 0 <= seconds < _LATEST_S:
         raise ValueError(text)
     return round(seconds * 1e6) * 1000, resolution_ns
+
+
+def is_readable(time_format: str) -> bool:
+    """Whether a format, as ``strptime`` has it, gives date and time to the minute at least."""
+    instant = datetime(2026, 11, 21, 13, 14, 15, 161_718, UTC)
+    try:
+        found = datetime.strptime(instant.strftime(time_format), time_format)  # noqa: DTZ007
+    except ValueError:
+        return False
+    return found.replace(second=0, microsecond=0, tzinfo=UTC) == instant.replace(
+        second=0, microsecond=0
+    )
 
 
 def _instant(text: str, time_format: str) -> datetime:

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from daq.protocols import text_format, text_packets
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.text import TextDecoder
-from daq.protocols.text_format import LILY, RASPBERRY_SHAKE, TextFormat, encode_fields
+from daq.protocols.text_format import (
+    LILY,
+    RASPBERRY_SHAKE,
+    TextFormat,
+    decode_time,
+    encode_fields,
+    encode_time,
+)
 
 ROWS = TextFormat(columns=(0, 1, 2))
 TIMED = TextFormat(columns=(1,), time_column=0)
@@ -366,8 +373,15 @@ def test_times_that_are_none(time: str) -> None:
 
 def test_whole_numbers_stay_whole() -> None:
     decoder = TextDecoder("A", TextFormat(columns=(0,), whole=True), sampling_rate=1.0)
-    sent = b"2147483647\n2147483648\n1.5\n-2147483647\n"
-    assert split(decoder.receive(sent, at(1)))[1] == [[2147483647], [-2147483647]]
+    sent = b"2147483647\n2147483648\n1.5\n1e300\n-1e300\n-2147483648\n"
+    assert split(decoder.receive(sent, at(1)))[1] == [[2147483647], [-2147483648]]
+
+
+def test_times_are_written_as_finely_as_they_are_read() -> None:
+    format_ = TextFormat(time_format="%Y-%m-%dT%H:%M:%S.%f")
+    written = encode_time(1_795_219_200_123_456_789, format_)
+    assert written == "2026-11-21T00:00:00.123456"
+    assert decode_time(written, format_) == (1_795_219_200_123_456_000, 1000)
 
 
 @settings(max_examples=60)
