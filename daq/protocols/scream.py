@@ -136,12 +136,14 @@ class PacketFinder:
         tails = np.frombuffer(buffer, np.uint8)[BLOCK_SIZE:]
         starts = np.flatnonzero(np.isin(tails, tuple(SIZES)))
         here = 0
+        undecided = max(0, len(buffer) - BLOCK_SIZE)  # from there on no tail has come
         for start in starts.tolist():
             if start < here:
                 continue
             end = start + SIZES[buffer[start + BLOCK_SIZE]]
             if end > len(buffer):
                 if _plausible(buffer, start):
+                    undecided = start
                     break
                 continue
             if not _plausible(buffer, start):
@@ -156,8 +158,7 @@ class PacketFinder:
                 self._skipped = 0
             yield packet
             here = end
-        keep = min(SIZES.values()) * 2
-        drop = max(here, len(buffer) - keep)
+        drop = max(here, undecided)
         self._skipped += drop - here
         del self._buffer[:drop]
 
