@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 LEAST_SAMPLES = 4
 FIRST_BLOCK = 30.0
 """How long a sensor may take to its first samples, s (a Güralp block lasts many seconds)."""
+FEWEST_BLOCKS, RATE_TOLERANCE = 3, 0.01
+"""For a rate: blocks, and its standard error as a share of it."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
@@ -60,7 +62,7 @@ class SensorCheck:
     n_samples, n_missing : int
         Samples received, and known to be missing between them.
     measured_rate : float or None
-        Samples a second by the host's clock; None where there were too few blocks to tell.
+        Samples a second by the host's clock; None where blocks were too few or came too unevenly.
     clipped : bool
         Whether any sample was at the end of its range.
     channels
@@ -244,6 +246,19 @@ async def discover(
     return found
 
 
+def searched(port: str) -> str:
+    """Return in words where `discover` looks, unless told otherwise."""
+    devices = "Modbus device " + ", ".join(map(str, MODBUS_DEVICES))
+    if port.startswith(TCP):
+        return devices
+    if "://" in port:
+        return f"an Epson accelerometer or {devices}"
+    epsons, others = (
+        ", ".join(map(str, sorted(rates))) for rates in (epson.BAUD_RATES, MODBUS_BAUD_RATES)
+    )
+    return f"an Epson accelerometer ({epsons} baud) or {devices} ({others} baud)"
+
+
 async def _modbus_devices(
     port: str, clock: HostClock, baud_rate: int, device_ids: Sequence[int]
 ) -> list[Found]:
@@ -291,7 +306,7 @@ def _check(
         information=information,
         n_samples=len(counts),
         n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
-        measured_rate=_rate(blocks),
+        measured_rate=arrival_rate(blocks),
         clipped=any(BlockFlag.CLIPPED in block.flags for block in blocks),
         channels=tuple(
             ChannelCheck(
@@ -320,9 +335,16 @@ def _together(parts: Sequence[NDArray[np.int64] | None]) -> NDArray[np.int64] | 
     return np.concatenate(there) if there else None
 
 
-def _rate(blocks: Sequence[Block]) -> float | None:
-    """Return samples a second between the ends of the first and the last block."""
-    elapsed = blocks[-1].received.monotonic_ns - blocks[0].received.monotonic_ns
-    if elapsed <= 0:
+def arrival_rate(blocks: Sequence[Block]) -> float | None:
+    """Return samples a second by the arrival of blocks, from the second one on.
+
+    The first may have waited for its reader. None where the others were too few, or came too
+    unevenly, as when all had waited.
+    """
+    blocks = blocks[1:]
+    if len(blocks) < FEWEST_BLOCKS:
         return None
-    return (blocks[-1].end_sample - blocks[0].end_sample) / elapsed * 1e9
+    sent = np.array([block.end_sample - blocks[0].end_sample for block in blocks])
+    came = [block.received.monotonic_ns - blocks[0].received.monotonic_ns for block in blocks]
+    (period, _), cov = np.polyfit(sent, np.array(came) * 1e-9, 1, cov=True)
+    return float(1 / period) if 0 < period >= np.sqrt(cov[0, 0]) / RATE_TOLERANCE else None

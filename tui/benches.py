@@ -13,7 +13,7 @@ from rich.table import Table
 from daq.bench import format_duration, load
 from daq.clock import SystemClock
 from daq.errors import NoAnswerError
-from daq.probe import discover, probe_bench
+from daq.probe import discover, probe_bench, searched
 from tui.output import check_places, console, for_people, write_json, write_text
 from tui.results import plain
 from tui.text import signed
@@ -92,8 +92,8 @@ def check_port(port: str, *, json: str | None) -> None:
     write_json(json, {"port": port, "devices": plain(found)})
     if not found:
         raise NoAnswerError(
-            f"port {port}: nothing answers as an Epson accelerometer or a Modbus device; check"
-            " power and cable; devices of other families must be named in a bench file"
+            f"port {port}: nothing answers as {searched(port)}; check power and cable; other"
+            " devices, rates and addresses must be named in a bench file"
         )
     table = _table(["driver", "settings", "device"])
     for device in found:
