@@ -49,7 +49,7 @@ def clipped_shares(record: SensorRecord) -> dict[str, float]:
 
 def _rows(record: SensorRecord) -> NDArray[np.int64]:
     """First and last + 1 row of every stretch, shape (n, 2)."""
-    n_rows = int(record.blocks["n_samples"].sum())
+    n_rows = record.n_samples
     if n_rows <= _STRETCHES * _ROWS:
         return np.array([[0, n_rows]] if n_rows else np.empty((0, 2)), dtype=np.int64)
     first = np.linspace(0, n_rows - _ROWS, _STRETCHES).astype(np.int64)

@@ -11,7 +11,6 @@ import numpy as np
 
 from daq.alignment import AlignedRecording
 from daq.estimation.stillness import Stillness, stands_still
-from daq.protocols.block import BlockFlag
 from daq.refinement import DelayMeter
 from estimator.multiresolution import MultiResolution
 from estimator.rejection import Reason, RejectionSettings, SelectedSpectra
@@ -184,19 +183,16 @@ class Pass:
             return None
         found = None
         for number, record in enumerate(self._sensors):
-            blocks = record.blocks
-            blocks = blocks[(blocks["flags"] & int(BlockFlag.CLIPPED)) != 0]
-            if len(blocks) == 0:
+            clipped = record.blocks.clipped
+            if len(clipped) == 0:
                 continue
             found = np.zeros(n_samples, dtype=np.bool_) if found is None else found
             at = np.arange(start, start + n_samples, dtype=np.float64)
             origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
             seconds = origin * 1e-9 + at / self.welch.sampling_rate
             position = (seconds - self.aligned.delays(at)[:, number]) * record.sampling_rate
-            first = blocks["first_sample"].astype(np.float64)
-            before = np.searchsorted(first, position, side="right") - 1
-            last = (first + blocks["n_samples"])[before]
-            found |= (before >= 0) & (position < last)
+            before = np.searchsorted(clipped[:, 0], position, side="right") - 1
+            found |= (before >= 0) & (position < clipped[before, 1])
         return found
 
     @property

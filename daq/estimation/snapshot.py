@@ -37,20 +37,16 @@ class SensorState:
     n_samples: int
     n_gaps: int
     n_missing: int
-    last_seen: float
-    """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
     @classmethod
     def of(cls, record: SensorRecord) -> SensorState:
         """Return the state of a sensor of a recording."""
-        blocks = record.blocks
         return cls(
             name=record.name,
             sampling_rate=record.sampling_rate,
             n_samples=record.n_samples,
             n_gaps=len(record.gaps),
             n_missing=int(record.gaps["missing"].sum()),
-            last_seen=float(blocks["utc_ns"][-1]) * 1e-9 if len(blocks) else float("nan"),
         )
 
 

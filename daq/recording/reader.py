@@ -18,6 +18,7 @@ from daq.bench import parse
 from daq.errors import BenchFileError, NotARecordingError, RecordingError
 from daq.protocols.block import Event, HostTime
 from daq.recording import layout
+from daq.recording.block_table import BlockTable
 from daq.recording.chunks import ChunkedRows
 from daq.recording.locking import is_being_written
 from daq.recording.superblock import ClearedFile, Superblock
@@ -78,13 +79,10 @@ class SensorRecord:
         self._instants: h5py.Dataset = group["instants"]
         self.channels: tuple[Channel, ...] = layout.channels_of(self._samples.attrs)
         self.dtype: np.dtype[Any] = self._samples.dtype
-        self.chunk_rows: int = self._samples.chunks[0]
-        """Rows a chunk holds: reading multiples of it is fastest."""
         self._sample_rows = ChunkedRows(self._samples)
         self._instant_rows = ChunkedRows(self._instants)
-        self._blocks = _Rows(group["blocks"])
+        self.blocks = BlockTable(group["blocks"])
         self._gaps = _Rows(group["gaps"])
-        self._n_blocks = 0
         self.n_samples = 0
         """Number of committed rows of samples."""
 
@@ -97,11 +95,6 @@ class SensorRecord:
     def n_written(self) -> int:
         """Number of rows in the file, those never committed included."""
         return int(self._samples.shape[0])
-
-    @property
-    def blocks(self) -> NDArray[np.void]:
-        """Committed blocks, dtype :data:`daq.recording.layout.BLOCK_DTYPE`."""
-        return self._blocks.rows()[: self._n_blocks]
 
     @property
     def gaps(self) -> NDArray[np.void]:
@@ -161,17 +154,12 @@ class SensorRecord:
     def take(self, counts: NDArray[np.int64]) -> bool:
         """Take over what was committed (a row of ``/committed``); return whether that is news."""
         before = self.n_samples, self._gaps.n_rows
-        self._blocks.take(int(counts[layout.BLOCKS]))
+        self.blocks.take(int(counts[layout.BLOCKS]), int(counts[layout.ROWS]))
         self._gaps.take(int(counts[layout.GAPS]))
-        blocks = self._blocks.rows()
-        ends = blocks["first_row"] + blocks["n_samples"]
-        # Samples and blocks end together, even if a crash left one of the two numbers behind.
-        n_whole = int(np.searchsorted(ends, int(counts[layout.ROWS]), side="right"))
-        n_samples = int(ends[n_whole - 1]) if n_whole else 0
-        if n_samples > self.n_samples:
+        if self.blocks.n_samples > self.n_samples:
             self._samples.refresh()
             self._instants.refresh()
-            self._n_blocks, self.n_samples = n_whole, n_samples
+            self.n_samples = self.blocks.n_samples
         return before != (self.n_samples, self._gaps.n_rows)
 
 
@@ -291,6 +279,8 @@ class Recording:
             news = [s.take(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
             n_events = self._events.n_rows
             self._events.take(int(counts[-1, layout.EVENTS]))
+        except RecordingError:
+            raise
         except (OSError, RuntimeError) as error:
             raise RecordingError(f"{self.path}: a damaged recording: {error}") from error
         self.closed = bool(counts[-1, layout.CLOSED])

@@ -97,7 +97,7 @@ def _source(path: Path) -> Source:
     with Recording.open(path, alone=True) as recording:
         created = recording.created_at.utc_ns
         last = max(
-            (int(s.blocks["utc_ns"][-1]) for s in recording.sensors if len(s.blocks)),
+            (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),
             default=created,
         )
         happenings = [
@@ -137,8 +137,8 @@ def _source(path: Path) -> Source:
 
 def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:
     """Return gaps at the time at which the block before each was received."""
-    gaps, blocks = sensor.gaps, sensor.blocks
-    before = np.searchsorted(blocks["first_sample"], gaps["first_sample"], side="left") - 1
+    gaps, received_ns = sensor.gaps, sensor.blocks["utc_ns"]
+    before = np.searchsorted(sensor.blocks["first_sample"], gaps["first_sample"], side="left") - 1
     found = []
     for gap, place in zip(gaps, before, strict=True):
         missing = int(gap["missing"])
@@ -147,7 +147,7 @@ def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:
             f"{about}{missing} {'sample' if missing == 1 else 'samples'} missing"
             f" ({missing / sensor.sampling_rate:.3g} s): {gap['reason'].decode(errors='replace')}"
         )
-        at = int(blocks["utc_ns"][place]) if place >= 0 else created_ns
+        at = int(received_ns[place]) if place >= 0 else created_ns
         found.append(Happening(at, sensor.name, "gap", text))
     return found
 

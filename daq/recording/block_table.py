@@ -1,0 +1,103 @@
+"""The committed blocks of a sensor, of which a long recording has millions.
+
+They stay in the file, and are read where they are asked for: who follows a recording wants each of
+them once. What is asked for again and again, which of them are clipped, is kept.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.protocols.block import BlockFlag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import h5py
+    from numpy.typing import NDArray
+
+    IntArray = NDArray[np.int64]
+
+_ROWS_AT_ONCE = 1 << 14  # 900 kB
+
+
+class BlockTable:
+    """Committed blocks, dtype :data:`daq.recording.layout.BLOCK_DTYPE`, indexed like an array.
+
+    A slice reads no more than its rows, the name of a field no other fields.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._n_rows = 0
+        self._clipped: list[IntArray] = []
+        self.n_samples = 0
+        """Rows of samples at which they end."""
+
+    def __len__(self) -> int:
+        return self._n_rows
+
+    def __getitem__(self, which: Any) -> NDArray[Any]:  # noqa: ANN401 - as arrays take it
+        if isinstance(which, str):
+            return self._read(0, self._n_rows, which)
+        if isinstance(which, slice) and which.step is None:
+            first, last, _ = which.indices(self._n_rows)
+            return self._read(first, max(first, last))
+        return np.asarray(self._read(0, self._n_rows)[which])
+
+    def __iter__(self) -> Iterator[NDArray[np.void]]:
+        for first in range(0, self._n_rows, _ROWS_AT_ONCE):
+            yield from self[first : first + _ROWS_AT_ONCE]
+
+    @property
+    def clipped(self) -> IntArray:
+        """First sample and the one after the last of what is clipped, shape (n, 2); rising."""
+        if len(self._clipped) > 1:
+            self._clipped = [np.concatenate(self._clipped)]
+        return self._clipped[0] if self._clipped else np.empty((0, 2), np.int64)
+
+    def take(self, n_rows: int, n_samples: int) -> None:
+        """Take further blocks: up to ``n_rows``, of those that end within ``n_samples``.
+
+        Samples and blocks end together, even if a crash left one of the two numbers behind.
+        """
+        if n_rows > self._n_rows:
+            self._dataset.refresh()
+        for first in range(self._n_rows, n_rows, _ROWS_AT_ONCE):
+            blocks = self._read(first, min(first + _ROWS_AT_ONCE, n_rows))
+            ends = blocks["first_row"] + blocks["n_samples"]
+            n_whole = int(np.searchsorted(ends, n_samples, side="right"))
+            if n_whole:
+                self._n_rows, self.n_samples = first + n_whole, int(ends[n_whole - 1])
+                self._note_clipped(blocks[:n_whole])
+            if n_whole < len(blocks):
+                break
+
+    def _note_clipped(self, blocks: NDArray[np.void]) -> None:
+        blocks = blocks[(blocks["flags"] & int(BlockFlag.CLIPPED)) != 0]
+        if len(blocks):
+            first, end = blocks["first_sample"], blocks["first_sample"] + blocks["n_samples"]
+            apart = first[1:] != end[:-1]
+            begins, ends = first[np.append(True, apart)], end[np.append(apart, True)]
+            self._clipped.append(np.column_stack([begins, ends]))
+
+    def _read(self, first: int, last: int, field: str | None = None) -> NDArray[Any]:
+        dataset = self._dataset if field is None else self._dataset.fields(field)
+        try:
+            rows = np.asarray(dataset[first:last])
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(
+                f"{self._where}: damaged between rows {first} and {last}: {error}"
+            ) from error
+        if len(rows) < last - first:
+            raise RecordingError(
+                f"{self._where} has {first + len(rows)} rows where {last} were committed"
+            )
+        return rows
+
+    @property
+    def _where(self) -> str:
+        return f"{self._dataset.file.filename}: {self._dataset.name}"
