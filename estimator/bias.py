@@ -111,9 +111,14 @@ def three_channel_bias(
     -------
     float64, shape (..., p)
         Real part of Eq. (13), the mean over all pairs of other sensors; (27) where the motion
-        is incoherent.
+        is incoherent. Not finite where two others share none of the motion that the channel feels.
+
+    Raises
+    ------
+    EstimatorError
+        If sensors are not equal, shapes do not fit, motion is not finite or noise not positive.
     """
-    d = _equal_dims(dims)
+    d = _equal_dims(motion, noise_psd, dims)
     bias = snr(motion, noise_psd)
     factor = np.zeros_like(bias)
     for i, r in itertools.product(range(len(dims)), range(d)):
@@ -122,9 +127,10 @@ def three_channel_bias(
         for j, k in pairs:
             q, s = d * j + r, d * k + r
             product = motion[..., q, p] * motion[..., p, s]
-            quotient = product / (motion[..., p, p] * motion[..., q, s])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                quotient = product / (motion[..., p, p] * motion[..., q, s])
             factor[..., p] += (1 - quotient.real) / len(pairs)
-    return bias * factor
+    return np.where(bias == 0, 0.0, bias * factor)
 
 
 def three_sensor_bias(
@@ -147,12 +153,17 @@ def three_sensor_bias(
         Diagonal of Eq. (30), real part (the mean with j and k swapped), and mean over all pairs
         of other sensors.
 
+    Raises
+    ------
+    EstimatorError
+        If sensors are not equal, shapes do not fit, motion is not finite or noise not positive.
+
     Notes
     -----
     Evaluated as Eq. (29) over the noise; in terms of ``c``, ``H_i S_ZiZk S_ZjZk^-1 S_ZjZi H_i^*``
     is ``c_ik inv(c_jk) c_ji``; the generalised inverse where the motion lacks a dimension.
     """
-    d = _equal_dims(dims)
+    d = _equal_dims(motion, noise_psd, dims)
     n = len(dims)
     blocks = motion.reshape(*motion.shape[:-2], n, d, n, d).swapaxes(-3, -2)
     bias = np.zeros((*motion.shape[:-2], n, d))
@@ -166,8 +177,17 @@ def three_sensor_bias(
     return np.asarray(bias.reshape(*motion.shape[:-2], n * d) / noise_psd)
 
 
-def _equal_dims(dims: tuple[int, ...]) -> int:
+def _equal_dims(motion: ComplexArray, noise_psd: FloatArray, dims: tuple[int, ...]) -> int:
+    """Return the channels of each sensor; raise unless motion and noise are of such sensors."""
     check_dims(dims)
     if len(set(dims)) != 1:
         raise EstimatorError(f"sensors of {dims} channels: the theory takes equal sensors")
+    p = sum(dims)
+    if motion.shape[-2:] != (p, p) or noise_psd.shape[-1:] != (p,):
+        raise EstimatorError(
+            f"motion of shape {motion.shape} and noise of shape {noise_psd.shape}: "
+            f"expected (..., {p}, {p}) and (..., {p})"
+        )
+    if not (np.isfinite(motion).all() and np.all(noise_psd > 0)):
+        raise EstimatorError("motion and noise: expected finite numbers, noise above zero")
     return dims[0]

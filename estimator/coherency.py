@@ -74,8 +74,10 @@ class Coherency:
 
 def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
     """Raise unless `dims` describes at least `n_sensors` sensors of one channel or more."""
-    if any(d < 1 for d in dims):
-        raise InvalidMatrixError(f"dims {dims}: every sensor needs at least one channel")
+    if any(d < 1 for d in dims) or (dims and np.asarray(dims).dtype.kind not in "iu"):
+        raise InvalidMatrixError(
+            f"dims {dims}: expected a whole number of channels for every sensor, at least one"
+        )
     if len(dims) < n_sensors:
         raise InsufficientDataError(f"{len(dims)} sensors: at least {n_sensors} are needed")
 
@@ -91,6 +93,16 @@ def check_averages(n_effective: float, d: int = 0) -> None:
             f"{n_effective:g} effective averages: more than {d} are needed to tell the noise from "
             f"a motion of {d} dimensions; record longer or use shorter segments"
         )
+
+
+def check_frequency(frequency: FloatArray, n_freqs: int) -> FloatArray:
+    """Return frequencies as an array; raise unless they are one a matrix, finite and rising."""
+    frequency = np.asarray(frequency, dtype=np.float64)
+    if frequency.shape != (n_freqs,):
+        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({n_freqs},)")
+    if not (np.isfinite(frequency).all() and np.all(np.diff(frequency) > 0)):
+        raise InvalidMatrixError("frequency: expected finite numbers of Hz, rising")
+    return frequency
 
 
 def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.coherency import check_dims, coherency, testable
+from estimator.coherency import (
+    check_averages,
+    check_dims,
+    check_frequency,
+    coherency,
+    testable,
+)
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import max_factors, maximise
 from estimator.likelihood import standard_error
@@ -166,7 +172,8 @@ def choose_dimension(
     InvalidMatrixError
         As `estimator.coherency.coherency` says, or if `frequency` or `band` do not fit.
     InsufficientDataError
-        If there are fewer than three sensors that have signal, or no more averages than channels.
+        If there are fewer than three sensors that have signal, or averages are no more
+        than channels, or not finite.
 
     Notes
     -----
@@ -177,9 +184,9 @@ def choose_dimension(
     or copies of earlier ones, count for nothing here: a fourth sensor of such channels is none.
     """
     check_dims(dims)
+    check_averages(n_effective)
     given = coherency(csm, dims)
-    if frequency.shape != (len(csm),):
-        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
+    frequency = check_frequency(frequency, len(csm))
     there = presence(given, dims)
     kind = kinds(given, dims)[list(there.channels)]
     given, n_channels = given.part(list(there.channels)), len(there.channels)
@@ -192,7 +199,7 @@ def choose_dimension(
             f"{n_effective:.1f} averages of {n_channels} channels: more averages than channels "
             "are needed"
         )
-    number = bands(frequency) if band is None else band
+    number = bands(frequency) if band is None else np.asarray(band)
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
         raise InvalidMatrixError("band: expected one number a frequency, never falling")
     matrix = testable(given, frequency)

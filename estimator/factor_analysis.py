@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.coherency import TOLERANCE
+from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -131,12 +132,15 @@ def max_factors(n_channels: int | IntArray) -> IntArray:
     return np.floor(n_channels - np.sqrt(n_channels) + 1e-12).astype(np.int64)
 
 
-def check_factors(n_factors: int, n_channels: int) -> None:
+def check_factors(n_factors: int | IntArray, n_channels: int) -> None:
     """Raise unless so many factors can be told from the noise of so many channels."""
-    most = max_factors(n_channels)
-    if not 0 <= n_factors <= most:
+    factors, most = np.asarray(n_factors), max_factors(n_channels)
+    if factors.dtype.kind not in "iu":
+        raise EstimatorError(f"{n_factors} factors of motion: expected a whole number")
+    wrong = factors[(factors < 0) | (factors > most)]
+    if wrong.size:
         raise InsufficientDataError(
-            f"{n_factors} factors of motion cannot be told from the noise of {n_channels} "
+            f"{wrong[0]} factors of motion cannot be told from the noise of {n_channels} "
             f"channels: at most {most} can"
         )
 
@@ -217,16 +221,17 @@ def maximise(
 
 
 def _precision(csm: ComplexArray) -> tuple[BoolArray, ComplexArray, FloatArray]:
-    """Where the matrices are positive definite, their inverses, and the rounding of these."""
+    """Where matrices are Hermitian, positive definite; their inverses, and these' rounding."""
     p = csm.shape[-1]
     power = np.real(np.einsum("fii->fi", csm))
     usable = np.isfinite(csm).all(axis=(1, 2)) & (power > 0).all(axis=1)
     scale = 1 / np.sqrt(np.where(usable[:, None], power, 1.0))
     outer = scale[:, :, None] * scale[:, None, :]
     identity = np.eye(p)
-    coherency = np.where(usable[:, None, None], csm * outer, identity)
+    coherency = np.where(usable[:, None, None], csm, identity) * outer
     least = np.linalg.eigvalsh(coherency)[:, 0]
     usable &= least > 4 * p * np.finfo(np.float64).eps
+    usable &= np.abs(coherency - coherency.conj().swapaxes(1, 2)).max(axis=(1, 2)) <= TOLERANCE
     inverse = np.linalg.inv(np.where(usable[:, None, None], coherency, identity))
     inverse = (inverse + inverse.conj().swapaxes(1, 2)) / 2
     rounding = 1e-15 * p / np.where(usable, least, 1.0)

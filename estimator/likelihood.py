@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator import fisher
-from estimator.coherency import check_dims, coherency
-from estimator.errors import InsufficientDataError
+from estimator.coherency import check_averages, check_dims, coherency
+from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.factor_analysis import Maximum, check_factors, max_factors, maximise
 from estimator.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
 from estimator.resolution import alone, resolved
@@ -74,6 +74,8 @@ def maximum_likelihood(
     InsufficientDataError
         If there are fewer than three sensors, fewer averages than channels, or too many
         factors for as many channels.
+    EstimatorError
+        If `n_factors` is not whole or mis-shaped, or `noise_spread` not above zero.
 
     Notes
     -----
@@ -88,15 +90,19 @@ def maximum_likelihood(
     check_dims(dims)
     given = coherency(csm, dims)
     n_freqs, p = given.psd.shape
-    if not n_effective >= p:  # NaN included
+    check_averages(n_effective)
+    if n_effective < p:
         raise InsufficientDataError(
             f"{n_effective:.1f} averages of {p} channels: at least as many averages as channels "
             "are needed"
         )
-    factors = np.broadcast_to(
-        np.asarray(max(dims) if n_factors is None else n_factors, np.int64), (n_freqs,)
-    )
-    check_factors(int(factors.max()), p)
+    factors = np.asarray(max(dims) if n_factors is None else n_factors)
+    if factors.shape not in {(), (n_freqs,)}:
+        raise EstimatorError(f"n_factors of shape {factors.shape}, expected () or ({n_freqs},)")
+    check_factors(factors, p)
+    factors = np.broadcast_to(factors, (n_freqs,))
+    if not (np.isfinite(noise_spread) and noise_spread > 0):
+        raise EstimatorError(f"noise_spread {noise_spread}: expected a finite number above zero")
     matrix, absent = _without_dead_and_copies(given)
     few = factors > max_factors(p - absent.sum(axis=1))
     lone = np.zeros_like(absent)

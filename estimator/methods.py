@@ -5,8 +5,10 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from estimator import uncertainty
-from estimator.errors import UnknownMethodError
+from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.likelihood import maximum_likelihood
 from estimator.self_noise import Flag, SelfNoise
 from estimator.three_channel import three_channel
@@ -74,9 +76,16 @@ def self_noise(
     UnknownMethodError
         If there is no method of that name.
     EstimatorError
-        As the method says.
+        As the method says, or if `real` is not one bool a frequency.
     """
     if method not in METHODS:
         raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")
     found = METHODS[method](csm, dims=dims, n_effective=n_effective, correct=correct, **options)
-    return found if real is None else uncertainty.widened(found, real)
+    if real is None:
+        return found
+    real = np.asarray(real)
+    if real.shape != (len(csm),) or real.dtype != np.bool_:
+        raise EstimatorError(
+            f"real of shape {real.shape} and type {real.dtype}, expected bool of ({len(csm)},)"
+        )
+    return uncertainty.widened(found, real)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import special
 
 from estimator import fisher
+from estimator.coherency import check_averages
 from estimator.errors import InsufficientDataError
 from estimator.windows import get_window
 
@@ -87,7 +88,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     ------
     InsufficientDataError
         If the model has as many parameters as the matrix (nothing is left to test it with), or
-        the averages are fewer than the channels.
+        the averages are fewer than the channels, or not finite.
 
     Notes
     -----
@@ -104,6 +105,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     can find (n SNR**2 < 100, say), the test is conservative. Under a penalty psi has
     ``tr J (J + penalty)^-1`` parameters and not p, as ridge regression counts them.
     """
+    check_averages(n_effective)
     p = maximum.eigenvalues.shape[1]
     q = maximum.n_factors
     order, averages = p - q, n_effective - q

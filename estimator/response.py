@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.coherency import check_dims, coherency
-from estimator.errors import InsufficientDataError
+from estimator.coherency import check_dims, check_frequency, coherency
+from estimator.errors import EstimatorError, InsufficientDataError
 
 if TYPE_CHECKING:
     from estimator.arrays import BoolArray, ComplexArray, FloatArray
@@ -153,7 +153,7 @@ def relative_response(
         channels grouped by sensor; at least three sensors, both with d channels and the others
         with no fewer together.
     frequency : float64, shape (n_freqs,)
-        Hz.
+        Hz, rising.
     dims : tuple of int
         Channels of each sensor.
     first, second : int
@@ -174,7 +174,9 @@ def relative_response(
         If the two have different numbers of channels, there is no third sensor to compare by,
         or the band holds no frequency at which they are coherent.
     InvalidMatrixError
-        As `estimator.coherency.coherency` says.
+        As `estimator.coherency.coherency` says, or if `frequency` does not fit.
+    EstimatorError
+        If there are no two such sensors.
 
     Notes
     -----
@@ -187,7 +189,13 @@ def relative_response(
     left, weighted alike, has a slope through the origin: least squares.
     """
     check_dims(dims)
+    csm = np.asarray(csm, dtype=np.complex128)
     given = coherency(csm, dims)
+    frequency = check_frequency(frequency, len(csm))
+    if first == second or not {first, second} <= set(range(len(dims))):
+        raise EstimatorError(
+            f"sensors {first} and {second}: expected two different ones of 0 to {len(dims) - 1}"
+        )
     d = dims[first]
     if dims[second] != d:
         raise InsufficientDataError(

@@ -59,9 +59,9 @@ class WelchSettings:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.sampling_rate) and self.sampling_rate > 0):
             raise EstimatorError(f"sampling rate {self.sampling_rate}: expected Hz above 0")
-        if self.segment_length < 2:
+        if self.segment_length < 2 or np.asarray(self.segment_length).dtype.kind not in "iu":
             raise EstimatorError(
-                f"segment length {self.segment_length}: expected 2 samples or more"
+                f"segment length {self.segment_length}: expected 2 samples or more, a whole number"
             )
         if not 0 <= self.overlap < 1:
             raise EstimatorError(f"overlap {self.overlap}: expected a fraction from 0 to below 1")
@@ -314,6 +314,11 @@ def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
     -------
     complex128, shape (n_freqs, n_channels, n_channels)
         ``csm[f, p, q] / (h[f, p] conj(h[f, q]))``; NaN where a response is zero, as at 0 Hz.
+
+    Raises
+    ------
+    EstimatorError
+        If `response` is not one number a frequency and channel.
     """
     response = np.asarray(response, dtype=np.complex128)
     if response.shape != csm.shape[:2]:

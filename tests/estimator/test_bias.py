@@ -115,3 +115,16 @@ def test_what_the_theory_does_not_cover_is_refused() -> None:
         three_sensor_bias(c, np.ones(4), dims=(1, 1, 2))
     with pytest.raises(EstimatorError, match="expected"):
         motion_csm(unit([0, 5, 10]), np.eye(3))
+
+
+def test_a_channel_that_feels_none_of_the_motion_has_no_bias() -> None:
+    response = np.zeros((3, 2, 2))
+    response[:, 0] = [[1, 0], [np.cos(0.1), np.sin(0.1)], [1, 0]]
+    motion = motion_csm(response, np.eye(2))
+    bias = three_channel_bias(motion, np.ones(6), dims=(2, 2, 2))
+    np.testing.assert_array_equal(bias[1::2], 0)
+    assert np.all(bias[::2] != 0)
+    with pytest.raises(EstimatorError, match="shape"):
+        three_channel_bias(motion, np.ones(5), dims=(2, 2, 2))
+    with pytest.raises(EstimatorError, match="finite"):
+        three_sensor_bias(motion * np.nan, np.ones(6), dims=(2, 2, 2))

@@ -229,3 +229,10 @@ def test_refusals() -> None:
         )
     with pytest.raises(InsufficientDataError, match="averages"):
         choose_dimension(averages, np.ones(1), dims=THREE, n_effective=9)
+    for n in (np.nan, np.inf, -1):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            choose_dimension(averages, np.ones(1), dims=THREE, n_effective=n)
+    twice = np.tile(averages, (2, 1, 1))
+    for frequency in ([2.0, 1.0], [1.0, np.nan]):
+        with pytest.raises(InvalidMatrixError, match="rising"):
+            choose_dimension(twice, np.array(frequency), dims=THREE, n_effective=50)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimator import fisher
-from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import DECREMENT, max_factors, maximise
 from estimator.likelihood import maximum_likelihood
 from estimator.self_noise import Flag
@@ -456,6 +456,21 @@ def test_refuses_what_cannot_be_known() -> None:
         maximum_likelihood(csm, dims=(3, 3, 2), n_effective=100)
     with pytest.raises(InvalidMatrixError, match="expected"):
         maximise(csm[0], 3)
+    for options in (
+        {"n_factors": 2.5},
+        {"n_factors": np.array([3, 3])},
+        {"n_factors": 3, "noise_spread": 0.0},
+        {"noise_spread": np.nan},
+    ):
+        with pytest.raises(EstimatorError, match="expected"):
+            maximum_likelihood(csm, dims=(3, 3, 3), n_effective=100, **options)
+
+
+def test_a_matrix_that_is_not_hermitian_has_no_maximum() -> None:
+    csm = np.tile(np.eye(9, dtype=np.complex128), (2, 1, 1))
+    csm[1, 0, 4] = 0.1
+    found = maximise(csm, 3)
+    np.testing.assert_array_equal(found.singular, [False, True])
 
 
 @pytest.mark.parametrize(("n_channels", "most"), [(3, 1), (6, 3), (9, 6), (12, 8), (15, 11)])

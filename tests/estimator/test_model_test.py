@@ -160,3 +160,6 @@ def test_refuses_a_model_with_nothing_left_to_test() -> None:
         model_test(maximise(draws, 6), n_effective=50)
     with pytest.raises(InsufficientDataError, match="averages"):
         model_test(maximise(draws, 3), n_effective=9)
+    for n in (np.nan, np.inf, -1):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            model_test(maximise(draws, 3), n_effective=n)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.diagnostics import diagnose
-from estimator.errors import InsufficientDataError
+from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.response import canonical_coherence, matched_coherence, relative_response
 from estimator.spectra import CrossSpectra, WelchSettings
 from tests.estimator.models import wishart
@@ -187,6 +187,9 @@ def test_what_cannot_be_compared() -> None:
     with pytest.raises(InsufficientDataError, match="others have 2"):
         relative_response(csm, FREQUENCY, dims=(3, 2, 3), first=0, second=2)
     quiet = np.broadcast_to(np.eye(9, dtype=np.complex128), (200, 9, 9))
+    for first, second in ((0, 0), (0, 5), (-1, 0)):
+        with pytest.raises(EstimatorError, match="two different ones of 0 to 2"):
+            relative_response(quiet, FREQUENCY, dims=(3, 3, 3), first=first, second=second)
     with pytest.raises(InsufficientDataError, match="coherent"):
         relative_response(quiet, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
 

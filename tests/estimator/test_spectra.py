@@ -160,6 +160,7 @@ def test_segments_that_are_not_there_are_refused(samples: np.ndarray, starts: np
         {"sampling_rate": 0.0},
         {"sampling_rate": np.nan},
         {"segment_length": 1},
+        {"segment_length": 100.5},
         {"overlap": 1.0},
         {"overlap": -0.1},
         {"window": "hat"},

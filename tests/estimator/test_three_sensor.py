@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.errors import InsufficientDataError, InvalidMatrixError, UnknownMethodError
+from estimator.errors import (
+    EstimatorError,
+    InsufficientDataError,
+    InvalidMatrixError,
+    UnknownMethodError,
+)
 from estimator.methods import METHODS, Flag, SelfNoise, self_noise
 from estimator.spectra import CrossSpectra, WelchSettings
 from estimator.three_channel import three_channel
@@ -376,6 +381,15 @@ def test_what_makes_no_sense_is_refused(method: str) -> None:
     if method != "two-channel":
         with pytest.raises(InsufficientDataError, match="sensors"):
             estimate(good[:, :6, :6], (3, 3))
+    for n_effective in (np.nan, np.inf, -1.0):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            estimate(good, n_effective=n_effective)
+    with pytest.raises(InvalidMatrixError, match="whole number"):
+        estimate(good, (9, 3, -3))
+    with pytest.raises(InvalidMatrixError, match="whole number"):
+        estimate(good, (3.0, 3.0, 3.0))  # type: ignore[arg-type]  # wrong on purpose
+    with pytest.raises(EstimatorError, match="real of shape"):
+        self_noise(method, good, dims=(3, 3, 3), n_effective=60, real=np.zeros(2, np.bool_))
     for n_effective in (0.0, 1.0, np.nan):
         with pytest.raises(InsufficientDataError, match="averages"):
             estimate(good, n_effective=n_effective)
