@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import itertools
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from daq.protocols.epson import COUNTS_PER_G
+from daq.protocols.epson import COUNTS_PER_G, FILTERS, NOT_ON_A370
 from sim_devices import launch
 from tests.sim_devices.bench import device, spec
 
@@ -71,6 +72,15 @@ def test_it_detects_configures_and_reads_without_a_gap(
         assert sum(words) % 65536 == checksum
         assert max(abs(x), abs(y), abs(z)) < 0.1 * COUNTS_PER_G
     assert scaled[1] == pytest.approx(25.0, abs=0.6)  # °C
+
+
+@pytest.mark.parametrize(
+    ("module", "lacking"), [("ma352ad10", frozenset()), ("ma370ad10", NOT_ON_A370)]
+)
+def test_models_have_the_filters_that_it_knows(module: str, lacking: frozenset[str]) -> None:
+    known = importlib.import_module(f"esensorlib.model.{module}").FILTER_SEL
+    fixed = {name: code for name, code in known.items() if not name.startswith("UDF")}
+    assert fixed == {name: code for name, code in FILTERS.items() if name not in lacking}
 
 
 def test_flash_reset_and_automatic_start(accelerometer: Any) -> None:  # noqa: ANN401
