@@ -1,4 +1,4 @@
-"""``huddle devices``: simulated devices on request, and nothing left of them."""
+"""``huddle devices`` and ``huddle demo``: simulated devices, and nothing left of them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from importlib import resources
 from typing import TYPE_CHECKING
 
 import pytest
+from typer.testing import CliRunner
+
+from daq.bench import parse
+from tui.command import app
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,3 +40,13 @@ def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 130
     assert not list(folder.iterdir())
+
+
+def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    bench = parse(text)
+    assert (bench.recording.duration, bench.speed) == (300.0, 4.0)
+    said = " ".join(CliRunner().invoke(app, ["demo", "--help"]).output.replace("│", " ").split())
+    assert "5min where not given" in said
+    assert "4 where not given" in said
+    assert "bench file" not in said

@@ -8,12 +8,8 @@ from typing import Annotated
 import typer
 
 from tui.commands import examples
-from tui.options import (
-    BenchArgument,
-    DurationOption,
-    JsonOption,
-    SpeedOption,
-)
+from tui.options import BenchArgument, JsonOption, SpeedOption
+from tui.options import duration as read_duration
 
 
 @examples("huddle init", "huddle init -o lab.toml")
@@ -117,8 +113,25 @@ def devices(
 @examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
 def demo(
     *,
-    duration: DurationOption = None,
-    speed: SpeedOption = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            "--duration",
+            "-d",
+            metavar="TIME",
+            parser=read_duration,
+            help="As in 90s, 20min, 3h; 5min where not given.",
+        ),
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            "--speed",
+            metavar="FACTOR",
+            min=0.01,
+            help="How many times as fast as life; 4 where not given.",
+        ),
+    ] = None,
     keep: Annotated[
         Path | None, typer.Option("--keep", metavar="FILE", help="Keep the recording here.")
     ] = None,
