@@ -15,9 +15,15 @@ import numpy as np
 from scipy import special
 
 from estimator.advice import Advice, advise
-from estimator.coherency import check_dims, coherency, testable
+from estimator.coherency import (
+    check_averages,
+    check_dims,
+    check_frequency,
+    coherency,
+    testable,
+)
 from estimator.dimension import bands
-from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.factor_analysis import maximise
 from estimator.model_test import BandTest, ModelTest, model_test, pool
 from estimator.presence import Presence, presence
@@ -151,12 +157,21 @@ def diagnose(
     InvalidMatrixError
         As `estimator.coherency.coherency` says, or if `frequency` does not fit.
     InsufficientDataError
-        With fewer than three sensors.
+        With fewer than three sensors, or if averages are not a finite number above zero.
+    EstimatorError
+        If there are not as many `names` as sensors, or `channels` as channels.
     """
     check_dims(dims)
+    check_averages(n_effective)
+    csm = np.asarray(csm, dtype=np.complex128)
     given = coherency(csm, dims)
-    if frequency.shape != (len(csm),):
-        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({len(csm)},)")
+    frequency = check_frequency(frequency, len(csm))
+    names = names or tuple(str(i + 1) for i in range(len(dims)))
+    channels = channels or tuple(str(r + 1) for d in dims for r in range(d))
+    if (len(names), len(channels)) != (len(dims), sum(dims)):
+        raise EstimatorError(
+            f"{len(names)} names and {len(channels)} channels: expected {len(dims)} and {sum(dims)}"
+        )
     pairs = tuple(combinations(range(len(dims)), 2))
     coherence = np.stack(
         [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
@@ -201,8 +216,8 @@ def diagnose(
             responses,
             given,
             dims=dims,
-            names=names or tuple(str(i + 1) for i in range(len(dims))),
-            channels=channels or tuple(str(r + 1) for d in dims for r in range(d)),
+            names=names,
+            channels=channels,
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
         ),

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.diagnostics import Diagnostics, diagnose
-from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 from estimator.factor_analysis import maximise
 from estimator.model_test import model_test
 from estimator.three_sensor import three_sensor
@@ -316,3 +316,18 @@ def test_refusals() -> None:
         diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
     with pytest.raises(InsufficientDataError, match="2 sensors"):
         diagnose(csm[:, :6, :6], FREQUENCY, dims=(3, 3), n_effective=100)
+    with pytest.raises(InvalidMatrixError, match="rising"):
+        diagnose(csm, FREQUENCY[::-1], dims=THREE, n_effective=100)
+    for n in (np.nan, np.inf, -1):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            diagnose(csm, FREQUENCY, dims=THREE, n_effective=n)
+    for labels in ({"names": ("a", "b")}, {"channels": ("x", "y", "z")}):
+        with pytest.raises(EstimatorError, match="expected 3 and 9"):
+            diagnose(csm, FREQUENCY, dims=THREE, n_effective=100, **labels)
+
+
+def test_lists_do_as_well_as_arrays() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))[:12]
+    array = diagnose(csm, FREQUENCY[:12], dims=THREE, n_effective=100)
+    lists = diagnose(csm.tolist(), FREQUENCY[:12].tolist(), dims=THREE, n_effective=100)
+    np.testing.assert_array_equal(lists.snr, array.snr)
