@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
 _FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
 _ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
+_LATEST = 5.0  # seconds that a device with UTC may take to send; beyond, the host's UTC is wrong
 _SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
 
 
@@ -212,6 +213,7 @@ class AlignedRecording:
     def set_clocks(self) -> None:
         """Set every clock by all that is known now."""
         sources = self._sources
+        self._place_stated()
         if self._at_face_value:
             for source in sources:
                 rate = source.record.sampling_rate
@@ -254,6 +256,14 @@ class AlignedRecording:
                 if clock.state.refined:  # against the reference, whose rate is not certain either
                     clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
                 source.clock = clock
+
+    def _place_stated(self) -> None:
+        """Move stated UTC to where it arrives, if the host's UTC, which others have, is wrong."""
+        stated = [source.arrivals for source in self._sources if source.device_utc]
+        if 0 < len(stated) < len(self._sources):
+            latency = min(arrivals.latency for arrivals in stated)
+            for arrivals in stated:
+                arrivals.moved = 0.0 if 0 <= latency < _LATEST else latency
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""

@@ -22,8 +22,9 @@ host's clock has been asleep.
 
 Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
-its nominal rate. A step of one second while the samples are counted on is a leap second: UTC's, and
-not the sensor's.
+its nominal rate. Beside sensors without UTC the host's UTC must place them; where arrivals show
+that to be wrong, statements are moved to where arrivals put them. A step of one second while the
+samples are counted on is a leap second: UTC's, and not the sensor's.
 """
 
 from __future__ import annotations
@@ -95,11 +96,20 @@ class ArrivalTimes:
         Nominal, in Hz.
     origin_monotonic_ns, origin_utc_ns : int
         The recording's origin on both host clocks.
+
+    Attributes
+    ----------
+    latency : float
+        Seconds at least from the last sample of a block, as stated, to its arrival.
+    moved : float
+        Seconds by which stated times are moved.
     """
 
     sampling_rate: float
     origin_monotonic_ns: int
     origin_utc_ns: int
+    latency: float = np.inf
+    moved: float = 0.0
     _epoch_starts: list[int] = field(default_factory=list)
     _index: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _late: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -127,12 +137,13 @@ class ArrivalTimes:
         begins = not self._epoch_starts
         if begins:
             self._device_utc = bool(flags[0] & BlockFlag.DEVICE_UTC)
+        arrived = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
         if self._device_utc:
             index = first
             elapsed = (blocks["device_counter"].astype(np.int64) - self.origin_utc_ns) * _NANO
         else:
             index = first + length - 1
-            elapsed = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
+            elapsed = arrived
         late = elapsed - index / self.sampling_rate
         if not self._device_utc:
             self._polls.add(index, late)
@@ -144,6 +155,8 @@ class ArrivalTimes:
             late -= np.cumsum(leaps)
             step -= leaps
             self._leapt += float(leaps.sum())
+            latency = arrived - late - (first + length - 1) / self.sampling_rate
+            self.latency = min(self.latency, float(latency.min()))
             breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
         else:
             # Far below all before, even if the rate is off: the host's clock stood still.
@@ -172,7 +185,7 @@ class ArrivalTimes:
         In seconds from the origin.
         """
         first = self._index <= self._index[0] + _NODE * self.sampling_rate
-        return float(self._late[first & (self._epoch == self._epoch[0])].min())
+        return float(self._late[first & (self._epoch == self._epoch[0])].min()) + self.moved
 
     def come_with(self, other: ArrivalTimes) -> bool:
         """Whether blocks of both are received together, so that both count alike."""
@@ -229,7 +242,8 @@ class ArrivalTimes:
             if np.ptp(late) < _UTC_TOLERANCE:
                 index = np.array([first, max(end, first + 1)], dtype=float)
                 late = np.full(2, late[0])
-            epochs.append(Epoch(first, end, index, index / self.sampling_rate + late))
+            seconds = index / self.sampling_rate + late + self.moved
+            epochs.append(Epoch(first, end, index, seconds))
         ppm, wander = 0.0, 0.0
         if any(len(epoch.index) > 2 for epoch in epochs):
             longest = max(epochs, key=lambda epoch: epoch.end_sample - epoch.first_sample)

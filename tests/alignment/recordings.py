@@ -31,6 +31,8 @@ class Sensor:
     late: float = 2e-4
     clock: str = ""
     utc: bool = False
+    utc_ahead: float = 0.0
+    """Seconds of what it states before the host's UTC."""
     gaps: tuple[tuple[int, int], ...] = ()
     """(first, end) of samples never received."""
     restarts: tuple[int, ...] = ()
@@ -54,7 +56,8 @@ def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
         flags, counter = BlockFlag.NONE, None
         if sensor.utc:
             flags = BlockFlag.DEVICE_UTC
-            counter = ORIGIN.utc_ns + round((sensor.start + first / sensor.rate) * 1e9)
+            stated = sensor.start + first / sensor.rate + sensor.utc_ahead
+            counter = ORIGIN.utc_ns + round(stated * 1e9)
         if first == 0 or first in sensor.restarts:
             flags |= BlockFlag.CLOCK_RESTART
         found.append(

@@ -51,6 +51,23 @@ def test_exact_times_align_whole_samples_and_name_the_start(tmp_path: Path) -> N
         assert aligned.start_utc_ns == 1_468_458_000_125_500_000
 
 
+@pytest.mark.parametrize("ahead", [0.0, 0.3, 30.0, -30.0, 10_800.0])  # of the host's UTC
+def test_a_sensor_with_utc_meets_those_without_whatever_the_host_takes_utc_for(
+    tmp_path: Path, ahead: float
+) -> None:
+    sensors = {
+        "a": Sensor(counts(3000, 1, 1), start=0.5),
+        "b": Sensor(counts(3000, 1, 2), start=0.7, utc=True, utc_ahead=ahead),
+        "c": Sensor(counts(3000, 1, 3), start=0.6, utc=True, utc_ahead=ahead),
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        offsets = [clock.offset for clock in aligned.clocks]
+        assert offsets == pytest.approx([0.5, 0.7, 0.6], abs=1e-3)
+        assert offsets[1] - offsets[2] == pytest.approx(0.1, abs=1e-9)
+        assert 2800 < aligned.n_available < 3000
+
+
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_gap_is_invalid_for_all_and_nothing_else_is(tmp_path: Path, shared: bool) -> None:
     clock = {name: "one" if shared else name for name in "abc"}
