@@ -49,6 +49,7 @@ def advise(
     dims: tuple[int, ...],
     names: tuple[str, ...],
     channels: tuple[str, ...],
+    n_factors: int,
     n_effective: float,
     nyquist: float,
 ) -> tuple[Advice, ...]:
@@ -66,6 +67,8 @@ def advise(
         Of the sensors.
     channels : tuple of str
         Names of all channels.
+    n_factors : int
+        Dimensions of the motion in the model that was tested.
     n_effective : float
     nyquist : float
         Hz.
@@ -76,8 +79,12 @@ def advise(
     """
     found = [
         *_absent(given, dims, names, channels),
-        *_incoherence(bands, dims, n_effective),
-        *_sensor_space(bands, dims),
+        *(
+            _too_few_dimensions(bands, n_factors)
+            if n_factors < max(dims)
+            else _incoherence(bands, dims, n_factors, n_effective)
+        ),
+        *_sensor_space(bands, dims, names),
         *_dimensions(bands, presence(given, dims).dims, n_effective),
         *_weak_motion(bands),
         *_left_in(bands, max(dims), n_effective),
@@ -89,6 +96,13 @@ def advise(
     ]
     order = {"problem": 0, "warning": 1, "note": 2}
     return tuple(sorted(found, key=lambda advice: order[advice.level]))
+
+
+def model(n_factors: int) -> str:
+    """Say what motion a model has, as the subject of a sentence."""
+    if n_factors == 0:
+        return "a model without motion"
+    return f"one motion of {n_factors} dimension{'s' if n_factors > 1 else ''}"
 
 
 def _runs(
@@ -182,8 +196,33 @@ def _absent(
         )
 
 
+def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Iterator[Advice]:
+    """Where fewer dimensions were asked for than the sensors feel."""
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
+        worst = max(run, key=lambda b: b.test.statistic / b.test.degrees)
+        most = worst.test.statistic / worst.test.degrees
+        mean = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
+        yield Advice(
+            "problem",
+            (),
+            _span(run),
+            f"At {in_hz(_span(run))} {model(n_factors)} does not explain what the sensors have in "
+            f"common (statistic {mean:.3g} times its expectation). The maximum likelihood estimate "
+            "is wrong there: what moves in further dimensions is counted as noise.",
+            {
+                "statistic over expectation": mean,
+                "worst": most,
+                "worst_low_hz": worst.low,
+                "worst_high_hz": worst.high,
+                "dimensions": n_factors,
+            },
+            "Leave out --dimension, or let it be chosen (--dimension auto).",
+        )
+
+
 def _incoherence(
-    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_factors: int, n_effective: float
 ) -> Iterator[Advice]:
     d = max(dims)
     crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
@@ -206,9 +245,8 @@ def _incoherence(
             else "any amount where waves cross sensors that stand apart, which three sensors of "
             f"{d} channel{'s' if d > 1 else ''} cannot show"
         )
-        few = "1 dimension" if d == 1 else f"{d} dimensions"
         text = (
-            f"At {in_hz(_span(run))} one motion of {few} does not explain what the sensors have in "
+            f"At {in_hz(_span(run))} {model(n_factors)} does not explain what the sensors have in "
             f"common (statistic {mean:.3g} times its expectation{at}"
             f"{'' if level == 'problem' else ': certain, but small'}). At worst "
             f"{percent(seen)} of the noise is unexplained, and the estimate "
@@ -248,26 +286,41 @@ def _incoherence(
         )
 
 
-def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
-    """Section 5: the motion's dimension against that of what a sensor can feel."""
-    d = max(dims)
+def _sensor_space(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], names: tuple[str, ...]
+) -> Iterator[Advice]:
+    """Section 5: the motion's dimension against that of what the compared channels can feel."""
     strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
-    if d == 3 or not strong:
+    if not strong:
         return
     snr = float(max(np.nanmax(band.snr) for band in strong))
     leaked = snr * np.sin(np.deg2rad(1)) ** 2
-    which = "planes" if d == 2 else "axes"
-    yield Advice(
-        "note",
-        (),
-        _span(strong),
-        f"Sensors of {d} channel{'s' if d > 1 else ''} feel {d} of three dimensions of motion: no "
-        f"bias if the motion has no more, or if their {which} are parallel; otherwise motion "
-        f"across them is taken for noise. At the SNR here ({ratio(snr)}) 1° between their {which} "
-        f"adds up to {percent(leaked)} of the noise.",
-        {"SNR": snr, "added by 1 degree": leaked},
-        f"Level or align the sensors so that their {which} are parallel, or use triaxial data.",
-    )
+    shared = [sorted(dims[:i] + dims[i + 1 :])[-2] for i in range(len(dims))]
+    for d in sorted({n for n in shared if n < 3}):
+        which = "planes" if d == 2 else "axes"
+        few = f"{d} channel{'s' if d > 1 else ''}"
+        targets = tuple(i for i, n in enumerate(shared) if n == d)
+        more = listed([name for name, n in zip(names, dims, strict=True) if n > d] or [""])
+        who = f"Sensors of {few} feel"
+        remedy = "triaxial data"
+        if more:
+            compared = listed([names[i] for i in targets])
+            who = (
+                f"For {compared} three-sensor and three-channel estimates compare {few} of every "
+                "sensor, and these feel"
+            )
+            remedy = f"maximum likelihood, which compares with the further channels of {more} too"
+        yield Advice(
+            "note",
+            targets if more else (),
+            _span(strong),
+            f"{who} {d} of three dimensions of motion: no bias if the motion has no more, or if "
+            f"their {which} are parallel; otherwise motion across them is taken for noise. At the "
+            f"SNR here ({ratio(snr)}) 1° between their {which} adds up to {percent(leaked)} of "
+            "the noise.",
+            {"SNR": snr, "added by 1 degree": leaked},
+            f"Level or align the sensors so that their {which} are parallel, or use {remedy}.",
+        )
 
 
 def _dimensions(

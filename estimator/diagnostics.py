@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
+from estimator import fisher
 from estimator.advice import Advice, advise
 from estimator.coherency import (
     check_averages,
@@ -24,7 +25,7 @@ from estimator.coherency import (
 )
 from estimator.dimension import bands
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.factor_analysis import maximise
+from estimator.factor_analysis import Maximum, maximise
 from estimator.model_test import BandTest, ModelTest, model_test, pool
 from estimator.presence import Presence, presence
 from estimator.response import (
@@ -93,6 +94,8 @@ class Diagnostics:
         dead or copies of others, of which the model and its test know nothing.
     model : ModelTest
         At every frequency.
+    n_factors : int
+        Dimensions of the motion in that model.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
         Of the pairs that can be compared: of sensors with all their channels.
@@ -107,6 +110,7 @@ class Diagnostics:
     dimension: FloatArray
     snr: FloatArray
     model: ModelTest
+    n_factors: int
     bands: tuple[BandDiagnosis, ...]
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
@@ -118,6 +122,7 @@ def diagnose(
     *,
     dims: tuple[int, ...],
     n_effective: float,
+    n_factors: int | None = None,
     neighbours: FloatArray | None = None,
     names: tuple[str, ...] | None = None,
     channels: tuple[str, ...] | None = None,
@@ -139,6 +144,9 @@ def diagnose(
     n_effective : float
         Independent averages. With no more than channels everything that needs the likelihood
         (SNR and model test) is NaN, and so with fewer than three sensors that have signal.
+    n_factors : int, optional
+        Dimensions of the motion in the model that is tested: those of the estimate that the
+        diagnosis goes with; ``max(dims)`` by default.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.model_test.neighbour_correlation`.
     names : tuple of str, optional
@@ -183,8 +191,15 @@ def diagnose(
     for one, two in combinations(range(len(there.sensors)), 2):
         pair = pairs.index((there.sensors[one], there.sensors[two]))
         condition[:, pair] = _condition(part.matrix, there.dims, one, two)
-    model, snr = _model(matrix, there, max(dims), n_effective)
-    snr = there.spread(snr, sum(dims))
+    d = max(dims)
+    q = d if n_factors is None else n_factors
+    fit = _fit(matrix, there, d, n_effective)
+    model = _test(
+        fit if q == d else _fit(matrix, there, q, n_effective), there, n_effective, len(csm)
+    )
+    snr = np.full((len(csm), sum(dims)), np.nan)
+    if fit is not None:
+        snr = there.spread(1 / np.maximum(fit.psi, np.finfo(np.float64).tiny) - 1, sum(dims))
     dimension = _dimension(matrix, there.dims, n_effective)
     number = bands(frequency)
     found = tuple(
@@ -209,6 +224,7 @@ def diagnose(
         dimension=dimension,
         snr=snr,
         model=model,
+        n_factors=q,
         bands=found,
         responses=responses,
         advice=advise(
@@ -218,6 +234,7 @@ def diagnose(
             dims=dims,
             names=names,
             channels=channels,
+            n_factors=q,
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
         ),
@@ -243,24 +260,36 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
     return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
 
 
-def _model(
-    matrix: ComplexArray, there: Presence, d: int, n_effective: float
-) -> tuple[ModelTest, FloatArray]:
-    """Model test and SNR at every frequency, NaN where unknown."""
-    n_freqs, p = matrix.shape[:2]
+def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | None:
+    """Fit motion of q dimensions; None with too few averages, sensors or channels for it."""
+    if n_effective <= matrix.shape[1] or len(there.sensors) < 3:
+        return None
+    try:
+        return maximise(matrix, q)
+    except InsufficientDataError:
+        return None
+
+
+def _test(maximum: Maximum | None, there: Presence, n_effective: float, n_freqs: int) -> ModelTest:
+    """Model test at every frequency, NaN where there is none.
+
+    Where two channels alone feel a dimension their noise can be divided between them anyhow. Such
+    a direction of ln psi, known to no better than a factor e, is a parameter that does not help
+    the fit. With equal sensors there is none, but for further dimensions.
+    """
     unknown = np.full(n_freqs, np.nan)
-    nothing = ModelTest(unknown, unknown, unknown), np.full((n_freqs, p), np.nan)
-    if n_effective <= p or len(there.sensors) < 3:
-        return nothing
+    if maximum is None:
+        return ModelTest(unknown, unknown, unknown)
     try:
-        maximum = maximise(matrix, d)
-    except InsufficientDataError:  # too few channels to tell the noise from the motion
-        return nothing
-    snr = 1 / np.maximum(maximum.psi, np.finfo(np.float64).tiny) - 1
-    try:
-        return model_test(maximum, n_effective=n_effective), snr
-    except InsufficientDataError:  # as many parameters as averages
-        return nothing[0], snr
+        test = model_test(maximum, n_effective=n_effective)
+    except InsufficientDataError:  # as many parameters as the matrix has
+        return ModelTest(unknown, unknown, unknown)
+    if len(set(there.dims)) == 1 and maximum.n_factors <= there.dims[0]:
+        return test
+    information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
+    idle = (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
+    degrees = test.degrees + idle
+    return ModelTest(test.statistic, degrees, np.asarray(special.chdtrc(degrees, test.statistic)))
 
 
 def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:

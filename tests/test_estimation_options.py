@@ -197,8 +197,9 @@ def test_the_dimension_is_chosen_by_band_and_lowers_the_scatter(tmp_path: Path) 
     found = estimate([path], replace(usual, dimension="auto"))
     choices = found.diagnostics["dimension"]
     assert sum(choice.n_factors == 1 for choice in choices) >= 0.8 * len(choices)
-    with_one = estimate([path], replace(usual, dimension=1)).results["maximum-likelihood"].cov
-    with_three = estimate([path], usual).results["maximum-likelihood"].cov
+    one, three = (estimate([path], replace(usual, dimension=q)) for q in (1, None))
+    with_one, with_three = (each.results["maximum-likelihood"].cov for each in (one, three))
+    assert [each.diagnostics["n_factors"] for each in (one, three, found)] == [1, 3, 3]
     assert np.nanmedian(with_one[1:-1]) < 0.9 * np.nanmedian(with_three[1:-1])
     with pytest.raises(InsufficientDataError, match="at most"):
         estimate([path], replace(usual, dimension=9))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from estimator.advice import model
 from estimator.wording import ratio
 from tui.text import signed
 
@@ -46,15 +47,37 @@ def summary(snapshot: Snapshot) -> list[str]:
             )
     tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
     if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
-        lines.append("model test: one common motion explains what the sensors share, in all bands")
-    if tested and not any(math.isfinite(p_value) for p_value in tested) and "sensors" not in kinds:
         lines.append(
-            f"model test: none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
-            f"channels ({len(snapshot.channels)})"
+            f"model test: {_model(snapshot)} explains what the sensors share, in all bands"
         )
+    if tested and not any(math.isfinite(p_value) for p_value in tested) and "sensors" not in kinds:
+        lines.append(_why_not_tested(snapshot))
     if "dimension" in snapshot.diagnostics:
         lines += _dimensions(snapshot)
     return lines
+
+
+def _why_not_tested(snapshot: Snapshot) -> str:
+    n_channels = len(snapshot.channels)
+    if snapshot.n_effective > n_channels:
+        return (
+            f"model test: not possible: {model(_n_factors(snapshot))} explains whatever these "
+            "channels share, as they are too few for it"
+        )
+    return (
+        f"model test: none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
+        f"channels ({n_channels})"
+    )
+
+
+def _n_factors(snapshot: Snapshot) -> int:
+    return int(snapshot.diagnostics.get("n_factors", max(snapshot.dims)))
+
+
+def _model(snapshot: Snapshot) -> str:
+    """Say what was tested: of how many dimensions, where these are not the usual ones."""
+    n_factors = _n_factors(snapshot)
+    return "one common motion" if n_factors == max(snapshot.dims) else model(n_factors)
 
 
 def _odd_one(found: Sequence[Advice], names: list[str]) -> str:
@@ -175,8 +198,11 @@ def _fails(found: Sequence[Advice], _names: list[str]) -> str:
     most = by_worst[0].numbers
     where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in by_worst)
     effect = by_worst[0].text.partition("). ")[2].rstrip(".")
+    tested = "one common motion"
+    if "dimensions" in most:
+        tested = model(int(most["dimensions"]))
     return (
-        f"model test fails at {where}: one common motion does not explain what the sensors share "
+        f"model test fails at {where}: {tested} does not explain what the sensors share "
         f"(in brackets its statistic over the expectation, at worst, which is at "
         f"{most['worst_low_hz']:.3g}–{most['worst_high_hz']:.3g} Hz). {effect}"
     )

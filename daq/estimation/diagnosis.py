@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from daq.bench_model import Channel
     from daq.clock_model import ClockState
+    from daq.estimation.results import Dimensions
     from estimator.advice import Advice
     from estimator.multiresolution import Band
     from estimator.self_noise import SelfNoise
@@ -86,19 +87,23 @@ def diagnosis(
     dims: tuple[int, ...],
     channels: Sequence[tuple[str, Channel]],
     *,
+    dimensions: Dimensions | None = None,
     faulty: Collection[str] = (),
 ) -> dict[str, Any]:
     """Diagnose the test.
 
-    Of `faulty` channels (such as ``A.X``) it is known that they are cut off, or were dead for a
-    while: no sensitivity of theirs is called wrong.
+    The model tested has as many dimensions as were asked for, or as the largest sensor has
+    channels where `dimensions` were chosen by the motion. Of `faulty` channels (such as ``A.X``)
+    it is known that they are cut off, or were dead for a while: no sensitivity of theirs is called
+    wrong.
 
     Returns
     -------
     dict
         ``bands``, ``responses`` and ``advice`` as `estimator.diagnostics.Diagnostics` has them;
-        ``pairs`` (names of sensors) and ``per_frequency``, a dict of its arrays. Where each octave
-        has its own segments, sensors are compared by the octave in which they are most coherent.
+        ``n_factors``, the dimensions of the model tested; ``pairs`` (names of sensors) and
+        ``per_frequency``, a dict of its arrays. Where each octave has its own segments, sensors
+        are compared by the octave in which they are most coherent.
         Empty where there is too little to diagnose.
     """
     sensors = list(dict.fromkeys(sensor for sensor, _ in channels))
@@ -107,6 +112,9 @@ def diagnosis(
         for sensor in sensors
     }
     vertical = verticals.pop() if len(verticals) == 1 else None
+    n_factors = None
+    if dimensions is not None and not dimensions.chosen:
+        n_factors = int(dimensions.n_factors[0][0])
     found: list[Diagnostics] = []
     known = [_n_known(band) for band in bands]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -117,6 +125,7 @@ def diagnosis(
                     band.frequencies[:count],
                     dims=dims,
                     n_effective=band.n_effective,
+                    n_factors=n_factors,
                     neighbours=neighbours(band),
                     names=tuple(sensors),
                     channels=tuple(channel.name for _, channel in channels),
@@ -139,6 +148,7 @@ def diagnosis(
             if (each is clearest or not advice.sensors)
             and not _is_explained(advice, labels, faulty)
         ),
+        "n_factors": found[0].n_factors,
         "pairs": tuple((sensors[j], sensors[k]) for j, k in found[0].pairs),
         "per_frequency": {
             **{

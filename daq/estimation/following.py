@@ -238,7 +238,13 @@ class Estimation:
             diagnostics["dimension"] = estimates.dimensions.chosen
         if final:
             faulty = self._clipped() | self._dead_for_a_while()
-            diagnostics |= diagnosis(bands, dims, channels, faulty=set().union(*faulty.values()))
+            diagnostics |= diagnosis(
+                bands,
+                dims,
+                channels,
+                dimensions=estimates.dimensions,
+                faulty=set().union(*faulty.values()),
+            )
             diagnostics |= faulty
         return Snapshot(
             frequency=frequency,

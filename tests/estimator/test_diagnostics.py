@@ -283,6 +283,62 @@ def test_sensors_of_fewer_channels_are_told_what_their_sensor_space_asks(d: int)
     )
 
 
+@pytest.mark.parametrize(
+    ("dims", "concerned"),
+    [
+        ((3, 2, 2), [(2, (0, 1, 2))]),
+        ((3, 3, 2), [(2, (0, 1))]),
+        ((3, 2, 1), [(1, (0, 1)), (2, (2,))]),
+        ((3, 3, 2, 3), []),
+    ],
+)
+def test_sensors_of_unequal_channels_are_told_which_of_them_are_compared(
+    dims: tuple[int, ...], concerned: list[tuple[int, tuple[int, ...]]]
+) -> None:
+    """As `three_sensor` does: with the two other sensors that have most channels."""
+    csm = bench(*(np.eye(3)[:k] for k in dims))
+    found = diagnose(
+        averages(csm), FREQUENCY, dims=dims, n_effective=1080, names=tuple("ABCD")[: len(dims)]
+    )
+    space = [advice for advice in found.advice if "three dimensions of motion" in advice.text]
+    assert [advice.sensors for advice in space] == [sensors for _, sensors in concerned]
+    for advice, (d, _) in zip(space, concerned, strict=True):
+        assert f"these feel {d} of three" in advice.text
+        assert "maximum likelihood, which compares with the further channels of A" in advice.remedy
+
+
+@pytest.mark.parametrize("dims", [(3, 2, 1), (3, 3, 1), (2, 2, 1)])
+def test_a_good_bench_of_unequal_sensors_is_seldom_said_to_fail(dims: tuple[int, ...]) -> None:
+    """Two channels alone feel a dimension: their noise is divided anyhow, and fits no better."""
+    n, n_freqs = 1080, 1500
+    directions = [
+        Rotation.from_euler("x", 3 * i, degrees=True).as_matrix()[:k] for i, k in enumerate(dims)
+    ]
+    csm = np.broadcast_to(bench(*directions), (n_freqs, sum(dims), sum(dims)))
+    draws = wishart(csm, n, np.random.default_rng(6))[0]
+    model = diagnose(draws, np.arange(1.0, n_freqs + 1), dims=dims, n_effective=n).model
+    degrees = model.degrees.sum()
+    assert model.statistic.sum() < degrees + 4 * np.sqrt(2 * degrees)
+    assert np.mean(model.p_value < 0.01) < 0.01 + 4 * np.sqrt(0.01 / n_freqs)
+
+
+def test_a_model_of_fewer_dimensions_than_the_motion_fails_in_its_own_name() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    for q, model in ((0, "a model without motion"), (1, "one motion of 1 dimension"), (3, "")):
+        found = diagnose(
+            csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q, neighbours=INDEPENDENT
+        )
+        failing = [advice for advice in found.advice if "does not explain" in advice.text]
+        assert found.n_factors == q
+        assert bool(failing) == bool(model)
+        for advice in failing:
+            assert advice.level == "problem"
+            assert f"{model} does not explain what the sensors have in common" in advice.text
+            assert "--dimension auto" in advice.remedy
+        assert np.median(found.snr) > 50  # whatever is tested
+    assert np.isfinite(found.model.p_value).all()
+
+
 @pytest.mark.parametrize("rank", [0, 1])
 def test_the_dimension_is_overrated_as_seldom_as_its_level_says(rank: int) -> None:
     """Bartlett's degrees of freedom: with fewer it would be too often, with more hardly ever."""

@@ -28,7 +28,12 @@ if TYPE_CHECKING:
     from estimator.arrays import FloatArray
 
 
-def diagnosed(change: FloatArray | None = None, *, n_effective: float = 400.0) -> Snapshot:
+def diagnosed(
+    change: FloatArray | None = None,
+    *,
+    n_effective: float = 400.0,
+    n_factors: int | None = None,
+) -> Snapshot:
     """Return a finished snapshot with the diagnosis of its averages, changed before."""
     snapshot = made_snapshot(n_effective=n_effective, closed=True)
     csm = snapshot.csm if change is None else change @ snapshot.csm @ change.T
@@ -37,6 +42,7 @@ def diagnosed(change: FloatArray | None = None, *, n_effective: float = 400.0) -
         snapshot.frequency[::2],
         dims=snapshot.dims,
         n_effective=n_effective,
+        n_factors=n_factors,
         names=SENSORS,
         channels=CHANNELS * 3,
         vertical=2,
@@ -45,6 +51,7 @@ def diagnosed(change: FloatArray | None = None, *, n_effective: float = 400.0) -
         "bands": found.bands,
         "responses": found.responses,
         "advice": found.advice,
+        "n_factors": found.n_factors,
     }
     return replace(snapshot, csm=csm, diagnostics=diagnostics)
 
@@ -157,6 +164,25 @@ def test_too_few_averages_for_the_model_test_are_said() -> None:
     assert any("it takes more averages (9 now) than channels (9)" in x for x in summary(early))
     assert "nan" not in shown(details(early))
     assert not any("none yet" in line for line in summary(diagnosed()))
+
+
+def test_the_model_that_is_tested_is_the_one_that_gave_the_numbers() -> None:
+    explained = "one common motion explains what the sensors share, in all bands"
+    assert f"model test: {explained}" in summary(diagnosed())
+    for n_factors, model in ((0, "a model without motion"), (1, "one motion of 1 dimension")):
+        lines = summary(diagnosed(n_factors=n_factors))
+        (line,) = [line for line in lines if line.startswith("model test")]
+        assert line.startswith("model test fails at")
+        assert f": {model} does not explain what the sensors share" in line
+        assert "estimate is wrong there" in line
+        assert "--dimension auto" in line
+    (line,) = [x for x in summary(diagnosed(n_factors=4)) if x.startswith("model test")]
+    assert line.startswith("model test: one motion of 4 dimensions explains")
+
+
+def test_too_few_channels_for_the_model_test_are_no_too_few_averages() -> None:
+    (line,) = [x for x in summary(diagnosed(n_factors=6)) if x.startswith("model test")]
+    assert line.startswith("model test: not possible: one motion of 6 dimensions explains whatever")
 
 
 def test_a_channel_without_signal_has_no_level() -> None:
