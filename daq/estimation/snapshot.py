@@ -37,16 +37,20 @@ class SensorState:
     n_samples: int
     n_gaps: int
     n_missing: int
+    last_seen: float
+    """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
     @classmethod
     def of(cls, record: SensorRecord) -> SensorState:
         """Return the state of a sensor of a recording."""
+        last = record.blocks[-1:]["utc_ns"]
         return cls(
             name=record.name,
             sampling_rate=record.sampling_rate,
             n_samples=record.n_samples,
             n_gaps=len(record.gaps),
             n_missing=int(record.gaps["missing"].sum()),
+            last_seen=float(last[0]) * 1e-9 if len(last) else float("nan"),
         )
 
 

@@ -69,8 +69,8 @@ def made_snapshot(
         time_left=None if closed else 260.0,
         start_utc_ns=1_795_230_000_000_000_000,
         sensors=tuple(
-            SensorState(name, RATE, n_samples, n_gaps, 7 * n_gaps)
-            for name, n_gaps in (("A", 0), ("B", 2), ("C", 0))
+            SensorState(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
+            for name, n_gaps, last_seen in (("A", 0, 1000.0), ("B", 2, 1000.0), ("C", 0, 988.0))
         ),
         clocks=tuple(
             ClockState(
@@ -140,7 +140,7 @@ def empty_snapshot() -> Snapshot:
         n_effective=0.0,
         elapsed=0.0,
         time_left=None,
-        sensors=tuple(replace(s, n_samples=0) for s in full.sensors),
+        sensors=tuple(replace(s, n_samples=0, last_seen=float("nan")) for s in full.sensors),
     )
 
 
