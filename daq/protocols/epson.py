@@ -46,7 +46,6 @@ class Register(NamedTuple):
 
 MODE_CTRL = Register(0, 0x02)
 DIAG_STAT = Register(0, 0x04)
-FLAG = Register(0, 0x06)
 COUNT = Register(0, 0x0A)
 TEMP_HIGH = Register(0, 0x0E)
 ACCELERATION_HIGH = (Register(0, 0x30), Register(0, 0x34), Register(0, 0x38))

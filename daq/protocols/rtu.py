@@ -24,7 +24,6 @@ READ_HOLDING = 3
 READ_INPUT = 4
 WRITE_SINGLE = 6
 WRITE_MULTIPLE = 16
-MAX_REGISTERS = 125
 MAX_FRAME = 256
 _EXCEPTION_SIZE = 5
 
@@ -100,14 +99,11 @@ class ReplyFinder:
         self._function = 0
         self._size = 0
         self._heard = bytearray()
-        self.n_skipped = 0
-        """Bytes that were no part of the reply, since the request."""
 
     def expect(self, request: bytes) -> None:
         """Wait for the reply to ``request``; whatever came before is forgotten."""
         self._buffer.clear()
         self._heard.clear()
-        self.n_skipped = 0
         self._unit, self._function = request[0], request[1]
         reads = self._function in (READ_HOLDING, READ_INPUT)
         self._size = 5 + 2 * int.from_bytes(request[4:6], "big") if reads else 8
@@ -130,7 +126,6 @@ class ReplyFinder:
     def receive(self, received: bytes) -> Reply | None:
         """Take bytes; return the reply once it is whole."""
         if not self.waiting:
-            self.n_skipped += len(received)
             return None
         self._buffer += received
         self._heard += received[: MAX_FRAME - len(self._heard)]
@@ -138,7 +133,6 @@ class ReplyFinder:
         head = bytes((self._unit,))
         here = 0
         while (at := buffer.find(head, here)) >= 0:
-            self.n_skipped += at - here
             here = at
             if len(buffer) < here + 2:
                 break
@@ -156,9 +150,7 @@ class ReplyFinder:
                         return Reply(b"", frame[2])
                     return Reply(frame[2:-2])
             here += 1
-            self.n_skipped += 1
         else:
-            self.n_skipped += len(buffer) - here
             here = len(buffer)
         del self._buffer[:here]
         return None

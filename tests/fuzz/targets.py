@@ -190,7 +190,7 @@ def fifo(fuzzed: bytes) -> None:
         decoder.request()
         with contextlib.suppress(RemoteProtocolError):
             decoder.receive(read, at)
-            size = min(len(read), 2 * rtu.MAX_REGISTERS) & 0xFE
+            size = min(len(read), rtu.MAX_FRAME - 6) & 0xFE
             whole = rtu.encode(1, bytes((4, size)) + read[:size])
             decoder.receive(whole, at)
         if decoder.waiting:

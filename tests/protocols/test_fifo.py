@@ -65,14 +65,13 @@ def test_requests_and_replies() -> None:
 @pytest.mark.parametrize("step", [1, 3, 100])
 @pytest.mark.parametrize("before", [b"", b"\x01\x04\x08\x00", b"\x01\x84\x02\x00\x00", b"\x01" * 9])
 def test_a_reply_is_found_in_anything(step: int, before: bytes) -> None:
-    """Half a reply, a damaged refusal, the unit's address repeated: skipped, and counted."""
+    """Half a reply, a damaged refusal, the unit's address repeated: skipped."""
     finder = ReplyFinder()
     finder.expect(rtu.read_request(1, 2, 4))
     line = before + rtu.encode_registers(1, 4, np.arange(4, dtype=np.uint16))
     replies = [finder.receive(line[i : i + step]) for i in range(0, len(line), step)]
     found = [reply for reply in replies if reply is not None]
     assert [reply.registers.tolist() for reply in found] == [[0, 1, 2, 3]]
-    assert finder.n_skipped == len(before)
     assert not finder.waiting
 
 
