@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.base import DeviceInformation
-from daq.drivers.modbus import ModbusBus, RefusedError, open_bus
+from daq.drivers.modbus import ModbusBus, RefusedError, Reply, open_bus
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import registers as protocol
 from daq.protocols.block import Block, Event
@@ -80,7 +80,7 @@ class RegisterSettings(BaseModel):
     stop_bits: Literal[1, 2] = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Polled:
     """One sensor on the bus."""
 
@@ -88,6 +88,8 @@ class _Polled:
     settings: RegisterSettings
     registers: RegisterMap
     device_id: int
+    apart: bool = False
+    """Whether the device refuses registers that lie between those that are needed."""
 
     @classmethod
     def of(cls, sensor: Sensor) -> _Polled:
@@ -103,17 +105,19 @@ class _Polled:
     async def prepare(self, bus: ModbusBus) -> DeviceInformation:
         """Set up the device where its preset says how, and see that it answers."""
         wanted = (
-            f"sensor {self.sensor.name!r}: expected registers {self.registers.first} to"
-            f" {self.registers.first + self.registers.count - 1} of device {self.device_id}"
+            f"sensor {self.sensor.name!r}: expected registers {self.registers} of device"
+            f" {self.device_id}"
         )
         try:
             if self.settings.preset == "witmotion":
                 await self._set_witmotion_rate(bus)
-            r = self.registers
-            reply = await bus.read(r.function, self.device_id, r.first, r.count)
-            RegisterDecoder(
-                self.sensor.name, self.registers, sampling_rate=self.sensor.sampling_rate
-            ).receive(reply.registers, reply.sent, reply.received)
+            try:
+                await self.read(bus)
+            except RefusedError as error:
+                if error.code in GATEWAY_CODES or self.apart:
+                    raise
+                self.apart = True
+                await self.read(bus)
         except NoAnswerError as error:
             raise NoAnswerError(
                 f"{wanted}; {error}; check cable, power, device_id and baud_rate"
@@ -128,6 +132,29 @@ class _Polled:
             sampling_rate=self.sensor.sampling_rate,
             details={"polled": "each sample at its own instant"},
         )
+
+    async def read(self, bus: ModbusBus) -> Reply:
+        """Ask for the registers that are needed.
+
+        Raises
+        ------
+        RemoteProtocolError
+            A reply does not hold as many registers as were asked for.
+        DeviceError
+            As of :meth:`ModbusBus.read`.
+        """
+        held: dict[int, int] = {}
+        replies: list[Reply] = []
+        for first, count in self.registers.reads(apart=self.apart):
+            reply = await bus.read(self.registers.function, self.device_id, first, count)
+            if len(reply.registers) != count:
+                raise RemoteProtocolError(
+                    f"{count} registers asked for, {len(reply.registers)} came"
+                )
+            held |= dict(enumerate(reply.registers, first))
+            replies.append(reply)
+        registers = [held[address] for address in self.registers.needed]
+        return Reply(registers, replies[0].sent, replies[-1].received)
 
     async def _set_witmotion_rate(self, bus: ModbusBus) -> None:
         code = protocol.WITMOTION_RATES.get(self.sensor.sampling_rate)
@@ -159,10 +186,9 @@ class _Poller:
         """Ask once; what goes wrong becomes an event."""
         if self.is_gone:
             return await self._retry(bus)
-        r = self._polled.registers
         found: list[Block | Event] = []
         try:
-            reply = await bus.read(r.function, self._polled.device_id, r.first, r.count)
+            reply = await self._polled.read(bus)
             found = self._decoder.receive(reply.registers, reply.sent, reply.received)
         except NoAnswerError as error:
             found = self._unanswered(str(error))

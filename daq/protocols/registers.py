@@ -2,12 +2,14 @@
 
 Theory of operation
 -------------------
-A device is asked again and again for one stretch of registers that holds all channels and, where
-there are such, a counter and a time. Each reply is one sample, taken at its own instant: at the
-device's time if it tells one, else halfway between request and reply. Rows are gathered and decoded
-together. Index and nominal rate only number the samples; the instants say when they were taken,
-and where two are more than ``GAP`` periods apart samples are missing between. A reply whose counter
-or time is that of the one before is the same reading again, and dropped.
+A device is asked again and again for the registers that hold all channels and, where there are
+such, a counter and a time: in one request, so that they belong together, or in several where one
+reply would not hold them, or where a device refuses the registers that lie between. What came is
+one sample, taken at its own instant: at the device's time if it tells one, else halfway between
+first request and last reply. Rows are gathered and decoded together. Index and nominal rate only
+number the samples; the instants say when they were taken, and where two are more than ``GAP``
+periods apart samples are missing between. A reply whose counter or time is that of the one before
+is the same reading again, and dropped.
 
 Both roles are here: the simulated device encodes with the same map.
 """
@@ -39,6 +41,7 @@ TimeFormat: TypeAlias = Literal["witmotion", "uint32-s", "uint32-ms", "uint32-us
 DATA_TYPES: tuple[str, ...] = get_args(DataType)
 MOST_REGISTERS = 125
 """In one Modbus reply."""
+N_ADDRESSES = 65536
 GATHER = 0.25
 """Samples of so much host time make a block, s."""
 GAP = 2.5
@@ -118,6 +121,10 @@ class RegisterMap:
             raise ValueError(
                 f"settings.addresses: {len(addresses)} given; expected {n_channels}, one a channel"
             )
+        if "time_format" in chosen and "time_address" not in chosen:
+            raise ValueError(
+                f"settings.time_format = {chosen['time_format']!r}: expected with time_address only"
+            )
         found = cls(
             function=chosen.get("function", 3),
             addresses=addresses,
@@ -127,10 +134,11 @@ class RegisterMap:
             time_address=chosen.get("time_address"),
             time_format=chosen.get("time_format", "uint32-ms"),
         )
-        if found.count > MOST_REGISTERS:
+        end = max(address + words for address, words in found._extents)
+        if end > N_ADDRESSES:
             raise ValueError(
-                f"settings: registers {found.first} to {found.first + found.count - 1} are"
-                f" {found.count}; expected at most {MOST_REGISTERS}, which is what one reply holds"
+                f"settings: registers up to {end - 1}; expected at most {N_ADDRESSES - 1}, which is"
+                " the last there is"
             )
         return found
 
@@ -150,31 +158,47 @@ class RegisterMap:
         return np.dtype(self.data_type)
 
     @property
-    def first(self) -> int:
-        """Address of the first register to read."""
-        return min(address for address, _ in self._extents)
+    def needed(self) -> tuple[int, ...]:
+        """Addresses of all registers that mean something, rising: the columns of a reading."""
+        return tuple(sorted({a + k for a, words in self._extents for k in range(words)}))
 
-    @property
-    def count(self) -> int:
-        """How many registers to read."""
-        return max(address + words for address, words in self._extents) - self.first
+    def reads(self, *, apart: bool = False) -> tuple[tuple[int, int], ...]:
+        """Return what to ask for: first address and number of registers of each request.
+
+        As few as can be, each of at most ``MOST_REGISTERS`` and each value in one; ``apart``
+        without any register that is not needed.
+        """
+        reads: list[tuple[int, int]] = []
+        for address, words in sorted(self._extents):
+            first, count = reads[-1] if reads else (address, 0)
+            end = max(first + count, address + words)
+            joins = address <= first + count or not apart
+            if reads and joins and end - first <= MOST_REGISTERS:
+                reads[-1] = (first, end - first)
+            else:
+                reads.append((address, words))
+        return tuple(reads)
+
+    def __str__(self) -> str:
+        """Say which registers are read."""
+        return ", ".join(f"{first} to {first + count - 1}" for first, count in self.reads())
 
     def counts(self, registers: NDArray[np.uint16]) -> CountsArray:
-        """Decode readings: registers (n, count) → counts (n, n_channels) of :attr:`dtype`."""
-        start = np.array(self.addresses) - self.first
+        """Decode readings: registers (n, n_needed) → counts (n, n_channels) of :attr:`dtype`."""
+        start = np.searchsorted(self.needed, self.addresses)
         return self._values(registers, start, self.dtype)
 
     def counters(self, registers: NDArray[np.uint16]) -> NDArray[np.int64] | None:
         """Return the counter of each reading, (n,)."""
         if self.counter_address is None:
             return None
-        return registers[:, self.counter_address - self.first].astype(np.int64)
+        return registers[:, self.needed.index(self.counter_address)].astype(np.int64)
 
     def times_ns(self, registers: NDArray[np.uint16]) -> NDArray[np.int64] | None:
         """Return the device's time of each reading in ns since an epoch of its own, (n,)."""
         if self.time_address is None:
             return None
-        start = self.time_address - self.first
+        start = self.needed.index(self.time_address)
         if self.time_format == "witmotion":
             return _witmotion_ns(registers[:, start : start + 4].astype(np.int64))
         kind = np.dtype(self.time_format.partition("-")[0])
@@ -268,17 +292,16 @@ class RegisterDecoder:
     def receive(
         self, registers: Sequence[int], sent: HostTime, at: HostTime
     ) -> list[Block | Event]:
-        """Take one reply; ``sent`` is when it was asked for.
+        """Take the registers the map needs; ``sent`` is when the first were asked for.
 
         Raises
         ------
         RemoteProtocolError
             It does not hold as many registers as were asked for.
         """
-        if len(registers) != self._map.count:
-            raise RemoteProtocolError(
-                f"{self._map.count} registers asked for, {len(registers)} came"
-            )
+        n_needed = len(self._map.needed)
+        if len(registers) != n_needed:
+            raise RemoteProtocolError(f"{n_needed} registers needed, {len(registers)} came")
         self._rows.append(registers)
         self._sent.append(sent.monotonic_ns)
         self._received.append(at.monotonic_ns)

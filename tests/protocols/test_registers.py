@@ -44,13 +44,13 @@ def as_array(registers: list[int]) -> NDArray[np.uint16]:
 )
 def test_values(data_type: str, word_order: str, registers: list[int], value: float) -> None:
     found = RegisterMap.of({"address": 7, "data_type": data_type, "word_order": word_order}, 1)
-    assert (found.first, found.count) == (7, len(registers))
+    assert found.reads() == ((7, len(registers)),)
     assert found.counts(as_array(registers)).tolist() == [[value]]
     assert found.counts(as_array(registers)).dtype == np.dtype(data_type)
 
 
 def test_witmotion_reads_time_and_acceleration_together() -> None:
-    assert (WITMOTION.function, WITMOTION.first, WITMOTION.count) == (3, 0x30, 7)
+    assert (WITMOTION.function, WITMOTION.reads()) == (3, ((0x30, 7),))
     # 2022-03-21 13:45:59.250, as its manual packs it: the first named is the low byte
     registers = as_array([0x0316, 0x0D15, 0x3B2D, 250, 0x0800, 0xF800, 0x7FFF])
     assert WITMOTION.counts(registers).tolist() == [[2048, -2048, 32767]]
@@ -61,7 +61,39 @@ def test_witmotion_reads_time_and_acceleration_together() -> None:
 
 def test_labjack_inputs_are_floats_two_registers_apart() -> None:
     found = RegisterMap.of({"preset": "labjack-ain"}, 3)
-    assert (found.function, found.addresses, found.count) == (4, (0, 2, 4), 6)
+    assert (found.function, found.addresses, found.reads()) == (4, (0, 2, 4), ((0, 6),))
+
+
+@pytest.mark.parametrize(
+    ("given_settings", "together", "apart"),
+    [
+        (
+            {"addresses": (10, 20, 30), "data_type": "float64"},
+            ((10, 24),),
+            ((10, 4), (20, 4), (30, 4)),
+        ),
+        ({"addresses": (3, 2, 1), "time_address": 4}, ((1, 5),), ((1, 5),)),
+        ({"addresses": (0, 200, 60000)}, ((0, 1), (200, 1), (60000, 1)), None),
+        ({"addresses": (5, 5, 6), "counter_address": 3}, ((3, 4),), ((3, 1), (5, 2))),
+    ],
+)
+def test_as_few_requests_as_can_be(
+    given_settings: dict[str, Any],
+    together: tuple[tuple[int, int], ...],
+    apart: tuple[tuple[int, int], ...] | None,
+) -> None:
+    found = RegisterMap.of(given_settings, 3)
+    assert found.reads() == together
+    assert found.reads(apart=True) == (apart or together)
+    assert len(found.needed) == sum(count for _, count in apart or together)
+
+
+def test_a_value_is_never_split_between_two_replies() -> None:
+    found = RegisterMap.of({"address": 1, "data_type": "int64", "word_order": "little"}, 40)
+    assert found.reads() == ((1, 124), (125, 36))
+    held = found.encode(np.arange(40) + 10)
+    registers = as_array([held[address] for address in found.needed])
+    assert found.counts(registers).tolist() == [list(range(10, 50))]
 
 
 @given(
@@ -87,7 +119,7 @@ def test_what_a_device_holds_is_what_is_read(
     values = np.arange(n_channels) + 1
     time_ns = 1_790_000_000 * 10**9 if "s" in time_format[-2:] else 1_790_000_000_123 * MS
     held = found.encode(values, counter=70000, time_ns=time_ns)
-    registers = as_array([held.get(found.first + k, 0) for k in range(found.count)])
+    registers = as_array([held[address] for address in found.needed])
     assert found.counts(registers).tolist() == [values.tolist()]
     counters, times = found.counters(registers), found.times_ns(registers)
     assert counters is not None
@@ -102,7 +134,9 @@ def test_what_a_device_holds_is_what_is_read(
     [
         ({}, "address is missing"),
         ({"addresses": (1, 2)}, "2 given; expected 3"),
-        ({"addresses": (0, 1, 125)}, "are 126; expected at most 125"),
+        ({"address": 65531, "data_type": "int32"}, "up to 65536; expected at most 65535"),
+        ({"address": 0, "counter_address": 65536}, "up to 65536; expected at most 65535"),
+        ({"address": 0, "time_format": "uint32-s"}, "expected with time_address only"),
     ],
 )
 def test_maps_that_cannot_be(given_settings: dict[str, Any], message: str) -> None:
@@ -160,12 +194,12 @@ def test_the_same_reading_twice_is_one() -> None:
 
 def test_the_device_time_gives_the_instant_whatever_the_latency() -> None:
     latency = np.random.default_rng(1).uniform(1, 8, 400)
-    one = decoder(rate=100.0, time_address=2, time_format="uint32-ms")
+    one = decoder(rate=100.0, time_address=1, time_format="uint32-ms")
     instants = []
     for k in range(400):
         taken = 10.0 * k
         words = [(50_000 + 10 * k) >> 16, (50_000 + 10 * k) & 0xFFFF]
-        for item in one.receive([k, 0, *words], host(taken), host(taken + latency[k])):
+        for item in one.receive([k, *words], host(taken), host(taken + latency[k])):
             assert isinstance(item, Block)
             assert item.instants_ns is not None
             instants += item.instants_ns.tolist()
@@ -175,9 +209,9 @@ def test_the_device_time_gives_the_instant_whatever_the_latency() -> None:
 
 
 def test_a_device_time_that_jumps_restarts_the_clock() -> None:
-    one = decoder(rate=4.0, time_address=2, time_format="uint32-s")
-    one.receive([0, 0, 0, 100], host(0), host(0))
-    found = one.receive([0, 0, 0, 5000], host(250), host(250))
+    one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
+    one.receive([0, 0, 100], host(0), host(0))
+    found = one.receive([0, 0, 5000], host(250), host(250))
     assert isinstance(found[0], Event)
     assert found[0].kind == "reset"
     assert isinstance(found[1], Block)
@@ -186,9 +220,9 @@ def test_a_device_time_that_jumps_restarts_the_clock() -> None:
 
 def test_a_device_that_was_off_for_a_while_leaves_a_gap() -> None:
     """One of several slaves on a bus: the session goes on without it."""
-    one = decoder(rate=4.0, time_address=2, time_format="uint32-s")
-    one.receive([0, 0, 0, 5000], host(0), host(0))
-    _, block = one.receive([0, 0, 0, 1], host(10_000), host(10_000))
+    one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
+    one.receive([0, 0, 5000], host(0), host(0))
+    _, block = one.receive([0, 0, 1], host(10_000), host(10_000))
     assert isinstance(block, Block)
     assert block.first_sample == 40
     assert block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
@@ -209,7 +243,7 @@ def test_any_replies_are_decoded_or_refused(replies: list[list[int]]) -> None:
         if len(reply) == 7:
             one.receive(reply, host(50 * k), host(50 * k + 5))
         else:
-            with pytest.raises(RemoteProtocolError, match="7 registers asked for"):
+            with pytest.raises(RemoteProtocolError, match="7 registers needed"):
                 one.receive(reply, host(50 * k), host(50 * k + 5))
     one.flush()
     # and after that every valid reply counts

@@ -107,6 +107,26 @@ async def test_floats_over_tcp(running: tuple[RunningDevice, ...]) -> None:
     assert all(block.instants_ns is not None for block in found["C"])
 
 
+async def test_registers_with_others_between_are_read_apart() -> None:
+    """A device refuses a request for registers it does not have."""
+    settings = {
+        "addresses": [10, 20, 300],
+        "data_type": "float64",
+        "time_address": 0,
+        "time_format": "uint32-us",
+    }
+    table = device("H", "registers", port="tcp", channels={"H": VOLTS}, settings=settings)
+    with launch.start(spec(table, speed=SPEED)) as (one,):
+        (sensor,) = sensors(one, table, settings=settings, sampling_rate=50.0)
+        found = await read([sensor], 40, SystemClock(SPEED))
+        counts = np.concatenate([block.counts for block in found["H"]])
+        assert counts.shape[1] == 3
+        assert 1e-3 < counts.std(axis=0).min() <= counts.std(axis=0).max() < 1.0
+        (whole,) = sensors(one, table, settings={"address": 0, "data_type": "float64"})
+        with pytest.raises(WrongDeviceError, match=r"registers 0 to 11 of .*illegal data address"):
+            await read([whole], 1, SystemClock(SPEED))
+
+
 async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> None:
     absent = [
         s.model_copy(update={"settings": {"preset": "witmotion", "device_id": 7, "timeout": 0.05}})
