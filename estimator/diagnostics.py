@@ -26,6 +26,7 @@ from estimator.coherency import (
 from estimator.dimension import bands
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.factor_analysis import Maximum, maximise
+from estimator.likelihood import standard_error
 from estimator.model_test import BandTest, ModelTest, model_test, pool
 from estimator.presence import Presence, presence
 from estimator.response import (
@@ -91,7 +92,8 @@ class Diagnostics:
         sensors, tested at 1 %).
     snr : float64, shape (n_freqs, n_channels)
         ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for channels that are
-        dead or copies of others, of which the model and its test know nothing.
+        dead or copies of others, of which the model and its test know nothing, and where psi is
+        within its standard error of zero.
     model : ModelTest
         At every frequency.
     n_factors : int
@@ -199,7 +201,8 @@ def diagnose(
     )
     snr = np.full((len(csm), sum(dims)), np.nan)
     if fit is not None:
-        snr = there.spread(1 / np.maximum(fit.psi, np.finfo(np.float64).tiny) - 1, sum(dims))
+        known = standard_error(fit, n_effective=n_effective) < fit.psi
+        snr = there.spread(np.where(known, 1 / fit.psi - 1, np.nan), sum(dims))
     dimension = _dimension(matrix, there.dims, n_effective)
     number = bands(frequency)
     found = tuple(

@@ -304,6 +304,7 @@ def test_sensors_of_unequal_channels_are_told_which_of_them_are_compared(
     assert [advice.sensors for advice in space] == [sensors for _, sensors in concerned]
     for advice, (d, _) in zip(space, concerned, strict=True):
         assert f"these feel {d} of three" in advice.text
+        assert 100 < advice.numbers["SNR"] < 300  # of channels whose noise is known
         assert "maximum likelihood, which compares with the further channels of A" in advice.remedy
 
 
