@@ -69,7 +69,7 @@ class Maximum:
         Where the likelihood grows towards psi = 0 (Heywood's case); psi is then at the small
         positive number at which the search stopped.
     singular : bool, shape (n_freqs,)
-        Where the matrix is not positive definite, so that there is no maximum.
+        Where the matrix is not Hermitian and positive definite, so that there is no maximum.
     penalty : float64, shape (n_channels, n_channels)
         What was added to the Fisher information of ln psi per average, zero if nothing.
     """

@@ -30,6 +30,7 @@ REFERENCE = 1e6  # averages at which a method is asked for its scatter
 FOUND = 30.0
 """Averages, times the coherence of two sensors in the direction in which it is least, from which on
 c.o.v. are as predicted: simulated ones exceed it by 5 % there, by 20 to 200 % at 8."""
+ROUNDING = 1e-24  # coherence: what rounding leaves of none
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +218,7 @@ def _plan(
 
 
 def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> FloatArray:
-    """Averages from which on a method finds the motion, shape (n_freqs, n_channels).
+    """Averages from which on a method finds the motion, shape (n_freqs, n_channels); NaN: never.
 
     The motion of a channel is inferred from the cross-spectra between the other sensors: of the
     like channels, or of all. The triad methods take all pairs of them for equally good, maximum
@@ -241,8 +242,8 @@ def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> 
         }
         others = [[g for pair, g in pairs.items() if i not in pair] for i in range(len(dims))]
         found = np.stack([over_pairs(each, axis=0) for each in others], axis=1)[:, sensor]
-    with np.errstate(divide="ignore"):
-        return np.asarray(FOUND / found)
+    there = found > ROUNDING
+    return np.where(there, FOUND / np.where(there, found, 1.0), np.nan)
 
 
 def segments_needed(window: FloatArray, hop: int, n_effective: float) -> int:

@@ -105,6 +105,14 @@ def test_methods_that_such_sensors_do_not_allow_say_nothing() -> None:
     assert np.isfinite(plans["three-channel"].n_effective[0, [0, 3, 4]]).all()
 
 
+def test_motion_that_lacks_a_dimension_is_not_found_however_long() -> None:
+    csm, noise_psd = planned_csm(planar_sensors(10), snr=100, motion=np.diag([1.0, 0.0]))
+    plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)}
+    for method in ("three-sensor", "maximum-likelihood"):
+        assert np.isnan(plans[method].duration).all()
+    assert np.isfinite(plans["three-channel"].duration[0, [0, 2, 4]]).all()
+
+
 @pytest.mark.parametrize("overlap", [0.0, 0.5, 0.75])
 def test_segments_needed_is_the_least_number_that_is_enough(overlap: float) -> None:
     window = get_window("hann", 200)
