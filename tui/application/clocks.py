@@ -116,8 +116,8 @@ def drift_title(snapshot: Snapshot) -> str:
     if len(snapshot.drift) < _FEWEST_POINTS:
         return "clock drift: seen from the third segment on"
     against = reference(snapshot)
-    behind = "the computer's clock" if against is None else f"that of {against}"
-    return f"clock drift: lag of each clock behind {behind}, its constant rate taken out"
+    behind = "the computer's" if against is None else f"that of {against}"
+    return f"clock drift: lag behind {behind}, less constant rates"
 
 
 def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]:
