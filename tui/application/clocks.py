@@ -116,7 +116,7 @@ def drift_title(snapshot: Snapshot) -> str:
     if len(snapshot.drift) < _FEWEST_POINTS:
         return "clock drift: seen from the third segment on"
     against = reference(snapshot)
-    behind = "the computer's" if against is None else f"that of {against}"
+    behind = "the computer" if against is None else against
     return f"clock drift: lag behind {behind}, less constant rates"
 
 
