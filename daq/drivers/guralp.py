@@ -28,6 +28,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 
 from daq.drivers.base import DeviceInformation
 from daq.drivers.guralp_links import open_link
+from daq.drivers.shared_port import require_address, require_alike
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event
 from daq.protocols.gcf import component, serial_number
@@ -138,6 +139,10 @@ class GuralpDriver:
         """Return int32."""
         return np.dtype(np.int32)
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _configured(sensors)
+
     @contextlib.asynccontextmanager
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
@@ -164,9 +169,12 @@ class GuralpDriver:
 
 def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
     """Return the streams of each sensor; of the only one perhaps none, which are to be found."""
+    every = {s.name: GuralpSettings.model_validate(s.settings) for s in sensors}
+    require_address(sensors[0])
+    require_alike(sensors, every, GuralpSettings.model_fields.keys() - {"streams", "system_id"})
     ids: dict[str, tuple[str, ...]] = {}
     for sensor in sensors:
-        settings = GuralpSettings.model_validate(sensor.settings)
+        settings = every[sensor.name]
         if settings.streams is None and len(sensors) == 1:
             return {sensor.name: ()}
         if settings.streams is None or len(settings.streams) != len(sensor.channels):

@@ -21,13 +21,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.drivers import labjack_setup as setup
-from daq.drivers.labjack_setup import LabJackSettings, Registers, Uptime
+from daq.drivers.labjack_setup import LabJackSettings, Registers, StreamPlan, Uptime
 from daq.errors import DeviceError, NoAnswerError
 from daq.protocols import labjack
 from daq.protocols import labjack_registers as reg
@@ -132,7 +132,13 @@ class LabJackSession:
         silent_since = self._clock.now().monotonic_ns
         read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
         while True:
-            values, at = await self._registers.exchange(read)
+            try:
+                values, at = await self._registers.exchange(read)
+            except RemoteProtocolError as error:
+                reason = await self._registers.reason()
+                raise DeviceError(
+                    f"{self._registers.label}: reading the stream: {error}{reason}"
+                ) from error
             packet = labjack.decode_response(values)
             if len(packet.samples) or packet.status == labjack.AUTO_RECOVER_ACTIVE:
                 silent_since = at.monotonic_ns
@@ -158,6 +164,10 @@ class LabJackDriver:
         """Return uint16."""
         return np.dtype(np.uint16)
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _Planned.of(sensors)
+
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[LabJackSession]:
@@ -171,19 +181,35 @@ class LabJackDriver:
         return _opened(sensors, clock, before if isinstance(before, LabJackSession) else None)
 
 
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """What the bench file says of one device."""
+
+    settings: dict[str, LabJackSettings]
+    inputs: dict[str, tuple[int, ...]]
+    stream: StreamPlan
+    address: tuple[str, int]
+
+    @classmethod
+    def of(cls, sensors: Sequence[Sensor]) -> _Planned:
+        first = sensors[0]
+        settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
+        inputs = setup.inputs_of(sensors, settings)
+        stream = setup.plan(settings[first.name], inputs, first.sampling_rate)
+        return cls(settings, inputs, stream, setup.address_of(first))
+
+
 @contextlib.asynccontextmanager
 async def _opened(
     sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
 ) -> AsyncIterator[LabJackSession]:
     first = sensors[0]
-    settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
-    common = settings[first.name]
-    inputs = setup.inputs_of(sensors, settings)
-    stream_plan = setup.plan(common, inputs, first.sampling_rate)
+    planned = _Planned.of(sensors)
+    settings, inputs, stream_plan = planned.settings, planned.inputs, planned.stream
+    common, (host, number) = settings[first.name], planned.address
     names = ", ".join(repr(sensor.name) for sensor in sensors)
     label = f"sensor {names} on {first.port}"
-    host, _, number = (first.port.partition("://")[2] or first.port).partition(":")
-    async with open_port(f"socket://{host}:{number or 502}", clock, label=label) as stream:
+    async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
         registers = Registers(stream)
         product, identity = await setup.identify(registers, sensors)
         uptime = await setup.read_uptime(registers)

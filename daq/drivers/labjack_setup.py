@@ -7,6 +7,7 @@ import contextlib
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
+from urllib.parse import urlsplit
 
 from pydantic import (
     AfterValidator,
@@ -19,12 +20,14 @@ from pydantic import (
 )
 
 from daq.drivers.base import DeviceInformation
+from daq.drivers.shared_port import require_alike
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import labjack
 from daq.protocols import labjack_registers as reg
 from daq.protocols.counting import CLOCK_TOLERANCE, SLACK
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack_registers import Adu, AduFinder, Calibration, Read, Write
+from daq.transport import host_and_port
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,6 +40,9 @@ if TYPE_CHECKING:
 REPLY_TIMEOUT = 2.0
 PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
+MODBUS_PORT = 502
+OWN = ("inputs", "range", "negative_inputs")
+"""Settings of a sensor; the others are of the stream, and taken from the port's first sensor."""
 BUFFERS = {"T7": 32768, "T8": 262144}
 
 
@@ -48,6 +54,12 @@ def _input_number(value: object) -> object:
 def _range(value: float) -> float:
     if value not in reg.GAINS:
         raise ValueError(f"expected one of {', '.join(f'{volts:g}' for volts in reg.GAINS)} V")
+    return value
+
+
+def _power_of_two(value: int) -> int:
+    if value.bit_count() != 1:
+        raise ValueError("expected a power of 2")
     return value
 
 
@@ -74,7 +86,7 @@ class LabJackSettings(BaseModel):
     mode: Literal["spontaneous", "command-response"] = "spontaneous"
     stream_port: Annotated[int, Field(gt=0, le=65535)] = 702
     samples_per_packet: Annotated[int, Field(gt=0, le=512)] | None = None
-    buffer_bytes: Annotated[int, Field(gt=0)] | None = None
+    buffer_bytes: Annotated[int, Field(gt=0), AfterValidator(_power_of_two)] | None = None
     """A power of 2; the largest the model has, if not given."""
     core_timer: bool = True
     external_clock_divisor: Annotated[int, Field(gt=0)] | None = None
@@ -119,10 +131,11 @@ class Registers:
         try:
             return (await self.exchange(*commands))[0]
         except RemoteProtocolError as error:
-            reason = await self._reason()
+            reason = await self.reason()
             raise WrongDeviceError(f"{self.label}: {doing}: {error}{reason}") from error
 
-    async def _reason(self) -> str:
+    async def reason(self) -> str:
+        """Return what the device says about its last refusal."""
         with contextlib.suppress(RemoteProtocolError):
             values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 1))
             return f", reason {int.from_bytes(values, 'big')}"
@@ -154,10 +167,32 @@ def exact(rate: float) -> float:
     return reg.CORE_HZ / max(1, round(reg.CORE_HZ / rate))
 
 
+def address_of(sensor: Sensor) -> tuple[str, int]:
+    """Return host and port number of a device."""
+    url = sensor.port if "://" in sensor.port else f"modbus-tcp://{sensor.port}"
+    try:
+        if urlsplit(url).port is None:
+            url = f"{url}:{MODBUS_PORT}"
+        host, number = host_and_port(url)
+    except ValueError as error:
+        raise BenchFileError(
+            f"sensor {sensor.name!r}: port = {sensor.port!r}; expected modbus-tcp://host, or"
+            " modbus-tcp://host:port"
+        ) from error
+    return f"[{host}]" if ":" in host else host, number
+
+
 def inputs_of(
     sensors: Sequence[Sensor], settings: dict[str, LabJackSettings]
 ) -> dict[str, tuple[int, ...]]:
-    """Return the analog inputs of each sensor's channels."""
+    """Return the analog inputs of each sensor's channels.
+
+    Raises
+    ------
+    BenchFileError
+        An input is given twice, or not one for each channel; or sensors differ in what is common.
+    """
+    require_alike(sensors, settings, LabJackSettings.model_fields.keys() - OWN)
     inputs: dict[str, tuple[int, ...]] = {}
     taken: dict[int, str] = {}
     for sensor in sensors:
@@ -184,6 +219,13 @@ def inputs_of(
                 f" {sensors[0].sampling_rate:g}, as of all sensors on port {sensor.port}"
             )
         inputs[sensor.name] = numbers
+    for sensor in sensors:
+        for number in settings[sensor.name].negative_inputs or ():
+            if number in taken:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: AIN{number} is a negative input, and already an input"
+                    f" of {taken[number]!r}"
+                )
     return inputs
 
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.base import DeviceInformation
 from daq.drivers.modbus import ModbusBus, RefusedError, Reply, open_bus
+from daq.drivers.shared_port import require_address, require_alike
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import registers as protocol
 from daq.protocols.block import Block, Event
@@ -46,6 +47,9 @@ FIRST_RETRY, LONGEST_RETRY = 1.0, 30.0
 late, since the others have to wait for it."""
 GATEWAY_CODES = {10, 11}
 """Modbus exceptions by which a gateway says that there is no answer behind it."""
+
+OF_THE_BUS = ("timeout", "baud_rate", "parity", "stop_bits")
+"""Settings of the port's first sensor, for all."""
 
 Address = Annotated[int, Field(ge=0, le=65535)]
 
@@ -294,12 +298,16 @@ class RegisterDriver:
         """Return the type of the readings in the registers."""
         return _Polled.of(sensor).registers.dtype
 
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.base.Checking.check`."""
+        _configured(sensors)
+
     @contextlib.asynccontextmanager
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[RegisterSession]:
         """Open the bus and see who of its sensors answers."""
-        polled = [_Polled.of(sensor) for sensor in sensors]
+        polled = _configured(sensors)
         first, port = polled[0].settings, sensors[0].port
         names = ", ".join(repr(sensor.name) for sensor in sensors)
         async with open_bus(
@@ -322,6 +330,13 @@ class RegisterDriver:
             if len(errors) == len(polled):
                 raise errors[0]
             yield RegisterSession(bus, clock, polled, tuple(information))
+
+
+def _configured(sensors: Sequence[Sensor]) -> list[_Polled]:
+    polled = [_Polled.of(sensor) for sensor in sensors]
+    require_address(sensors[0])
+    require_alike(sensors, {one.sensor.name: one.settings for one in polled}, OF_THE_BUS)
+    return polled
 
 
 DRIVER = RegisterDriver()

@@ -225,6 +225,15 @@ async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
     assert "2941" in events[1].text
 
 
+async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
+    settings = {"mode": "command-response"}
+    told = spec(table(["R"], settings=settings), speed=SPEED, sampling_rate=RATE)
+    told["faults"] = [{"kind": "reset", "at": 6.0, "every": 1.0}]
+    said = "reading the stream: .*exception 4.*, reason 2620"
+    with launch.start(told) as (one,), pytest.raises(DeviceError, match=said):
+        await record(bench(one, settings=settings), 10**6)
+
+
 @pytest.mark.parametrize(
     ("changes", "own", "error", "said"),
     [

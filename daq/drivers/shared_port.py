@@ -1,0 +1,54 @@
+"""What the sensors of one port must agree on, told from the bench file alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daq.errors import BenchFileError
+from daq.transport import host_and_port
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping, Sequence
+
+    from pydantic import BaseModel
+
+    from daq.bench import Sensor
+
+NETWORK = ("socket://", "tcp://", "udp://", "modbus-tcp://")
+
+
+def require_alike(
+    sensors: Sequence[Sensor], settings: Mapping[str, BaseModel], keys: Collection[str]
+) -> None:
+    """Refuse what a later sensor of a port says otherwise than the first, of which it is taken.
+
+    Raises
+    ------
+    BenchFileError
+        Naming the sensor, its key, the value and what was expected.
+    """
+    first = sensors[0]
+    for sensor in sensors[1:]:
+        own = settings[sensor.name]
+        for key in own.model_fields_set.intersection(keys):
+            value, expected = getattr(own, key), getattr(settings[first.name], key)
+            if value != expected:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: settings.{key} = {value!r}; expected {expected!r}, as"
+                    f" of sensor {first.name!r}, which is first on port {sensor.port}"
+                )
+
+
+def require_address(sensor: Sensor) -> None:
+    """Refuse a network port that is no address.
+
+    Raises
+    ------
+    BenchFileError
+        Naming the sensor, the port as it was written and what was expected.
+    """
+    if sensor.port.startswith(NETWORK):
+        try:
+            host_and_port(sensor.port)
+        except ValueError as error:
+            raise BenchFileError(f"sensor {sensor.name!r}: port {error}") from error
