@@ -45,6 +45,7 @@ _FEWEST_SEGMENTS = 6  # in the first batch, per channel of the reference: P is a
 _SHARED = 0.1  # samples to which most segments tell the delay of sensors that share a motion
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
+_CLEAR = 1.5  # times as high as the peak nearest zero: those of one line are about as high
 _OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
 _RIDGE = 1e-10  # of the mean power: keeps a dead channel from stopping everything
 
@@ -186,9 +187,20 @@ class DelayMeter:
             # How much of the sensor is predicted, as a weight that noise cannot raise.
             with np.errstate(divide="ignore", invalid="ignore"):
                 weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
-                turned = np.nan_to_num(weight * squares / size)[:, None]  # nothing, of no signal
-            delays[number] = self._peak(turned, beyond=len(self.window) / 2)[0] / 2
+                turned = np.nan_to_num(weight * squares / size)  # nothing, of no signal
+            delay = self._constant(turned) / 2
+            # Squares are the same half a segment farther; responses alternate there.
+            other = delay - math.copysign(len(self.window) / 2 / self.sampling_rate, delay)
+            here, there = (self._met(response, weight, tau) for tau in (delay, other))
+            delays[number] = other if there > _OUTSTANDING * here else delay
         return delays
+
+    def _met(self, response: ComplexArray, weight: FloatArray, tau: float) -> float:
+        """Return how much of a relative response is the same at all frequencies, freed of τ."""
+        turned = _turn(self.omega, np.array([tau]))[:, :, None]
+        return float(
+            np.linalg.norm((np.nan_to_num(weight)[:, None, None] * response * turned).sum(0))
+        )
 
     def _spectra(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
         """Spectra of shape (n_freqs, n_segments, n_channels)."""
@@ -231,13 +243,40 @@ class DelayMeter:
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
 
-    def _peak(self, crossed: ComplexArray, *, beyond: float = 0.0) -> FloatArray:
-        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column.
+    def _peak(self, crossed: ComplexArray) -> FloatArray:
+        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column."""
+        height, step = self._heights(crossed)
+        middle = height.shape[1] // 2
+        reach = min(middle - 1, int(_LONGEST / self.sampling_rate / step))
+        near = height[:, middle - reach : middle + reach + 1]
+        return self._polished(crossed, (np.argmax(near, axis=1) - reach) * step)
 
-        Up to `_LONGEST`; farther, up to `beyond` samples, where noise cannot be the reason.
+    def _constant(self, crossed: ComplexArray) -> float:
+        """Return the τ at which Re Σ crossed exp(iωτ) has the peak that it is likely to have.
+
+        The one nearest zero, where arrival times have it: motion that is nearly one line has
+        others, as high. So another one within `_LONGEST` must be clearly higher, and one farther
+        off must be so high that noise cannot be the reason.
         """
+        heights, step = self._heights(crossed[:, None])
+        height, middle = heights[0], heights.shape[1] // 2
+        peaks = np.flatnonzero((height[1:-1] > height[:-2]) & (height[1:-1] >= height[2:])) + 1
+        away = np.abs(peaks - middle) * step * self.sampling_rate
+        if not (away < _LONGEST).any():
+            return 0.0
+        best = peaks[np.argmin(away)]
+        near, far = (
+            max(peaks[away < limit].tolist(), key=height.item)
+            for limit in (_LONGEST, len(self.window) / 2)
+        )
+        if height[near] > _CLEAR * height[best]:
+            best = near
+        if height[far] > _OUTSTANDING * height[near]:
+            best = far
+        return float(self._polished(crossed[:, None], np.array([(best - middle) * step]))[0])
+
+    def _polished(self, crossed: ComplexArray, tau: FloatArray) -> FloatArray:
         omega = self.omega
-        tau = self._search(crossed, beyond)
         for _ in range(_NEWTON_STEPS):
             turned = crossed * _turn(omega, tau)
             curvature = omega**2 @ turned.real
@@ -245,24 +284,16 @@ class DelayMeter:
             tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
         return tau
 
-    def _search(self, crossed: ComplexArray, beyond: float) -> FloatArray:
-        """Return the best delay on a grid of a fraction of a period of the highest frequency."""
+    def _heights(self, crossed: ComplexArray) -> tuple[FloatArray, float]:
+        """Return Re Σ crossed exp(iωτ) of every column on a grid of τ, and its step in seconds.
+
+        A fraction of a period of the highest frequency; τ = 0 is in the middle of the row.
+        """
         n = scipy.fft.next_fast_len(4 * len(self.window), real=True)
         padded = np.zeros((crossed.shape[1], n // 2 + 1), dtype=np.complex128)
         padded[:, 1 : len(crossed) + 1] = crossed.T
-        height = scipy.fft.irfft(padded, n=n, axis=-1)
-        step = 2 * np.pi / self.omega[0] / n
-
-        def highest(longest: float) -> tuple[FloatArray, FloatArray]:
-            reach = min(n // 2 - 1, int(longest / self.sampling_rate / step))
-            near = np.concatenate([height[:, -reach:], height[:, : reach + 1]], axis=1)
-            return (np.argmax(near, axis=1) - reach) * step, near.max(axis=1)
-
-        tau, top = highest(_LONGEST)
-        if beyond > _LONGEST:
-            far, top_far = highest(beyond)
-            tau = np.where(top_far > _OUTSTANDING * top, far, tau)
-        return np.asarray(tau)
+        height = scipy.fft.fftshift(scipy.fft.irfft(padded, n=n, axis=-1), axes=-1)
+        return height, float(2 * np.pi / self.omega[0] / n)
 
 
 def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:

@@ -97,6 +97,30 @@ def test_a_reference_without_the_common_motion_is_replaced(dead: bool) -> None:
         assert np.median(std[:, ({0, 1, 2} - set(others)).pop()]) > 1e-4
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_hum_moves_no_sensor_by_half_periods(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 120 * HOP + LENGTH
+    phase = np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + [0.0, 1.2]
+    common = 10 * np.cos(2 * np.pi * 50.0 / RATE * np.arange(n)[:, None] + phase)
+    common += 0.03 * rng.standard_normal((n, 2))
+    samples = np.hstack([common, common @ np.array([[0.9, -0.44], [0.44, 0.9]])])
+    samples += 0.3 * rng.standard_normal(samples.shape)
+    meter = DelayMeter(RATE, WINDOW, COLUMNS)
+    meter.measure(samples, np.arange(120) * HOP)
+    assert abs(meter.frame_delays()[1]) < 1e-3  # half a period: 10 ms
+
+
+@pytest.mark.parametrize("delay", [0.9, 1.5, 1.9, -1.5])  # a segment lasts 5 s
+def test_a_long_constant_delay_is_told_from_its_alias(delay: float) -> None:
+    motion = np.random.default_rng(5).standard_normal((100 * HOP, 2))
+    motion += 0.03 * np.random.default_rng(6).standard_normal(motion.shape)
+    samples = np.hstack([motion, np.roll(motion, round(delay * RATE), axis=0)])[LENGTH:-LENGTH]
+    meter = DelayMeter(RATE, WINDOW, COLUMNS)
+    measured, _ = meter.measure(samples, np.arange(90) * HOP)
+    assert np.nanmean(measured[:, 1]) + meter.frame_delays()[1] == pytest.approx(delay, abs=1e-3)
+
+
 def test_too_few_segments_define_no_frame() -> None:
     samples = huddle(10, np.zeros(10), 0.03, 4)
     measured, std = DelayMeter(RATE, WINDOW, COLUMNS).measure(samples, np.arange(10) * HOP)
