@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -173,6 +172,7 @@ def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
     require_address(sensors[0])
     require_alike(sensors, every, GuralpSettings.model_fields.keys() - {"streams", "system_id"})
     ids: dict[str, tuple[str, ...]] = {}
+    taken: dict[str, str] = {}
     for sensor in sensors:
         settings = every[sensor.name]
         if settings.streams is None and len(sensors) == 1:
@@ -182,10 +182,14 @@ def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
                 f"sensor {sensor.name!r}: settings.streams = {settings.streams};"
                 f" expected a stream ID for each of its {len(sensor.channels)} channels"
             )
+        for stream in settings.streams:
+            if stream in taken:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: settings.streams: {stream} is already of a channel of"
+                    f" {taken[stream]!r}"
+                )
+            taken[stream] = sensor.name
         ids[sensor.name] = settings.streams
-    often = [stream for stream, n in Counter(s for i in ids.values() for s in i).items() if n > 1]
-    if often:
-        raise BenchFileError(f"port {sensors[0].port}: streams {often} are given to two channels")
     return ids
 
 

@@ -30,12 +30,12 @@ def require_alike(
     first = sensors[0]
     for sensor in sensors[1:]:
         own = settings[sensor.name]
-        for key in own.model_fields_set.intersection(keys):
+        for key in (k for k in type(own).model_fields if k in keys and k in own.model_fields_set):
             value, expected = getattr(own, key), getattr(settings[first.name], key)
             if value != expected:
                 raise BenchFileError(
                     f"sensor {sensor.name!r}: settings.{key} = {value!r}; expected {expected!r}, as"
-                    f" of sensor {first.name!r}, which is first on port {sensor.port}"
+                    f" of {first.name!r}, the first on port {sensor.port}"
                 )
 
 
