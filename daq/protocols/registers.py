@@ -17,7 +17,7 @@ Both roles are here: the simulated device encodes with the same map.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -38,7 +38,6 @@ DataType: TypeAlias = Literal[
 WordOrder: TypeAlias = Literal["big", "little"]
 TimeFormat: TypeAlias = Literal["witmotion", "uint32-s", "uint32-ms", "uint32-us", "uint64-ns"]
 
-DATA_TYPES: tuple[str, ...] = get_args(DataType)
 MOST_REGISTERS = 125
 """In one Modbus reply."""
 N_ADDRESSES = 65536

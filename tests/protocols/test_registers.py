@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.registers import DATA_TYPES, RegisterDecoder, RegisterMap
+from daq.protocols.registers import DataType, RegisterDecoder, RegisterMap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -97,7 +97,7 @@ def test_a_value_is_never_split_between_two_replies() -> None:
 
 
 @given(
-    st.sampled_from(DATA_TYPES),
+    st.sampled_from(get_args(DataType)),
     st.sampled_from(["big", "little"]),
     st.sampled_from(["witmotion", "uint32-s", "uint32-ms", "uint32-us", "uint64-ns"]),
     st.integers(1, 4),
