@@ -83,7 +83,9 @@ class BandDimension:
     def text(self) -> str:
         """The choice and its price in words."""
         band = f"{self.low:.3g}–{self.high:.3g} Hz"
-        price = f"c.o.v. of one bin {self.cov:.2g} instead of {self.usual_cov:.2g}"
+        price = f"c.o.v. of one bin {self.cov:.2g}"
+        if np.isfinite(self.usual_cov):
+            price += f" instead of {self.usual_cov:.2g}"
         if not self.accepted:
             effect = "the noise estimate is biased here"
             return (

@@ -51,21 +51,22 @@ def summary(snapshot: Snapshot) -> list[str]:
             f"model test: {_model(snapshot)} explains what the sensors share, in all bands"
         )
     if tested and not any(math.isfinite(p_value) for p_value in tested) and "sensors" not in kinds:
-        lines.append(_why_not_tested(snapshot))
+        lines.append(f"model test: {why_not_tested(snapshot)}")
     if "dimension" in snapshot.diagnostics:
         lines += _dimensions(snapshot)
     return lines
 
 
-def _why_not_tested(snapshot: Snapshot) -> str:
+def why_not_tested(snapshot: Snapshot) -> str:
+    """Return what the model test lacks, where it could be done in no band."""
     n_channels = len(snapshot.channels)
     if snapshot.n_effective > n_channels:
         return (
-            f"model test: not possible: {model(_n_factors(snapshot))} explains whatever these "
+            f"not possible: {model(_n_factors(snapshot))} explains whatever these "
             "channels share, as they are too few for it"
         )
     return (
-        f"model test: none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
+        f"none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
         f"channels ({n_channels})"
     )
 

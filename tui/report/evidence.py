@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.model_test import rejected_below
-from tui.diagnosis import summary
+from tui.diagnosis import summary, why_not_tested
 from tui.report.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import model_test_plot
@@ -46,8 +46,9 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     bands: Sequence[BandDiagnosis] = snapshot.diagnostics.get("bands", ())
     tested = [band for band in bands if math.isfinite(band.test.p_value)]
     if not tested:
-        text = "Not tested: that takes three sensors, and more averages than channels."
-        return Section(title, (Paragraph(text, "doubtful"),))
+        few = len(snapshot.dims) < 3
+        why = "it takes three sensors" if few else why_not_tested(snapshot)
+        return Section(title, (Paragraph(f"Not tested: {why}.", "doubtful"),))
     rejected = rejected_below(band.test for band in tested)
 
     def fails(band: BandDiagnosis) -> bool:
