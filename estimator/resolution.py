@@ -6,7 +6,7 @@ factors has no such bias. So the weakest factor counts only where it improves th
 scatter would, then the next. Motion left out with it stays in the noise: `docs/decisions/0033`.
 
 That is for motion that several sensors could feel. What one channel alone feels looks like its
-noise: `alone` finds the channels of which nothing else can be said.
+noise: `alone` finds the channels of which nothing else can be said (`docs/decisions/0034`).
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     if not tested:
         few = len(snapshot.dims) < 3
         why = "it takes three sensors" if few else why_not_tested(snapshot)
-        return Section(title, (Paragraph(f"Not tested: {why}.", "doubtful"),))
+        return Section(title, (Paragraph(f"{why[0].upper()}{why[1:]}.", "doubtful"),))
     rejected = rejected_below(band.test for band in tested)
 
     def fails(band: BandDiagnosis) -> bool:
