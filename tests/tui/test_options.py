@@ -68,6 +68,8 @@ def test_options_go_before_the_bench_file() -> None:
 
 def test_a_window_may_have_a_parameter_and_one_that_lacks_it_is_told_so() -> None:
     settings = chosen(Settings(), window="kaiser,8")
+    filed = TEMPLATE.replace('window = "hann"', 'window = "kaiser,8"')
+    assert Settings.of(parse(filed, "bench.toml")).window == settings.window
     spectra = WelchSettings(100.0, 64, window=settings.window)
     assert spectra.window == "kaiser,8"
     said = "--window 'kaiser': 'kaiser' must have parameters.*kaiser,8"
