@@ -38,6 +38,7 @@ import numpy as np
 
 from daq.clock_filter import Observations, smooth
 from daq.clock_model import Clock, ClockState, Epoch
+from daq.lateness import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.polling import SURELY, Polls, shows
 from daq.protocols.block import BlockFlag
 
@@ -57,14 +58,11 @@ _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes 
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
 _ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
 _RATE_OFF = 0.02  # share by which a rate may be off
-_STEEP = 2e-4  # seconds of lateness over a group that hide which one is the earliest
-_LEVEL = 10  # groups over which a slope can be told from jitter
-_FAR = 10.0  # medians of lateness; beyond, it is no longer how latency scatters
+_RECENT = 120.0  # seconds that a host may be held up, all its blocks late, and not have slept
 _UTC_JUMP = 0.01  # samples
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
-_HULL_POINTS = 512
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +115,8 @@ class ArrivalTimes:
     _end_sample: int = 0
     _device_utc: bool = False
     _polls: Polls = field(default_factory=Polls)
-    _lowest: float = np.inf
+    _stretch: int = -1
+    _lowest: tuple[float, float] = (np.inf, np.inf)
     _leapt: float = 0.0
 
     def add(self, blocks: NDArray[Any]) -> None:
@@ -159,11 +158,7 @@ class ArrivalTimes:
             self.latency = min(self.latency, float(latency.min()))
             breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
         else:
-            # Far below all before, even if the rate is off: the host's clock stood still.
-            level = late + _RATE_OFF * index / self.sampling_rate
-            lowest = np.minimum.accumulate(np.append(self._lowest, level))
-            self._lowest = float(lowest[-1])
-            breaks = ((flags & int(_BREAKS)) != 0) | (level < lowest[:-1] - _ASLEEP)
+            breaks = ((flags & int(_BREAKS)) != 0) | self._too_early(index, late)
         breaks[0] |= begins
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
@@ -173,7 +168,8 @@ class ArrivalTimes:
         late = np.concatenate([self._late[-1:], late])
         epoch = np.concatenate([self._epoch[-1:], epoch])
         seconds = (index / self.sampling_rate).astype(np.int64)
-        kept = _earliest(seconds, self._level(index, late, epoch), epoch)
+        late_by = levelled(index, late, epoch, second=self.sampling_rate)
+        kept = least_of_each(seconds, late_by, epoch)
         self._index = np.concatenate([self._index[:-1], index[kept]])
         self._late = np.concatenate([self._late[:-1], late[kept]])
         self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
@@ -270,21 +266,23 @@ class ArrivalTimes:
             float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
         ]
 
-    def _level(self, index: IntArray, late: FloatArray, epoch: IntArray) -> FloatArray:
-        """Return lateness without the slope of each epoch where that hides what came early.
+    def _too_early(self, index: IntArray, late: FloatArray) -> BoolArray:
+        """Whether blocks come far below the lateness before: then the host's clock stood still.
 
-        A sensor whose rate is off by per cent would otherwise keep each second's last, or first.
+        Even if the rate is off; so only this stretch of `_RECENT` and the one before it are looked
+        at, and all blocks of one must have been delayed to be taken for the rule.
         """
-        late = late.copy()
-        for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(epoch)) + 1):
-            half = len(rows) // 2
-            if np.ptp(index[rows]) > _LEVEL * self.sampling_rate:
-                rise = late[rows[half:]] - late[rows[: len(rows) - half]]
-                apart = index[rows[half:]] - index[rows[: len(rows) - half]]
-                slope = float(np.median(rise / apart))
-                if abs(slope * self.sampling_rate) > _STEEP:
-                    late[rows] -= slope * index[rows]
-        return late
+        raised = late + _RATE_OFF * index / self.sampling_rate
+        stretch = index // round(_RECENT * self.sampling_rate)
+        early = np.zeros(len(index), dtype=bool)
+        for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(stretch)) + 1):
+            before, lowest = self._lowest
+            if stretch[rows[0]] != self._stretch:
+                self._stretch, before, lowest = int(stretch[rows[0]]), lowest, np.inf
+            so_far = np.minimum.accumulate(np.append(lowest, raised[rows]))
+            early[rows] = raised[rows] < np.minimum(before, so_far[:-1]) - _ASLEEP
+            self._lowest = before, float(so_far[-1])
+        return early
 
     def _stretches(self, length: float) -> IntArray:
         """Return which stretch of `length` samples of its epoch each arrival lies in.
@@ -314,10 +312,10 @@ class ArrivalTimes:
         if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
             node, step = max(node, SURELY * beat), 0.0  # the earliest of those is early indeed
         group = self._stretches(self.sampling_rate * node)
-        kept = _earliest(group, left, self._epoch)
+        kept = least_of_each(group, left, self._epoch)
         begins = np.diff(group, prepend=-1) != 0
         begins |= np.diff(self._epoch, prepend=-1) != 0
-        scatter = _scatter_of_least(left, left[kept], begins)
+        scatter = scatter_of_least(left, left[kept], begins)
         index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
         variance = np.zeros(len(index))
         if measured is not None:
@@ -380,56 +378,3 @@ class ArrivalTimes:
             refined=refined,
         )
         return Clock(tuple(epochs), state)
-
-
-def _earliest(group: IntArray, late: FloatArray, epoch: IntArray) -> IntArray:
-    """Return, in order, the row of least lateness in every group of each epoch."""
-    order = np.lexsort((late, group, epoch))
-    kept = np.ones(len(order), dtype=bool)
-    kept[1:] = (np.diff(group[order]) != 0) | (np.diff(epoch[order]) != 0)
-    return order[kept]
-
-
-def _scatter_of_least(late: FloatArray, least: FloatArray, begins: BoolArray) -> float:
-    """Return by how much the least lateness of groups must scatter, in s, by the others' lateness.
-
-    The least of n scatters by an n-th of what one does, if lateness is exponential; a few groups
-    that happen to lie on a line do not show it. `begins` says which rows begin a group.
-    """
-    others = max(len(late) - len(least) - 1, 1)  # one more lies on the line that was taken out
-    above = late - least[np.cumsum(begins) - 1]
-    if above.any():
-        above = np.minimum(above, _FAR * np.median(above[above > 0]))
-    # Known from few, it may be too little by as much.
-    return float(above.sum() / others * (1 + 3 / others) * len(least) / len(late))
-
-
-def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return intercept and slope of the highest line under all points at their mean.
-
-    Parameters
-    ----------
-    x, y : float64, shape (n_points,)
-        `x` increasing.
-    """
-    x0, y0 = float(x[0]), float(y[0])
-    x, y = x - x0, y - y0
-    if len(x) > _HULL_POINTS:  # the lowest of each group, against a line through them all
-        slope = np.polynomial.polynomial.polyfit(x, y, 1)[1]
-        groups = np.array_split(np.arange(len(x)), _HULL_POINTS)
-        chosen = np.array([group[np.argmin(y[group] - slope * x[group])] for group in groups])
-    else:
-        chosen = np.arange(len(x))
-    hull: list[int] = []
-    for point in chosen.tolist():
-        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], point):
-            hull.pop()
-        hull.append(point)
-    right = min(max(int(np.searchsorted(x[hull], x.mean())), 1), len(hull) - 1)
-    a, b = hull[right - 1], hull[right]
-    slope = float((y[b] - y[a]) / (x[b] - x[a]))
-    return y0 + float(y[a]) - slope * (x0 + float(x[a])), slope
-
-
-def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
-    return bool((x[b] - x[a]) * (y[c] - y[a]) <= (y[b] - y[a]) * (x[c] - x[a]))

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.arrival_times import ArrivalTimes, MeasuredDelays, supporting_line
+from daq.arrival_times import ArrivalTimes, MeasuredDelays
 from daq.clock_filter import Observations, smooth
+from daq.lateness import supporting_line
 from daq.polling import Polls
 from daq.protocols.block import BlockFlag
 from daq.recording.layout import BLOCK_DTYPE
@@ -148,6 +149,16 @@ def test_a_host_that_slept_does_not_bend_the_clock() -> None:
     error = clock.at(BLOCK * np.arange(1.0, 6001) - 1) - taken
     assert error[:4000].std() < 4e-6
     assert error[4000:].std() < 4e-6
+
+
+@pytest.mark.parametrize("pieces", [1, 17])
+def test_late_in_a_recording_a_short_sleep_is_one_and_a_minute_of_delay_is_not(pieces: int) -> None:
+    rng = np.random.default_rng(6)
+    arrivals = last_samples(12_000, -12.0) + rng.exponential(5e-4, 12_000)
+    arrivals[4000:4600] = arrivals[4600]  # held up
+    arrivals[10_000:] -= 5.0  # asleep
+    clock = solved(block_rows(arrivals), pieces=pieces)
+    assert [epoch.first_sample for epoch in clock.epochs] == [0, 200_000]
 
 
 def test_utc_stepped_by_ntp_or_a_leap_second_changes_nothing() -> None:

@@ -101,7 +101,7 @@ def test_a_reference_without_the_common_motion_is_replaced(dead: bool) -> None:
 def test_hum_moves_no_sensor_by_half_periods(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 120 * HOP + LENGTH
-    phase = np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + [0.0, 1.2]
+    phase = np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + np.array([0.0, 1.2])
     common = 10 * np.cos(2 * np.pi * 50.0 / RATE * np.arange(n)[:, None] + phase)
     common += 0.03 * rng.standard_normal((n, 2))
     samples = np.hstack([common, common @ np.array([[0.9, -0.44], [0.44, 0.9]])])
