@@ -75,7 +75,7 @@ async def record(
             blocks.append(item)
             if idle_after is not None and item.end_sample >= idle_after:
                 idle_after = None
-                await asyncio.sleep(1.3)  # the test's own idleness is what is tested
+                await asyncio.sleep(2.5)  # the test's own idleness is what is tested
             if blocks[-1].end_sample >= n_samples and idle_after is None:
                 break
     return blocks, events
@@ -151,8 +151,8 @@ async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch)
 async def test_an_overflow_is_told_and_the_gap_estimated(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    """2000 samples fit; nobody reads for 1.3 s, 2600 samples."""
-    blocks, events = await record(sensor(running, 0), 3500, idle_after=400)
+    """2000 samples fit; nobody reads for 2.5 s, 5000 samples."""
+    blocks, events = await record(sensor(running, 0), 6000, idle_after=400)
     assert [e.kind for e in events] == ["overflow"]
     gap = next(b for b in blocks if b.reason)
     before = blocks[blocks.index(gap) - 1]
@@ -160,9 +160,9 @@ async def test_an_overflow_is_told_and_the_gap_estimated(
     assert gap.flags == BlockFlag.MISSING_ESTIMATED
     assert gap.first_sample - before.end_sample > 300
     # by the host, all samples of the time are there or missing, to what the host may be late by:
-    # without the gap 600 would be missing
+    # without the gap 3000 would be missing
     elapsed = (blocks[-1].received.monotonic_ns - blocks[0].received.monotonic_ns) * 1e-9 * RATE
-    assert blocks[-1].end_sample - blocks[0].end_sample == pytest.approx(elapsed, abs=500)
+    assert blocks[-1].end_sample - blocks[0].end_sample == pytest.approx(elapsed, abs=2500)
 
 
 @pytest.mark.parametrize(
