@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 
+_AT_ONCE = 1 << 14  # blocks
 _PROOF = 256  # samples whose counts are equal, one by one, are the same samples
 _APART = 1.0  # seconds by which two wires may deliver them apart
 
@@ -80,11 +81,10 @@ class SensorSource:
 
     def refresh(self) -> None:
         """Take the blocks that have been committed since."""
-        blocks = self.record.blocks[self.n_blocks :]
-        ends = blocks["first_row"] + blocks["n_samples"]
-        blocks = blocks[: np.searchsorted(ends, self.record.n_samples, side="right")]
-        if len(blocks) == 0:
-            return
+        for first in range(self.n_blocks, len(self.record.blocks), _AT_ONCE):
+            self._take(self.record.blocks[first : first + _AT_ONCE])
+
+    def _take(self, blocks: NDArray[Any]) -> None:
         if self.n_blocks == 0:
             self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
             self.polled = self.record.polled

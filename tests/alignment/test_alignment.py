@@ -148,6 +148,24 @@ def test_a_restart_gets_a_clock_of_its_own(tmp_path: Path) -> None:
         assert moved == pytest.approx(3.7e-3, abs=1e-5)
 
 
+def test_blocks_beyond_those_taken_at_once_go_on_where_the_others_ended(tmp_path: Path) -> None:
+    raw = {name: counts(17_000, 1, seed) for seed, name in enumerate("ab")}  # a block each
+    gaps = ((16_384, 16_386),)
+    sensors = {n: Sensor(c, 10.0, clock="one", gaps=gaps) for n, c in raw.items()}
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor, 0.1):
+            writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert len(recording.sensors[0].blocks) == 16_998
+        assert len(samples) == 17_000
+        assert np.flatnonzero(~valid).tolist() == [16_384, 16_385]
+        assert np.array_equal(samples[valid], np.hstack([*raw.values()])[valid].astype(float))
+
+
 def test_a_growing_file_is_read_as_far_as_it_is_committed(tmp_path: Path) -> None:
     sensors = {name: Sensor(counts(2000, 1, ord(name)), clock="one") for name in "abc"}
     writer = create(tmp_path / "r.h5", sensors)
