@@ -116,6 +116,15 @@ class ResumedSession(Session, Protocol):
         ...
 
 
+class RecoveringSession(Session, Protocol):
+    """A session that may know that its device lives while it sends no samples."""
+
+    @property
+    def recovers(self) -> bool:
+        """Whether it recovers from an overflow: it is waited for instead of called stalled."""
+        ...
+
+
 @runtime_checkable
 class Resuming(Protocol):
     """A driver (:class:`DriverType`) of devices that count on while nobody can hear them.
