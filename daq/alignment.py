@@ -21,7 +21,8 @@ import numpy as np
 
 from daq.clock_model import ClockState, nominal
 from daq.errors import CannotAlignError
-from daq.resampling import SPAN, USABLE, all_there, reach, resample
+from daq.grid import SNAP, Grid
+from daq.resampling import USABLE
 from daq.sensor_source import Learnt, SensorSource, main_columns
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ _GROWTH = 0.02  # share by which a recording grows before its clocks are set ane
 _FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
 _ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
 _LATEST = 5.0  # seconds that a device with UTC may take to send; beyond, the host's UTC is wrong
-_SNAP = 1e-3  # samples: constant offsets this small between exact clocks are rounding of the times
 
 
 class AlignedRecording:
@@ -86,7 +86,7 @@ class AlignedRecording:
         self._records = records
         self._sources: list[SensorSource] = []
         self._origin = (0, 0)
-        self._start: float | None = None
+        self._grid: Grid | None = None
         self._set_at = (0, 0)
         self._end = math.inf
         self._at_face_value = at_face_value
@@ -96,7 +96,7 @@ class AlignedRecording:
     @property
     def start_utc_ns(self) -> int:
         """UTC of grid sample 0, in ns since 1970."""
-        return self._origin[1] + round((self._start or 0.0) * 1e9)
+        return self._origin[1] + round(self._start * 1e9)
 
     @property
     def clocks(self) -> tuple[ClockState, ...]:
@@ -114,29 +114,25 @@ class AlignedRecording:
     @property
     def n_available(self) -> int:
         """Grid samples that can be read now."""
-        if self._start is None:
+        grid = self._grid
+        if grid is None:
             return 0
-        ends = []
-        for source in self._sources:
-            clock = source.known_clock
-            margin = 0 if self._passes(source) else reach(self._ratio(source))
-            rate = source.record.sampling_rate
-            ends.append(clock.end - margin / rate)
-        stop = (min(*ends, self._end) - self._start) * self.sampling_rate
-        return max(0, math.floor(stop + _SNAP) + 1)
+        ends = (
+            source.known_clock.end - (0.0 if grid.has(source) else grid.reach(source))
+            for source in self._sources
+        )
+        stop = (min(*ends, self._end) - grid.start) * self.sampling_rate
+        return max(0, math.floor(stop + SNAP) + 1)
 
     @property
     def is_exact(self) -> bool:
         """Whether every sensor's samples fall on the grid, so that no clock had to be estimated."""
-        return self._start is None or all(
-            self._passes(source) and not source.offset_in_doubt for source in self._sources
-        )
+        return self._untouched and not any(source.offset_in_doubt for source in self._sources)
 
     @property
     def usable(self) -> float:
         """Frequency in Hz up to which samples on the grid are what sensors read."""
-        untouched = self._start is None or all(map(self._passes, self._sources))
-        return (0.5 if untouched else USABLE) * self.sampling_rate
+        return (0.5 if self._untouched else USABLE) * self.sampling_rate
 
     def delays(self, at: FloatArray) -> FloatArray:
         """Return how far each sensor's count of time lags the grid, by the clocks as known now.
@@ -151,7 +147,7 @@ class AlignedRecording:
         float64, shape (n, n_sensors)
             In seconds; only differences mean anything.
         """
-        seconds = (self._start or 0.0) + at / self.sampling_rate
+        seconds = self._start + at / self.sampling_rate
         columns = [
             seconds - source.known_clock.position(seconds) / source.record.sampling_rate
             for source in self._sources
@@ -197,7 +193,7 @@ class AlignedRecording:
         certain = np.flatnonzero((std == 0).all(axis=0))
         if len(certain):
             self._measured_against = self.measurable[int(certain[0])]
-        seconds = (self._start or 0.0) + at / self.sampling_rate
+        seconds = self._start + at / self.sampling_rate
         at_reference = self._sources[self._reference].known_clock.position(seconds)
         for column, number in enumerate(self.measurable):
             source = self._sources[number]
@@ -287,8 +283,8 @@ class AlignedRecording:
         else:
             for source in self._sources:
                 source.clock = source.known_clock.extended(source.end_sample)
-        if self._start is None:
-            self._set_start()
+        if self._grid is None:
+            self._grid = self._laid()
 
     def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
         """Return grid samples `start` to `stop` (not included).
@@ -305,65 +301,19 @@ class AlignedRecording:
         CannotAlignError
             If the samples are not available (yet).
         """
-        if not 0 <= start <= stop <= self.n_available:
+        grid = self._grid
+        if grid is None or not 0 <= start <= stop <= self.n_available:
             raise CannotAlignError(
                 f"{self._recording.path}: grid samples {start} to {stop} asked for,"
                 f" {self.n_available} available"
             )
-        # Whole spans: then the same numbers come out however the reading is cut.
-        first = start // SPAN * SPAN
-        last = -(-stop // SPAN) * SPAN
         samples = np.zeros((stop - start, len(self.channels)))
         valid = np.ones(stop - start, dtype=bool)
         column = 0
         for source in self._sources:
             part = samples[:, column : column + len(source.columns)]
-            if self._passes(source):
-                valid &= self._pass_through(source, start, part)
-            else:
-                whole, present = self._interpolated(source, first, last)
-                part[:] = whole[start - first : stop - first]
-                valid &= present[start - first : stop - first]
+            valid &= grid.read(source, start, part)
             column += len(source.columns)
-        return samples, valid
-
-    def _pass_through(self, source: SensorSource, start: int, samples: FloatArray) -> BoolArray:
-        """Write samples that fall on the grid, from `start` on; return which are valid."""
-        second = np.array([(self._start or 0.0) + start / self.sampling_rate])
-        valid = np.zeros(len(samples), dtype=bool)
-        for epoch in source.known_clock.epochs:
-            first = round(float(epoch.position(second)[0]))
-            low = max(first, epoch.first_sample)
-            high = min(first + len(samples), epoch.end_sample)
-            if low < high:
-                rows = slice(low - first, high - first)
-                valid[rows] = source.fill(samples[rows], low)
-        return valid
-
-    def _interpolated(
-        self, source: SensorSource, start: int, stop: int
-    ) -> tuple[FloatArray, BoolArray]:
-        """Return samples interpolated on the grid, and which of them are valid."""
-        seconds = (self._start or 0.0) + np.arange(start, stop) / self.sampling_rate
-        samples = np.zeros((stop - start, len(source.columns)))
-        valid = np.zeros(stop - start, dtype=bool)
-        ratio = self._ratio(source)
-        for epoch in source.known_clock.epochs:
-            if epoch.end < seconds[0] or epoch.start > seconds[-1]:
-                continue
-            positions = epoch.position(seconds)
-            margin = reach(ratio)
-            low = math.floor(positions[0]) - margin
-            high = math.ceil(positions[-1]) + margin + 1
-            inputs = np.zeros((high - low, len(source.columns)))
-            present = source.fill(inputs, low)
-            inside = np.arange(low, high)
-            present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
-            inputs[~present] = 0.0
-            usable = all_there(present, positions - low, ratio=ratio)
-            if usable.any():
-                samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
-                valid |= usable
         return samples, valid
 
     @property
@@ -379,39 +329,34 @@ class AlignedRecording:
                 return number
         return 0
 
-    def _set_start(self) -> None:
+    @property
+    def _untouched(self) -> bool:
+        """Whether all samples fall on the grid, as far as there is one."""
+        grid = self._grid
+        return grid is None or all(map(grid.has, self._sources))
+
+    @property
+    def _start(self) -> float:
+        """Seconds from the recording's creation to grid sample 0."""
+        return 0.0 if self._grid is None else self._grid.start
+
+    def _laid(self) -> Grid:
+        """Lay the grid from where all sensors have begun, and note where it is to end."""
         start_utc_ns, end_utc_ns = self._wanted
-        self._start = max(source.known_clock.start for source in self._sources)
-        if not all(self._passes(source) for source in self._sources):
-            self._start += max(
-                reach(self._ratio(source)) / source.record.sampling_rate for source in self._sources
-            )
+        start = max(source.known_clock.start for source in self._sources)
+        grid = Grid(self.sampling_rate, start)
+        if not all(map(grid.has, self._sources)):
+            start += max(map(grid.reach, self._sources))
         first = self._sources[0].known_clock
         if start_utc_ns is not None:
             wanted = (start_utc_ns - self._origin[1]) * 1e-9
-            if wanted > self._start:  # the first sensor's next sample
+            if wanted > start:  # the first sensor's next sample
                 epoch = first.epochs[0]
-                index = np.ceil(epoch.position(np.array([wanted])) - _SNAP)
-                self._start = float(epoch.at(index)[0])
+                index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
+                start = float(epoch.at(index)[0])
         if end_utc_ns is not None:
             self._end = (end_utc_ns - self._origin[1]) * 1e-9
-
-    def _passes(self, source: SensorSource) -> bool:
-        """Whether the sensor's samples fall on the grid."""
-        if source.record.sampling_rate != self.sampling_rate or self._start is None:
-            return source.record.sampling_rate == self.sampling_rate and self._start is None
-        clock = source.known_clock
-        for epoch in clock.epochs:
-            rate = (epoch.index[-1] - epoch.index[0]) / (epoch.seconds[-1] - epoch.seconds[0])
-            if len(epoch.index) > 2 or abs(rate / self.sampling_rate - 1) > 1e-12:
-                return False
-            position = epoch.position(np.array([self._start]))
-            if abs(position[0] - round(position[0])) > _SNAP:
-                return False
-        return True
-
-    def _ratio(self, source: SensorSource) -> float:
-        return max(1.0, source.record.sampling_rate / self.sampling_rate)
+        return Grid(self.sampling_rate, start)
 
 
 def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:
