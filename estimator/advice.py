@@ -81,7 +81,7 @@ def advise(
         *_absent(given, dims, names, channels),
         *(
             _too_few_dimensions(bands, n_factors)
-            if n_factors < max(dims)
+            if n_factors < max(presence(given, dims).dims, default=0)
             else _incoherence(bands, dims, n_factors, n_effective)
         ),
         *_sensor_space(bands, dims, names),

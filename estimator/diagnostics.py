@@ -193,7 +193,7 @@ def diagnose(
     for one, two in combinations(range(len(there.sensors)), 2):
         pair = pairs.index((there.sensors[one], there.sensors[two]))
         condition[:, pair] = _condition(part.matrix, there.dims, one, two)
-    d = max(dims)
+    d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     fit = _fit(matrix, there, d, n_effective)
     model = _test(

@@ -49,7 +49,8 @@ def maximum_likelihood(
     correct : bool
         Remove the small-sample bias, see Notes.
     n_factors : int or int64, shape (n_freqs,), optional
-        Dimension of the common motion; ``max(dims)`` by default, `estimator.dimension` finds it.
+        Dimension of the common motion; by default the most channels that a sensor has alive,
+        ``max(dims)``. `estimator.dimension` finds it.
         With `correct`, fewer where the averages cannot tell so many from scatter, flagged
         UNRESOLVED.
     noise_spread : float
@@ -96,14 +97,15 @@ def maximum_likelihood(
             f"{n_effective:.1f} averages of {p} channels: at least as many averages as channels "
             "are needed"
         )
-    factors = np.asarray(max(dims) if n_factors is None else n_factors)
+    matrix, absent = _without_dead_and_copies(given)
+    alive = np.add.reduceat(~absent, np.cumsum([0, *dims[:-1]]), axis=1, dtype=np.int64)
+    factors = np.asarray(alive.max(axis=1) if n_factors is None else n_factors)
     if factors.shape not in {(), (n_freqs,)}:
         raise EstimatorError(f"n_factors of shape {factors.shape}, expected () or ({n_freqs},)")
     check_factors(factors, p)
     factors = np.broadcast_to(factors, (n_freqs,))
     if not (np.isfinite(noise_spread) and noise_spread > 0):
         raise EstimatorError(f"noise_spread {noise_spread}: expected a finite number above zero")
-    matrix, absent = _without_dead_and_copies(given)
     few = factors > max_factors(p - absent.sum(axis=1))
     lone = np.zeros_like(absent)
     lone[~few] = alone(matrix[~few], absent[~few], dims=dims, n_effective=n_effective)

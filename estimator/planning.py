@@ -212,7 +212,9 @@ def _plan(
         n_segments=segments,
         duration=(settings.segment_length + (segments - 1) * settings.hop) / settings.sampling_rate,
         bias=bias,
-        efficiency=np.where(known, share * averages / np.where(known, needed, 1.0), np.nan),
+        efficiency=np.where(
+            known & np.isfinite(share), share * averages / np.where(known, needed, 1.0), np.nan
+        ),
         weak=known & (needed > averages),
     )
 

@@ -81,7 +81,8 @@ def alone(
     Only the sensor with most channels can have such: as many as it has more than any other. They
     are those that the other sensors predict least. All of such a channel is taken for motion, and
     it is alone where that fits the averages as well as any noise does, but for scatter. So a
-    channel that others reach from the side, by sensors that point in many directions, is not.
+    channel that others reach from the side, by sensors that point in many directions, is not. What
+    is alone at most frequencies is so at all.
 
     Parameters
     ----------
@@ -116,33 +117,35 @@ def alone(
         # Where little is predicted, the channel that has no like one is the likeliest.
         left *= np.where(np.isin(place[own], place[others]), 1, 2)
         least = own[np.argsort(-left, axis=1)[:, :excess]]
-        for channel in own:
-            here = rows[(least == channel).any(axis=1)]
-            found[here, channel] = _may_be_motion(
-                csm[np.ix_(here, present, present)],
-                int(np.searchsorted(present, channel)),
-                d=int(count.max()),
-                n_effective=n_effective,
-            )
+        candidate = (least[:, :, None] == own).any(axis=1)
+        p, q = len(present), min(int(count.max()), int(max_factors(len(present))))
+        if q and n_effective > p:
+            matrix = csm[np.ix_(rows, present, present)]
+            parameters = 2 * (p - q) + 1
+            most_misfit, _ = _misfit(maximise(matrix, q), n_effective)
+            most_misfit += parameters + SURELY * np.sqrt(2 * parameters)
+            for here, channel in zip(candidate.T, np.searchsorted(present, own), strict=True):
+                misfit = _misfit_without_noise(matrix[here], int(channel), q, n_effective)
+                here[here] = misfit < most_misfit[here]
+        found[np.ix_(rows, own)] = candidate
+        # One frequency that slips through would stand for the whole band.
+        most = found[rows].mean(axis=0) > 0.5
+        found[np.ix_(rows, np.flatnonzero(most))] = True
     return found
 
 
-def _may_be_motion(csm: ComplexArray, channel: int, *, d: int, n_effective: float) -> BoolArray:
-    """Whether motion of d dimensions fits as well with no noise in a channel, shape (n_freqs,).
+def _misfit_without_noise(
+    csm: ComplexArray, channel: int, q: int, n_effective: float
+) -> FloatArray:
+    """Statistic of the model test with q factors and no noise in a channel, shape (n_freqs,).
 
     The others, that channel taken off, then have a factor less, and an average.
     """
-    p = csm.shape[1]
-    q = min(d, int(max_factors(p)))
-    if q == 0 or n_effective <= p:
-        return np.ones(len(csm), np.bool_)
-    rest = np.delete(np.arange(p), channel)
+    rest = np.delete(np.arange(csm.shape[1]), channel)
     seen = csm[:, rest, channel]
     taken_off = csm[:, rest][:, :, rest] - seen[:, :, None] * seen[:, None].conj()
     misfit, _ = _misfit(maximise(taken_off, q - 1), n_effective - 1)
-    before, _ = _misfit(maximise(csm, q), n_effective)
-    parameters = 2 * (p - q) + 1
-    return np.asarray(misfit - before < parameters + SURELY * np.sqrt(2 * parameters))
+    return misfit
 
 
 def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArray]:

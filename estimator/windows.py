@@ -48,7 +48,8 @@ def get_window(window: Window, length: int) -> FloatArray:
             if isinstance(window, str) and "," in window:
                 name, *parameters = window.split(",")
                 known = (name, *map(float, parameters))
-            taps = np.asarray(signal.get_window(known, length), dtype=np.float64)  # type: ignore[arg-type]  # any name; unknown ones raise below
+            with np.errstate(all="ignore"):  # what is not finite is refused below
+                taps = np.asarray(signal.get_window(known, length), dtype=np.float64)  # type: ignore[arg-type]  # any name; unknown ones raise below
         except (ValueError, TypeError) as error:
             raise EstimatorError(f"window {window!r}: {error}") from error
     else:
@@ -56,7 +57,8 @@ def get_window(window: Window, length: int) -> FloatArray:
     if taps.shape != (length,):
         raise EstimatorError(f"window of shape {taps.shape}, expected ({length},)")
     if not np.all(np.isfinite(taps)) or not np.any(taps):
-        raise EstimatorError("window: its samples must be finite and not all zero")
+        name = f"window {window!r}" if isinstance(window, (str, tuple)) else "window"
+        raise EstimatorError(f"{name}: its samples must be finite and not all zero")
     return taps
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from daq.recording.reader import SensorRecord
 
 LIMIT_NOT_MET = 1
+_LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
 _FEWEST_SAMPLES = 4  # of a segment: one frequency between 0 and half the rate
 
 
@@ -107,7 +108,7 @@ def chosen(settings: Settings, *, method: str | None = None, **wanted: Any) -> S
         changes["methods"] = (str(method),)
     settings = replace(settings, **changes)
     try:
-        get_window(settings.window, 16)
+        get_window(settings.window, _LONG_WINDOW)
     except EstimatorError as error:
         raise typer.BadParameter(
             f"--{error}; expected one of scipy.signal.get_window, as in hann or, with a parameter,"

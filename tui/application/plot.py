@@ -74,7 +74,7 @@ class TimeAxis(AxisFormatter):
 
     def get_ticks(self, min_: float, max_: float, max_ticks: int = 6) -> list[float]:
         """Return tick positions at round steps of seconds, minutes, hours or days."""
-        least = (max_ - min_) / (min(max_ticks, 6) - 1)
+        least = (max_ - min_) / max(min(max_ticks, 6) - 1, 1)
         step = next((s for s in TIME_STEPS if s >= least), 1440 * math.ceil(least / 1440))
         return [float(t) for t in np.arange(math.ceil(min_ / step) * step, max_ + 1e-9, step)]
 

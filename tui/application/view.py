@@ -191,7 +191,13 @@ def _channel_noise(
 
 def _flagged(snapshot: Snapshot, column: int) -> str:
     """Say why most frequencies of a channel have no noise; nothing where they do."""
-    words = {Flag.DEAD_CHANNEL: "no signal", Flag.DUPLICATE: "a copy", Flag.NOT_FINITE: "no number"}
+    words = {
+        Flag.DEAD_CHANNEL: "no signal",
+        Flag.DUPLICATE: "a copy",
+        Flag.NOT_FINITE: "no number",
+        Flag.INVALID: "no number",
+        Flag.NO_COUNTERPART: "unmatched",
+    }
     for noise in snapshot.results.values():
         flags = noise.flags[1:-1, column]
         for flag, word in words.items():
