@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
 _FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
 _ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
-_LATEST = 5.0  # seconds that a device with UTC may take to send; beyond, the host's UTC is wrong
+_LATEST = 5.0  # seconds that a device with UTC may take to send what it has
 
 
 class AlignedRecording:
@@ -254,12 +254,16 @@ class AlignedRecording:
                 source.clock = clock
 
     def _place_stated(self) -> None:
-        """Move stated UTC to where it arrives, if the host's UTC, which others have, is wrong."""
+        """Move stated UTC to where it arrives, if the host's UTC, which others have, is wrong.
+
+        It is where no device's blocks arrive when they can. A block of all channels is there when
+        the slowest channel's is: where these are out of step, up to twice as long after its end.
+        """
         stated = [source.arrivals for source in self._sources if source.device_utc]
         if 0 < len(stated) < len(self._sources):
-            latency = min(arrivals.latency for arrivals in stated)
-            for arrivals in stated:
-                arrivals.moved = 0.0 if 0 <= latency < _LATEST else latency
+            wrong = all(not 0 <= each.latency < _LATEST + 2 * each.longest_block for each in stated)
+            for each in stated:
+                each.moved = min(other.latency for other in stated) if wrong else 0.0
 
     def refresh(self) -> None:
         """Take what has been committed since, and set every clock by it."""

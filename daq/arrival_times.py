@@ -97,8 +97,8 @@ class ArrivalTimes:
 
     Attributes
     ----------
-    latency : float
-        Seconds at least from the last sample of a block, as stated, to its arrival.
+    longest_block : float
+        In seconds.
     moved : float
         Seconds by which stated times are moved.
     """
@@ -106,7 +106,7 @@ class ArrivalTimes:
     sampling_rate: float
     origin_monotonic_ns: int
     origin_utc_ns: int
-    latency: float = np.inf
+    longest_block: float = 0.0
     moved: float = 0.0
     _epoch_starts: list[int] = field(default_factory=list)
     _index: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
@@ -118,6 +118,7 @@ class ArrivalTimes:
     _stretch: int = -1
     _lowest: tuple[float, float] = (np.inf, np.inf)
     _leapt: float = 0.0
+    _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -154,8 +155,6 @@ class ArrivalTimes:
             late -= np.cumsum(leaps)
             step -= leaps
             self._leapt += float(leaps.sum())
-            latency = arrived - late - (first + length - 1) / self.sampling_rate
-            self.latency = min(self.latency, float(latency.min()))
             breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
         else:
             breaks = ((flags & int(_BREAKS)) != 0) | self._too_early(index, late)
@@ -163,6 +162,12 @@ class ArrivalTimes:
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
         self._end_sample = int(first[-1] + length[-1])
+        self.longest_block = max(self.longest_block, float(length.max()) / self.sampling_rate)
+        if self._device_utc:
+            least = np.full(len(self._epoch_starts), np.inf)
+            least[: len(self._latency)] = self._latency
+            np.minimum.at(least, epoch, arrived - late - (first + length - 1) / self.sampling_rate)
+            self._latency = least
         # A second that is not over yet is thinned again with what comes.
         index = np.concatenate([self._index[-1:], index])
         late = np.concatenate([self._late[-1:], late])
@@ -182,6 +187,15 @@ class ArrivalTimes:
         """
         first = self._index <= self._index[0] + _NODE * self.sampling_rate
         return float(self._late[first & (self._epoch == self._epoch[0])].min()) + self.moved
+
+    @property
+    def latency(self) -> float:
+        """Seconds at least from the last sample of a block, as stated, to its arrival.
+
+        In the longest epoch: a device may state wrong times until it has found the right one.
+        """
+        lengths = [end - first for first, end in self._bounds()]
+        return float(self._latency[int(np.argmax(lengths))])
 
     def come_with(self, other: ArrivalTimes) -> bool:
         """Whether blocks of both are received together, so that both count alike."""

@@ -43,6 +43,7 @@ _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3
 _FEWEST_SEGMENTS = 6  # in the first batch, per channel of the reference: P is a mean of those
 _SHARED = 0.1  # samples to which most segments tell the delay of sensors that share a motion
+_REFERENCES = 3  # sensors tried as the reference: more would cost too much where none is coherent
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
 _CLEAR = 1.5  # times as high as the peak nearest zero: those of one line are about as high
@@ -150,7 +151,7 @@ class DelayMeter:
         """Return the reference, and delays and standard deviations of the others against it."""
         best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
         most = -1
-        for reference, x0 in enumerate(sensors):
+        for reference, x0 in enumerate(sensors[:_REFERENCES]):
             found = {
                 number: self._first_delays(x0, xj)
                 for number, xj in enumerate(sensors)
@@ -160,7 +161,7 @@ class DelayMeter:
             n_shared = sum(spread * self.sampling_rate < _SHARED for spread in spreads)
             if n_shared > most:
                 best, most = (reference, found), n_shared
-            if n_shared == len(found):
+            if 2 * n_shared >= len(found):  # no other group of sensors is larger
                 break
         return best
 

@@ -171,7 +171,7 @@ async def test_a_digitizer_that_recovers_from_an_overflow_is_waited_for(tmp_path
         {**table(name, "labjack"), "settings": {"mode": mode}} for name, mode in modes.items()
     ]
     told = spec(*tables, speed=speed, age=0.0)
-    told["faults"] = [{"kind": "overflow", "at": 12.0, "every": 16.0, "duration": 5.0}]
+    told["faults"] = [{"kind": "overflow", "at": 12.0, "every": 40.0, "duration": 5.0}]
     stop = asyncio.Event()
 
     def acknowledged(status: Status) -> None:

@@ -100,8 +100,9 @@ class FifoSession:
                 raise NoAnswerError(
                     f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
                 )
-            if self._decoder.started or self._decoder.level < least:
-                least, lessened = self._decoder.level, loop.time()
+            level = self._decoder.level or math.inf  # none is known before a first reply
+            if self._decoder.started or level < least or least == math.inf:
+                least, lessened = level, loop.time()
             elif loop.time() - lessened > NOT_LESS:
                 raise NoAnswerError(
                     f"{self._stream.label}: the FIFO is never read up, {self._decoder.level} words"

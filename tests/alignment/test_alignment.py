@@ -68,6 +68,43 @@ def test_a_sensor_with_utc_meets_those_without_whatever_the_host_takes_utc_for(
         assert 2800 < aligned.n_available < 3000
 
 
+def test_a_device_whose_channels_are_out_of_step_is_slow_and_not_wrong(tmp_path: Path) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=7.5),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, seconds in (("a", 0.5), ("b", 10.0)):
+        for block in blocks(name, sensors[name], seconds):
+            writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        delays = AlignedRecording(recording).delays(np.array([3000.0]))
+        assert np.ptp(delays) < 1e-3
+
+
+@pytest.mark.parametrize("ahead", [3, -40])
+def test_wrong_utc_until_a_device_finds_the_right_one_moves_nothing(
+    tmp_path: Path, ahead: int
+) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            stated = block.device_counter
+            if stated is not None and block.first_sample < 500:
+                stated += ahead * 10**9
+            writer.append(replace(block, device_counter=stated))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
+        assert np.ptp(aligned.delays(at)) < 1e-3
+
+
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_gap_is_invalid_for_all_and_nothing_else_is(tmp_path: Path, shared: bool) -> None:
     clock = {name: "one" if shared else name for name in "abc"}

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 
 from daq.clock import SystemClock
+from daq.drivers.base import DeviceInformation
+from daq.drivers.fifo import FifoSession, FifoSettings
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import rtu
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.fifo import FifoDecoder
 from daq.transport import open_port
 from sim_devices import launch
 from sim_devices.device import Source
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.bench import Sensor
+    from daq.transport import ByteStream
     from sim_devices.launch import RunningDevice
     from sim_devices.scenario import Scenario
 
@@ -116,7 +120,8 @@ async def test_at_the_rate_it_leaves_the_factory_with_every_sample_comes() -> No
     one = table("A", rate=7812.0, settings={"capacity": 65_535})
     world = spec(one, sampling_rate=7812.0, age=0.0)
     with launch.start(world) as (running,):
-        blocks, events = await record(sensors(running, one)[0], 4000)
+        patient = sensors(running, one, settings={"capacity": 65_535, "timeout": 2.0})[0]
+        blocks, events = await record(patient, 4000)
     assert not events
     assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
     assert_felt(scenario("A", sampling_rate=7812.0), "A", blocks, world, 4000)
@@ -146,6 +151,42 @@ async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch)
             NoAnswerError, match=r"never read up, 58\d\d words wait: the link is too"
         ):
             await record(slow, 1)
+
+
+async def test_a_lost_reply_is_no_slow_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However much waits: a link is slow where that never lessens."""
+    monkeypatch.setattr("daq.drivers.fifo.NOT_LESS", 0.4)
+
+    class Backlog:
+        label, level, asked = "backlog", 6000, 0
+
+        def discard(self) -> None:
+            pass
+
+        async def write(self, request: bytes) -> None:
+            n = int.from_bytes(request[4:6], "big") - 1
+            self.asked += 1
+            self.reply = rtu.encode_registers(1, 4, np.array([self.level] + [7] * n, np.uint16))
+            self.level = max(0, self.level - n)
+
+        async def read(self) -> tuple[bytes, HostTime]:
+            await asyncio.sleep(10.0 if self.asked == 1 else 0.015)
+            return self.reply, SystemClock().now()
+
+    settings = FifoSettings(timeout=0.1, poll_interval=1e-3)
+    decoder = FifoDecoder("A", RATE, n_channels=3, header="size", unit=1, capacity=None)
+    stream = cast("ByteStream", Backlog())
+    session = FifoSession(
+        stream, settings, decoder, information=DeviceInformation("A"), clock=SystemClock()
+    )
+    items = []
+    async with asyncio.timeout(30):
+        async for item in session.read():
+            items.append(item)
+            if len(items) == 2:
+                break
+    assert isinstance(items[0], Event)
+    assert isinstance(items[1], Block)
 
 
 async def test_an_overflow_is_told_and_the_gap_estimated(
