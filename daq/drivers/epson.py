@@ -23,6 +23,7 @@ import numpy as np
 
 from daq.bench import Channel, Sensor
 from daq.drivers.epson_setup import Configuration, Device, EpsonSettings
+from daq.drivers.shared_port import only
 from daq.errors import (
     BenchFileError,
     DeviceError,
@@ -186,10 +187,7 @@ class EpsonDriver:
 
 
 def _configured(sensors: Sequence[Sensor]) -> tuple[Sensor, Configuration]:
-    sensor = sensors[0]
-    if len(sensors) > 1:
-        names = ", ".join(repr(other.name) for other in sensors)
-        raise BenchFileError(f"port {sensor.port} is given to {names}; an Epson has its own")
+    sensor = only(sensors, "an Epson has its own")
     return sensor, Configuration.of(sensor)
 
 

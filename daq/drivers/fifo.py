@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.base import DeviceInformation
+from daq.drivers.shared_port import only
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.protocols import rtu
 from daq.protocols.fifo import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
@@ -175,13 +176,8 @@ class FifoDriver:
 
 def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
     """Return the sensor and its settings; raise BenchFileError for what cannot be."""
-    sensor = sensors[0]
+    sensor = only(sensors, "reading one FIFO takes all of a line")
     settings = FifoSettings.model_validate(sensor.settings)
-    if len(sensors) > 1:
-        names = ", ".join(repr(other.name) for other in sensors)
-        raise BenchFileError(
-            f"port {sensor.port} is given to {names}; reading one FIFO takes all of a line"
-        )
     who, rate = f"sensor {sensor.name!r}", sensor.sampling_rate
     if settings.set_rate and not 1 <= rate == round(rate) <= HIGHEST_RATE:
         raise BenchFileError(

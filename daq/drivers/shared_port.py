@@ -1,4 +1,4 @@
-"""What the sensors of one port must agree on, told from the bench file alone."""
+"""What a port must be, and its sensors must agree on, told from the bench file alone."""
 
 from __future__ import annotations
 
@@ -15,6 +15,22 @@ if TYPE_CHECKING:
     from daq.bench import Sensor
 
 NETWORK = ("socket://", "tcp://", "udp://", "modbus-tcp://")
+
+
+def only(sensors: Sequence[Sensor], why: str) -> Sensor:
+    """Return the one sensor of a port that takes no more.
+
+    Raises
+    ------
+    BenchFileError
+        There are several; or the port is no address.
+    """
+    sensor = sensors[0]
+    if len(sensors) > 1:
+        names = ", ".join(repr(other.name) for other in sensors)
+        raise BenchFileError(f"port {sensor.port} is given to {names}; {why}")
+    require_address(sensor)
+    return sensor
 
 
 def require_alike(

@@ -27,6 +27,7 @@ from pydantic import (
 
 from daq.datagrams import open_datagrams
 from daq.drivers.base import DeviceInformation
+from daq.drivers.shared_port import only
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.block import Block, Event
 from daq.protocols.text import TextDecoder
@@ -272,11 +273,8 @@ class TextDriver:
 
 def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
     """Return the sensor, its settings and format; raise BenchFileError for what cannot be."""
-    sensor = sensors[0]
+    sensor = only(sensors, "text comes from one")
     settings = TextSettings.model_validate(sensor.settings)
-    if len(sensors) > 1:
-        names = ", ".join(repr(other.name) for other in sensors)
-        raise BenchFileError(f"port {sensor.port} is given to {names}; text comes from one")
     for key in ("start", "stop"):
         if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
             raise BenchFileError(

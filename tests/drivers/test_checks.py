@@ -39,6 +39,15 @@ def test_settings_are_of_their_type(driver: str, settings: str, key: str) -> Non
         parse(bench(driver, settings))
 
 
+@pytest.mark.parametrize("driver", ["epson", "fifo", "text"])
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:99999", "socket://bridge"])
+def test_a_port_that_is_no_address_is_said_as_it_was_written(driver: str, port: str) -> None:
+    with pytest.raises(
+        BenchFileError, match=rf"sensors\[\"A\"\]: port '{re.escape(port)}' is no address"
+    ):
+        parse(bench(driver, "", port=port))
+
+
 @pytest.mark.parametrize(
     ("driver", "settings"),
     [
