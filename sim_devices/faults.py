@@ -123,7 +123,7 @@ class Fault(BaseModel):
 _SCRIPT = TypeAdapter(list[Fault])
 
 
-def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...]:  # noqa: ANN401
+def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...]:  # noqa: ANN401 -- what a file says
     """Read a fault script.
 
     Parameters
@@ -148,7 +148,7 @@ def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...
 
 
 def _told(fault: ErrorDetails) -> str:
-    place = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in fault["loc"])
+    place = "".join(f"[{key + 1}]" if isinstance(key, int) else f".{key}" for key in fault["loc"])
     expected = fault["msg"]
     if fault["type"] == "list_type":
         expected = "expected a list of tables, [[faults]]"
@@ -165,8 +165,8 @@ def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
     ScenarioError
         Naming every sensor and channel that is not there, and those that are.
     """
-    wrong = []
-    for number, fault in enumerate(faults):
+    wrong = []  # counted from 1, as in other faults of bench files
+    for number, fault in enumerate(faults, 1):
         place, named = f"faults[{number}]", fault.sensors or ()
         wrong += [
             f"{place}.sensors = {name!r}: there is no such sensor; expected {', '.join(n_channels)}"

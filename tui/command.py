@@ -69,7 +69,7 @@ class HuddleGroup(TyperGroup):
 
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error; None for one that we did not foresee."""
-    from daq.errors import BenchFileError, HuddleError, WrongSettingError  # noqa: PLC0415
+    from daq.errors import BenchFileError, HuddleError, WrongSettingError  # noqa: PLC0415 - seldom needed
 
     if isinstance(error, BaseExceptionGroup):
         codes = [exit_code(inner) for inner in error.exceptions]

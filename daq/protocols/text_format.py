@@ -124,7 +124,7 @@ def is_readable(time_format: str) -> bool:
     """Whether a format, as ``strptime`` has it, gives date and time to the minute at least."""
     instant = datetime(2026, 11, 21, 13, 14, 15, 161_718, UTC)
     try:
-        found = datetime.strptime(instant.strftime(time_format), time_format)  # noqa: DTZ007
+        found = datetime.strptime(instant.strftime(time_format), time_format)  # noqa: DTZ007 -- UTC by now
     except ValueError:
         return False
     return found.replace(second=0, microsecond=0, tzinfo=UTC) == instant.replace(

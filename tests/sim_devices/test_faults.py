@@ -147,9 +147,9 @@ def test_a_wrong_script_says_what_is_wrong() -> None:
         parse([{"kind": "batching", "at": 1.0}])
     with pytest.raises(ScenarioError) as caught:
         parse([{"kind": "drop"}, {"kind": "melt", "at": -1}])
-    assert "faults[0].at" in str(caught.value)
-    assert "faults[1].kind = 'melt'" in str(caught.value)
-    assert "faults[1].at = -1" in str(caught.value)
+    assert "faults[1].at" in str(caught.value)
+    assert "faults[2].kind = 'melt'" in str(caught.value)
+    assert "faults[2].at = -1" in str(caught.value)
 
 
 DRIVER = driver_type("epson")
@@ -253,7 +253,7 @@ def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
     wanted = [{"kind": "drop", "at": 3.0}]
     assert specification(with_faults(bench, script), speed=1.0)["faults"] == wanted
     script.write_text("[[faults]]\nat = -3.0\n", encoding="utf-8")
-    with pytest.raises(BenchFileError, match=r"(?s)faults\.toml: faults\[0\].*at = -3"):
+    with pytest.raises(BenchFileError, match=r"(?s)faults\.toml: faults\[1\].*at = -3"):
         with_faults(bench, script)
 
 
@@ -261,9 +261,9 @@ def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
     ("script", "said"),
     [
         (b"faults = 5", r"faults = 5: expected a list"),
-        (b"faults = [5]", r"faults\[0\] = 5: "),
+        (b"faults = [5]", r"faults\[1\] = 5: "),
         (b"[[fault]]\nat = 3.0", r"fault: there is no such key; expected \[\[faults\]\]"),
-        (b'[[faults]]\nkind = "dead"\nat = 1\nwhen = 3', r"faults\[0\]\.when = 3: .*expected kind"),
+        (b'[[faults]]\nkind = "dead"\nat = 1\nwhen = 3', r"faults\[1\]\.when = 3: .*expected kind"),
         (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = ["NOPE"]', r"'NOPE': .*expected A, B, C"),
         (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = []', r"sensors = \[\]: "),
         (b'[[faults]]\nkind = "dead"\nat = 1\nchannel = 3', r"channel = 3: expected 0 to 2"),
