@@ -77,15 +77,16 @@ def advise(
     -------
     tuple of Advice
     """
+    alive = presence(given, dims).dims
     found = [
         *_absent(given, dims, names, channels),
         *(
             _too_few_dimensions(bands, n_factors)
-            if n_factors < max(presence(given, dims).dims, default=0)
+            if n_factors < max(alive, default=0)
             else _incoherence(bands, dims, n_factors, n_effective)
         ),
         *_sensor_space(bands, dims, names),
-        *_dimensions(bands, presence(given, dims).dims, n_effective),
+        *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
         *_left_in(bands, max(dims), n_effective),
         *(

@@ -122,15 +122,15 @@ def alone(
         if q and n_effective > p:
             matrix = csm[np.ix_(rows, present, present)]
             parameters = 2 * (p - q) + 1
-            most_misfit, _ = _misfit(maximise(matrix, q), n_effective)
-            most_misfit += parameters + SURELY * np.sqrt(2 * parameters)
+            explained, _ = _misfit(maximise(matrix, q), n_effective)
+            explained += parameters + SURELY * np.sqrt(2 * parameters)
             for here, channel in zip(candidate.T, np.searchsorted(present, own), strict=True):
                 misfit = _misfit_without_noise(matrix[here], int(channel), q, n_effective)
-                here[here] = misfit < most_misfit[here]
+                here[here] = misfit < explained[here]
         found[np.ix_(rows, own)] = candidate
         # One frequency that slips through would stand for the whole band.
-        most = found[rows].mean(axis=0) > 0.5
-        found[np.ix_(rows, np.flatnonzero(most))] = True
+        mostly = found[rows].mean(axis=0) > 0.5
+        found[np.ix_(rows, np.flatnonzero(mostly))] = True
     return found
 
 
