@@ -22,7 +22,7 @@ from daq.recorder import Status, record
 from daq.recording.healing import heal, verify
 from daq.recording.reader import Recording
 from sim_devices import launch
-from tests.sim_devices.bench import device, scenario, sensors, spec
+from tests.sim_devices.bench import bench_of, device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -50,16 +50,7 @@ def running() -> Iterator[tuple[launch.RunningDevice, ...]]:
 
 
 def make_bench(running: tuple[launch.RunningDevice, ...]) -> Bench:
-    return Bench(
-        name="simulated",
-        sampling_rate=200.0,
-        sensors=tuple(
-            sensor
-            for one, table in zip(running, TABLES, strict=True)
-            for sensor in sensors(one, table)
-        ),
-        simulation={"speed": SPEED},
-    )
+    return bench_of(running, TABLES, simulation={"speed": SPEED})
 
 
 def start(bench: Bench, path: Path) -> subprocess.Popen[str]:

@@ -20,7 +20,7 @@ from daq.recorder import Status, record
 from daq.recording.healing import verify
 from daq.recording.reader import Recording
 from tests.acceptance.account import Log, accounts
-from tests.sim_devices.bench import device, sensors, spec
+from tests.sim_devices.bench import bench_of, device, sensors, spec
 from tests.test_recorder_devices import started
 
 if TYPE_CHECKING:
@@ -69,15 +69,7 @@ async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> Non
             stop.set()
 
     async with started(told) as running:
-        bench = Bench(
-            name="simulated",
-            sampling_rate=200.0,
-            sensors=tuple(
-                sensor
-                for one, its_table in zip(running, tables, strict=True)
-                for sensor in sensors(one, its_table)
-            ),
-        )
+        bench = bench_of(running, tables)
         path = tmp_path / "r.h5"
         clock = SystemClock(SPEED)
         while not stop.is_set():  # a cable may just be out
@@ -182,15 +174,7 @@ async def test_a_digitizer_that_recovers_from_an_overflow_is_waited_for(tmp_path
 
     path = tmp_path / "r.h5"
     async with started(told) as running:
-        bench = Bench(
-            name="simulated",
-            sampling_rate=200.0,
-            sensors=tuple(
-                sensor
-                for one, its_table in zip(running, tables, strict=True)
-                for sensor in sensors(one, its_table)
-            ),
-        )
+        bench = bench_of(running, tables)
         await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
     with Recording.open(path) as recording:
         for sensor in recording.sensors:

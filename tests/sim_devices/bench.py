@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from daq.bench import Channel, Sensor
+from daq.bench import Bench, Channel, Sensor
 from daq.protocols import epson
 from sim_devices.scenario import Scenario
 
@@ -50,6 +50,18 @@ def spec(
         "scenario": scenario(names, sampling_rate=sampling_rate).to_dict(),
         "devices": list(devices),
     }
+
+
+def bench_of(
+    running: Sequence[RunningDevice],
+    tables: Sequence[dict[str, Any]],
+    **changes: Any,  # noqa: ANN401 -- whatever a bench holds
+) -> Bench:
+    """Return the bench of running devices, each beside its table."""
+    every = tuple(
+        sensor for one, table in zip(running, tables, strict=True) for sensor in sensors(one, table)
+    )
+    return Bench(name="simulated", sampling_rate=RATE, sensors=every, **changes)
 
 
 def sensors(running: RunningDevice, table: dict[str, Any], **changes: Any) -> list[Sensor]:  # noqa: ANN401
