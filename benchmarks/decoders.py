@@ -11,16 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.row import Row
-from daq.protocols import brp, epson, gcf, labjack, rtu
 from daq.protocols.block import HostTime
-from daq.protocols.epson import BurstFormat
-from daq.protocols.epson_burst import BurstDecoder
-from daq.protocols.fifo import FifoDecoder
-from daq.protocols.guralp import SerialDecoder
-from daq.protocols.labjack import Packet, StreamDecoder
-from daq.protocols.registers import RegisterDecoder, RegisterMap
-from daq.protocols.text import TextDecoder
-from daq.protocols.text_format import RASPBERRY_SHAKE
+from daq.protocols.epson import commands
+from daq.protocols.epson.burst import BurstDecoder
+from daq.protocols.epson.commands import BurstFormat
+from daq.protocols.guralp import brp, gcf
+from daq.protocols.guralp.decoders import SerialDecoder
+from daq.protocols.labjack import stream
+from daq.protocols.labjack.stream import Packet, StreamDecoder
+from daq.protocols.modbus import rtu
+from daq.protocols.modbus.fifo import FifoDecoder
+from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
+from daq.protocols.text.decoder import TextDecoder
+from daq.protocols.text.format import RASPBERRY_SHAKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +43,7 @@ def _noise(n: int) -> NDArray[np.int64]:
 
 def _epson(n_frames: int) -> bytes:
     noise = _noise(3 * n_frames).reshape(3, -1)
-    return epson.encode_bursts(
+    return commands.encode_bursts(
         EPSON,
         flag=0x8E00,
         temperature=2637,
@@ -110,7 +113,7 @@ def _labjack() -> bytes:
     rows[:, 0], rows[:, 1] = timer & 0xFFFF, timer >> 16 & 0xFFFF
     samples = rows.ravel()
     packets = [
-        labjack.encode_packet(Packet(samples[start : start + 506], transaction=k))
+        stream.encode_packet(Packet(samples[start : start + 506], transaction=k))
         for k, start in enumerate(range(0, samples.size, 506))
     ]
     return b"".join(packets)
@@ -190,7 +193,7 @@ def run() -> list[Row]:
             _labjack(),
             StreamDecoder(
                 {name: [0 + 6 * k, 2 + 6 * k, 4 + 6 * k] for k, name in enumerate("ABC")},
-                scan_list=[*labjack.TIMER_ADDRESSES, *range(0, 18, 2)],
+                scan_list=[*stream.TIMER_ADDRESSES, *range(0, 18, 2)],
                 scan_rate=1000.0,
             ).receive,
             1000 * 11 * 2,

@@ -23,13 +23,14 @@ import scipy.fft
 from isal import isal_zlib
 
 from benchmarks.row import Row
-from daq.bench_model import Channel
-from daq.estimation import Estimation, Settings, estimate
-from daq.formats.import_ import BLOCK_ROWS
+from daq.alignment.resampling import resample
+from daq.bench.model import Channel
+from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.settings import Settings
+from daq.formats.importer import BLOCK_ROWS
 from daq.protocols.block import Block, HostTime
-from daq.recording.layout import SensorLayout
+from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
-from daq.resampling import resample
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -84,7 +85,7 @@ def _three_hours(folder: Path) -> list[Row]:
     of_recorded, of_imported, start = _least(
         lambda: _command(recorded),
         lambda: _command(imported),
-        lambda: _run("-c", "import tui.estimating"),
+        lambda: _run("-c", "import tui.commands.estimate"),
         repeats=2,
     )
     (loop,) = _least(lambda: _csd_loop(samples), repeats=1)

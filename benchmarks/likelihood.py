@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 
 from benchmarks.row import Row, fastest
-from estimator import fisher
-from estimator.dimension import choose_dimension
-from estimator.likelihood import maximum_likelihood
-from estimator.three_sensor import three_sensor
-from tests.estimator.models import (
+from estimator.likelihood import fisher
+from estimator.likelihood.dimension import choose_dimension
+from estimator.likelihood.maximum_likelihood import maximum_likelihood
+from estimator.self_noise.three_sensor import three_sensor
+from tests.estimator.csm_models import (
     common_motion,
     pentagon,
     planar_sensors,

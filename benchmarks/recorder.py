@@ -24,12 +24,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.row import Row, peak_memory
-from daq.bench import Bench, Channel, Sensor, parse
-from daq.estimation import Estimation, Settings
-from daq.protocols import epson
-from daq.recorder import run as record
-from daq.recording.healing import verify
-from tui.running import BEHIND, INTERVAL
+from daq.acquisition.recorder import run as record
+from daq.bench.loading import parse
+from daq.bench.model import Bench, Channel, Sensor
+from daq.estimation.estimation import Estimation
+from daq.estimation.settings import Settings
+from daq.protocols.epson import commands
+from daq.recording.repair import verify
+from tui.commands.run import BEHIND, INTERVAL
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SEND_INTERVAL = 0.05
-AXES = tuple(Channel(name=axis, sensitivity=epson.COUNTS_PER_UNIT) for axis in "xyz")
+AXES = tuple(Channel(name=axis, sensitivity=commands.COUNTS_PER_UNIT) for axis in "xyz")
 
 
 class Noise:
@@ -67,16 +69,16 @@ class Noise:
 
 async def play(n_sensors: int, sampling_rate: float) -> None:
     """Be the devices until standard input is closed."""
-    from sim_devices import serve  # noqa: PLC0415  (only the process that plays them)
-    from sim_devices.device import ChannelSpec, DeviceSpec, Line  # noqa: PLC0415
-    from sim_devices.epson import EpsonDevice  # noqa: PLC0415
+    from sim_devices.devices.epson import EpsonDevice  # noqa: PLC0415
+    from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Line  # noqa: PLC0415
     from sim_devices.faults import LineFaults  # noqa: PLC0415
-    from sim_devices.pacing import WorldClock  # noqa: PLC0415
+    from sim_devices.server import serve  # noqa: PLC0415  (only the process that plays them)
+    from sim_devices.server.world_clock import WorldClock  # noqa: PLC0415
 
     serve.LEAST_INTERVAL = SEND_INTERVAL
     clock = WorldClock(time.monotonic_ns())
     source: Any = Noise(sampling_rate)
-    channels = tuple(ChannelSpec(axis, epson.COUNTS_PER_UNIT) for axis in "xyz")
+    channels = tuple(ChannelSpec(axis, commands.COUNTS_PER_UNIT) for axis in "xyz")
     served = []
     for number in range(n_sensors):
         name = f"s{number:02}"
@@ -93,7 +95,7 @@ async def play(n_sensors: int, sampling_rate: float) -> None:
 
 def measure(bench_file: str, path: str, duration: float) -> None:
     """Be the recorder, and say what it took."""
-    bench = parse(Path(bench_file).read_text(encoding="utf-8"), check=False)
+    bench = parse(Path(bench_file).read_text(encoding="utf-8"))
     begin: list[float] = []
 
     def used() -> float:

@@ -11,7 +11,7 @@ from scipy import signal
 
 from benchmarks.row import Row, fastest, least_work
 from estimator.methods import self_noise
-from estimator.spectra import CrossSpectra, WelchSettings
+from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 RATE, LENGTH, HOURS = 200, 2000, 3
 TRIAXIAL = (3, 3, 3)
@@ -22,7 +22,7 @@ import sys
 import numpy as np
 from benchmarks.row import peak_memory
 from estimator.methods import self_noise
-from estimator.spectra import CrossSpectra, WelchSettings
+from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 settings = WelchSettings(200.0, 2000)
 chunk = np.random.default_rng(0).standard_normal((120_000, 9))
@@ -144,7 +144,7 @@ def _live() -> list[Row]:
                 at_most=share,
                 note="all threads together"
                 if snr > 1
-                else "motion lost in the noise everywhere; updates are spaced (tui.spacing)",
+                else "motion lost in the noise everywhere; updates are spaced (Throttle)",
             )
         )
     return rows

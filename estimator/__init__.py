@@ -1,1 +1,4 @@
-"""Self-noise of collocated sensors: numbers in, numbers out."""
+"""Numbers in, numbers out: spectra, self-noise, likelihood, diagnostics.
+
+numpy and scipy alone: no files, no devices, no sentences.
+"""

@@ -15,5 +15,9 @@ class InsufficientDataError(EstimatorError):
     """Too few averages or too few sensors for what was asked."""
 
 
+class BandError(EstimatorError):
+    """A band that holds none of the frequencies."""
+
+
 class UnknownMethodError(EstimatorError):
     """No self-noise method of that name."""

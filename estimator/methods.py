@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from estimator import uncertainty
 from estimator.errors import EstimatorError, UnknownMethodError
-from estimator.likelihood import maximum_likelihood
-from estimator.self_noise import Flag, SelfNoise
-from estimator.three_channel import three_channel
-from estimator.three_sensor import three_sensor
-from estimator.two_channel import two_channel
+from estimator.likelihood.maximum_likelihood import maximum_likelihood
+from estimator.self_noise import uncertainty
+from estimator.self_noise.result import Flag, SelfNoise
+from estimator.self_noise.three_channel import three_channel
+from estimator.self_noise.three_sensor import three_sensor
+from estimator.self_noise.two_channel import two_channel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from estimator.arrays import BoolArray, ComplexArray
+    from estimator.types import BoolArray, ComplexArray
 
 __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
@@ -63,7 +63,7 @@ def self_noise(
         Remove the small-sample bias.
     real : bool, shape (n_freqs,), optional
         Where the spectra are real-valued and scatter twice as much: at 0 Hz and at the Nyquist
-        frequency (`estimator.spectra.WelchSettings.real`). Nowhere by default.
+        frequency (`estimator.spectra.welch.WelchSettings.real`). Nowhere by default.
     **options
         What the method alone takes; see there.
 

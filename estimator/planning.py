@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.coherency import check_dims
+from estimator.diagnostics.relative_response import canonical_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.fisher import cramer_rao_cov, efficiency
+from estimator.likelihood.fisher import cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
-from estimator.response import canonical_coherence
-from estimator.windows import effective_averages, get_window
+from estimator.self_noise.coherency import check_dims
+from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
-    from estimator.arrays import BoolArray, ComplexArray, FloatArray
-    from estimator.spectra import WelchSettings
+    from estimator.spectra.welch import WelchSettings
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 BOUND = "cramer-rao-bound"
 REFERENCE = 1e6  # averages at which a method is asked for its scatter
@@ -51,9 +51,9 @@ class Plan:
     bias : float64, shape (n_freqs, n_channels)
         Fractional bias however long one records: misalignment, wrong dimension.
     efficiency : float64, shape (n_freqs, n_channels)
-        `estimator.fisher.efficiency`: share of this recording's length that the best possible
-        estimate would need. Means nothing where there is a bias; NaN for two-channel, which is
-        told the response and so is not bound by what can be known without.
+        `estimator.likelihood.fisher.efficiency`: share of this recording's length that the best
+        possible estimate would need. Means nothing where there is a bias; NaN for two-channel,
+        which is told the response and so is not bound by what can be known without.
     weak : bool, shape (n_freqs, n_channels)
         Where the motion is so weak that to find it takes longer than the precision would. The
         c.o.v. will be lower than wanted.

@@ -1,1 +1,4 @@
-"""Simulated motion, noise and devices with known truth."""
+"""The motion and noise of the paper, and devices that speak the real protocols.
+
+Shares `daq.protocols` with daq and nothing else.
+"""

@@ -1,4 +1,4 @@
-"""``python -m sim_devices SPEC.json [INDEX]``; see :mod:`sim_devices.serve`."""
+"""``python -m sim_devices SPEC.json [INDEX]``; see :mod:`sim_devices.server.serve`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 from sim_devices.errors import ScenarioError, ServeError
-from sim_devices.launch import start
-from sim_devices.serve import serve
+from sim_devices.server.launch import start
+from sim_devices.server.serve import serve
 
 
 def main(arguments: list[str]) -> int:

@@ -28,7 +28,8 @@ def test_package_roots_import_nothing(package: str) -> None:
 
 def test_estimator_loads_no_input_or_output() -> None:
     loaded = modules_after(
-        "import estimator.methods, estimator.spectra, estimator.likelihood, estimator.diagnostics"
+        "import estimator.methods, estimator.spectra.welch,"
+        " estimator.likelihood.maximum_likelihood, estimator.diagnostics.diagnose"
     )
     assert not loaded & {"h5py", "serial", "pymodbus", "textual", "matplotlib", "daq", "tui"}
 
@@ -37,7 +38,7 @@ def test_estimator_loads_no_input_or_output() -> None:
 def test_headless_commands_never_load_textual(command: str) -> None:
     run = (
         "import os; os._exit = sys.exit  # so that it lives to say what it loaded\n"
-        f"from tui.command import main; sys.argv[1:] = ['{command}', 'absent.toml']"
+        f"from tui.cli.main import main; sys.argv[1:] = ['{command}', 'absent.toml']"
     )
     loaded = modules_after(
         f"{run}\ntry:\n    main()\nexcept SystemExit as end:\n    assert end.code\nprint()"

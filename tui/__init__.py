@@ -1,1 +1,4 @@
-"""Terminal front ends: the `huddle` command and the application."""
+"""Terminal front ends: the `huddle` command, the Textual application, reports, studies.
+
+No numerics of its own: numbers come from `daq.results` and `estimator`.
+"""

@@ -1,6 +1,7 @@
 """Which drivers there are: entry points in the group ``huddle.drivers``.
 
-A third-party package adds one by naming a :class:`~daq.drivers.base.DriverType` in its metadata:
+A third-party package adds one by naming a :class:`~daq.drivers.interface.DriverType` in its
+metadata:
 
 .. code-block:: toml
 
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, cast
 from daq.errors import DriverError
 
 if TYPE_CHECKING:
-    from daq.drivers.base import DriverType
+    from daq.drivers.interface import DriverType
 
 GROUP = "huddle.drivers"
 _SEAM = ("name", "summary", "settings", "shares_clock", "counts_dtype", "open")

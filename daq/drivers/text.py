@@ -1,8 +1,9 @@
 """Driver for devices that send delimited text over a serial line, TCP or UDP.
 
 ``preset`` gives a known device's format, and any setting beside it changes that; see
-:mod:`daq.protocols.text` for what a format is made of. Ports: serial, ``socket://host:port``, and
-``udp://address:port`` to listen at (``udp://0.0.0.0:8888`` for any interface).
+:mod:`daq.protocols.text.decoder` for what a format is made of. Ports: serial,
+``socket://host:port``, and ``udp://address:port`` to listen at (``udp://0.0.0.0:8888`` for any
+interface).
 
 A device that is quiet until told sends after ``start``, and ``stop`` is sent in the end: LILY
 tiltmeters take ``*9900XYC2`` and ``*9900XYC-OFF``.
@@ -25,24 +26,24 @@ from pydantic import (
     field_validator,
 )
 
-from daq.datagrams import open_datagrams
-from daq.drivers.base import DeviceInformation
-from daq.drivers.shared_port import only
+from daq.drivers.interface import DeviceInformation
+from daq.drivers.port_rules import only
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.block import Block, Event
-from daq.protocols.text import TextDecoder
-from daq.protocols.text_format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
-from daq.transport import open_port
+from daq.protocols.text.decoder import TextDecoder
+from daq.protocols.text.format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
+from daq.transport.ports import open_port
+from daq.transport.udp import open_datagrams
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     import numpy as np
 
-    from daq.bench import Sensor
-    from daq.clock import HostClock
-    from daq.datagrams import DatagramStream
-    from daq.transport import ByteStream
+    from daq.bench.model import Sensor
+    from daq.host_clock import HostClock
+    from daq.transport.byte_stream import ByteStream
+    from daq.transport.udp import DatagramStream
 
 PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
 
@@ -228,7 +229,7 @@ class TextSession:
 
 
 class TextDriver:
-    """See :class:`daq.drivers.base.DriverType`."""
+    """See :class:`daq.drivers.interface.DriverType`."""
 
     name = "text"
     summary = "Delimited text over serial, TCP or UDP (Raspberry Shake, LILY, any format)"
@@ -240,7 +241,7 @@ class TextDriver:
         return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
 
     def check(self, sensors: Sequence[Sensor]) -> None:
-        """See :meth:`daq.drivers.base.Checking.check`."""
+        """See :meth:`daq.drivers.interface.Checking.check`."""
         _checked(sensors)
 
     @contextlib.asynccontextmanager

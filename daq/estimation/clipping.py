@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _STRETCHES = 16
 _ROWS = 2048  # of each
 _DISTINCT = 16  # counts: what has fewer may well have a favourite at its end
-_FEWEST = 8  # samples at an end
+_MIN_SAMPLES = 8  # samples at an end
 _TIMES = 5  # more often than the count beside it; a sine reaches 2.4
 
 
@@ -61,5 +61,5 @@ def _share(counts: NDArray[np.generic]) -> float:
     if len(values) < _DISTINCT:
         return 0.0
     ends = ((times[0], times[1]), (times[-1], times[-2]))
-    cut = [int(end) for end, beside in ends if end >= max(_FEWEST, _TIMES * beside)]
+    cut = [int(end) for end, beside in ends if end >= max(_MIN_SAMPLES, _TIMES * beside)]
     return sum(cut) / len(counts)

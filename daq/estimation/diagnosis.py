@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.estimation.results import neighbours
-from estimator.diagnostics import Diagnostics, diagnose
+from daq.estimation.noise_estimates import neighbours
+from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench_model import Channel
-    from daq.clock_model import ClockState
-    from daq.estimation.results import Dimensions
-    from estimator.advice import Advice
-    from estimator.multiresolution import Band
-    from estimator.self_noise import SelfNoise
+    from daq.bench.model import Channel
+    from daq.estimation.noise_estimates import Dimensions
+    from daq.timing.clock_model import ClockState
+    from estimator.diagnostics.advice import Advice
+    from estimator.self_noise.result import SelfNoise
+    from estimator.spectra.multiresolution import Band
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
@@ -30,7 +30,7 @@ _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
 def synchronisation(
     clocks: Sequence[ClockState],
-    of_reference: Sequence[bool],
+    is_reference: Sequence[bool],
     moved: FloatArray,
     *,
     dims: tuple[int, ...],
@@ -40,7 +40,7 @@ def synchronisation(
 ) -> dict[str, Any]:
     """Say what is left between the clocks, and what it does to the noise estimate.
 
-    `of_reference` says which sensors run by the clock that others are measured against; `moved`,
+    `is_reference` says which sensors run by the clock that others are measured against; `moved`,
     shape (n_segments, n_sensors), by how much clocks differ from those that segments were taken by.
     A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common
     motion, and so into its noise.
@@ -48,11 +48,11 @@ def synchronisation(
     residual = np.array([state.residual for state in clocks])
     refined = np.array([state.refined for state in clocks], dtype=bool)
     if refined.any():  # what counts is the delay against the reference, however late all are
-        reference = np.array(of_reference, dtype=bool)
+        reference = np.array(is_reference, dtype=bool)
         residual = np.where(refined, residual, np.hypot(residual, residual[reference].max()))
         residual[reference] = 0.0
     if len(moved):
-        first = list(of_reference).index(True)
+        first = list(is_reference).index(True)
         residual = np.hypot(residual, (moved - moved[:, [first]]).std(axis=0))
     found: dict[str, Any] = {
         "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
@@ -100,11 +100,11 @@ def diagnosis(
     Returns
     -------
     dict
-        ``bands``, ``responses`` and ``advice`` as `estimator.diagnostics.Diagnostics` has them;
-        ``n_factors``, the dimensions of the model tested; ``pairs`` (names of sensors) and
-        ``per_frequency``, a dict of its arrays. Where each octave has its own segments, sensors
-        are compared by the octave in which they are most coherent.
-        Empty where there is too little to diagnose.
+        ``bands``, ``responses`` and ``advice`` as `estimator.diagnostics.diagnose.Diagnostics` has
+        them; ``n_factors``, the dimensions of the model tested; ``pairs`` (names of sensors) and
+        ``per_frequency``, a dict of its arrays. Where each octave has its own segments, sensors are
+        compared by the octave in which they are most coherent. Empty where there is too little to
+        diagnose.
     """
     sensors = list(dict.fromkeys(sensor for sensor, _ in channels))
     verticals = {

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from datetime import datetime
 
-    from daq.bench_model import Bench
+    from daq.bench.model import Bench
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Settings:
     segment : float
         Length of a segment in seconds.
     overlap, window, detrend
-        As `estimator.spectra.WelchSettings` takes them.
+        As `estimator.spectra.welch.WelchSettings` takes them.
     methods : tuple of str
         Names in `estimator.methods.METHODS`; ``("all",)`` for every method that applies.
     correct : bool
@@ -41,16 +41,16 @@ class Settings:
         sensors share; "arrivals", by arrival times alone; "nominal", samples at face value.
     reject : bool or None
         Which segments are left out, besides those with gaps: True for those that are clipped or
-        have a transient in any channel (`estimator.rejection`), None for those that are clipped,
-        False for none.
+        have a transient in any channel (`estimator.spectra.segment_rejection`), None for those that
+        are clipped, False for none.
     octaves : bool
-        Whether each octave has segments of its own length (`estimator.multiresolution`):
+        Whether each octave has segments of its own length (`estimator.spectra.multiresolution`):
         `segment` in the highest one, twice as long in each one below. With `reject` each octave's
         segments are judged by those before them in the same octave.
     dimension : int, "auto" or None
-        Factors of the common motion that maximum likelihood allows: that many, as many as the
-        model test of each band demands (`estimator.dimension`), or as many as the largest sensor
-        has channels.
+        Factors of the common motion that maximum likelihood allows: that many, as many as the model
+        test of each band demands (`estimator.likelihood.dimension`), or as many as the largest
+        sensor has channels.
     gains : mapping of str to float
         What a sensor ("A") or a channel ("A.X") makes of the motion, relative to the others: known
         beforehand, for the two-channel method. 1 where not given.

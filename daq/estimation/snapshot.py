@@ -10,10 +10,10 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.clock_model import ClockState
     from daq.recording.reader import SensorRecord
-    from estimator.multiresolution import Band
-    from estimator.self_noise import SelfNoise
+    from daq.timing.clock_model import ClockState
+    from estimator.self_noise.result import SelfNoise
+    from estimator.spectra.multiresolution import Band
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
@@ -121,7 +121,7 @@ class Snapshot:
     diagnostics : dict
         ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
         ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
-        ``dimension``: tuple of `estimator.dimension.BandDimension`, where it was chosen.
+        ``dimension``: tuple of `estimator.likelihood.dimension.BandDimension`, where it was chosen.
         Of a finished estimate also ``clipped``, the share of samples that stand at the end of the
         range by channel ("B.X") where there are any, and what
         `daq.estimation.diagnosis.diagnosis` returns.

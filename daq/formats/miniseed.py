@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign import NS_PER_S, ForeignSensor, Stretch
+from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign import ForeignSensor, finite_stretches
+from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
 
 if TYPE_CHECKING:
     from pathlib import Path

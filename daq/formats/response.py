@@ -12,7 +12,7 @@ import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from daq.bench import PolesZeros
+from daq.bench.model import PolesZeros
 from daq.errors import ImportFormatError
 from daq.formats.miniseed import load_obspy
 

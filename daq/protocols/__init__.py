@@ -1,1 +1,4 @@
-"""Wire protocols, sans-IO: bytes in, blocks out."""
+"""What devices speak, sans-IO: bytes in, blocks out.
+
+No asyncio, no sockets, no clock, no files. Simulated devices share these modules.
+"""

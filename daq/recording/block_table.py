@@ -25,7 +25,7 @@ _ROWS_AT_ONCE = 1 << 14  # 900 kB
 
 
 class BlockTable:
-    """Committed blocks, dtype :data:`daq.recording.layout.BLOCK_DTYPE`, indexed like an array.
+    """Committed blocks, dtype :data:`daq.recording.file_format.BLOCK_DTYPE`, indexed like an array.
 
     A slice reads no more than its rows, the name of a field no other fields.
     """

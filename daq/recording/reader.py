@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Self
 import h5py
 import numpy as np
 
-from daq.bench import parse
+from daq.bench.loading import parse
 from daq.errors import BenchFileError, NotARecordingError, RecordingError
 from daq.protocols.block import Event, HostTime
-from daq.recording import layout
+from daq.recording import file_format
 from daq.recording.block_table import BlockTable
-from daq.recording.chunks import ChunkedRows
+from daq.recording.chunk_reader import ChunkedRows
 from daq.recording.locking import is_being_written
 from daq.recording.superblock import ClearedFile, Superblock
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.bench_model import Bench, Channel
+    from daq.bench.model import Bench, Channel
 
 
 class _Rows:
@@ -77,7 +77,7 @@ class SensorRecord:
         """In Hz, as the device says; nominal where it does not."""
         self._samples: h5py.Dataset = group["samples"]
         self._instants: h5py.Dataset = group["instants"]
-        self.channels: tuple[Channel, ...] = layout.channels_of(self._samples.attrs)
+        self.channels: tuple[Channel, ...] = file_format.channels_of(self._samples.attrs)
         self.dtype: np.dtype[Any] = self._samples.dtype
         self._sample_rows = ChunkedRows(self._samples)
         self._instant_rows = ChunkedRows(self._instants)
@@ -98,7 +98,7 @@ class SensorRecord:
 
     @property
     def gaps(self) -> NDArray[np.void]:
-        """Committed gaps, dtype :data:`daq.recording.layout.GAP_DTYPE`."""
+        """Committed gaps, dtype :data:`daq.recording.file_format.GAP_DTYPE`."""
         return self._gaps.rows()
 
     def counts(self, first_row: int = 0, last_row: int | None = None) -> NDArray[Any]:
@@ -154,8 +154,8 @@ class SensorRecord:
     def take(self, counts: NDArray[np.int64]) -> bool:
         """Take over what was committed (a row of ``/committed``); return whether that is news."""
         before = self.n_samples, self._gaps.n_rows
-        self.blocks.take(int(counts[layout.BLOCKS]), int(counts[layout.ROWS]))
-        self._gaps.take(int(counts[layout.GAPS]))
+        self.blocks.take(int(counts[file_format.BLOCKS]), int(counts[file_format.ROWS]))
+        self._gaps.take(int(counts[file_format.GAPS]))
         if self.blocks.n_samples > self.n_samples:
             self._samples.refresh()
             self._instants.refresh()
@@ -228,7 +228,7 @@ class Recording:
         if not self.bench_text:
             return None
         with contextlib.suppress(BenchFileError):
-            return parse(self.bench_text, str(self.path), check=False)
+            return parse(self.bench_text, str(self.path))
         return None
 
     @property
@@ -278,12 +278,12 @@ class Recording:
             counts: NDArray[np.int64] = self._committed[...]
             news = [s.take(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
             n_events = self._events.n_rows
-            self._events.take(int(counts[-1, layout.EVENTS]))
+            self._events.take(int(counts[-1, file_format.EVENTS]))
         except RecordingError:
             raise
         except (OSError, RuntimeError) as error:
             raise RecordingError(f"{self.path}: a damaged recording: {error}") from error
-        self.closed = bool(counts[-1, layout.CLOSED])
+        self.closed = bool(counts[-1, file_format.CLOSED])
         return any(news) or self._events.n_rows > n_events or self.closed
 
     def close(self) -> None:
@@ -324,19 +324,19 @@ def _open_file(path: Path, *, alone: bool) -> h5py.File:
 def check_format(path: Path, file: h5py.File) -> None:
     """Refuse HDF5 files that are no recordings, and formats newer than this program."""
     found = file.attrs.get("format")
-    if found != layout.FORMAT:
+    if found != file_format.FORMAT:
         what = "it does not say what it is" if found is None else f"it says format={found!r}"
         raise NotARecordingError(
             f"{path}: an HDF5 file but not a huddle recording: {what};"
-            f" expected format={layout.FORMAT!r}"
+            f" expected format={file_format.FORMAT!r}"
         )
     number = file.attrs.get("format_version")
     if not isinstance(number, (int, np.integer)) or number < 1:
         raise NotARecordingError(f"{path}: format_version {number!r}; expected 1")
-    if number > layout.FORMAT_VERSION:
+    if number > file_format.FORMAT_VERSION:
         raise NotARecordingError(
             f"{path}: written by a newer huddle (format {number}); this one reads up to"
-            f" format {layout.FORMAT_VERSION}: update it"
+            f" format {file_format.FORMAT_VERSION}: update it"
         )
 
 
@@ -359,7 +359,7 @@ def control_address(path: str | Path) -> tuple[int, str] | None:
     try:
         with h5py.File(source, "r") as file:
             check_format(path, file)
-            if file["committed"][-1, layout.CLOSED] or "control_port" not in file.attrs:
+            if file["committed"][-1, file_format.CLOSED] or "control_port" not in file.attrs:
                 return None
             return int(file.attrs["control_port"]), file.attrs["control_token"]
     except (KeyError, OSError, RuntimeError, ValueError) as error:

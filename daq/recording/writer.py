@@ -30,16 +30,16 @@ import h5py
 import numpy as np
 
 from daq.errors import RecordingError
-from daq.recording import layout
+from daq.recording import file_format
+from daq.recording.chunk_writer import SensorRows, Table
 from daq.recording.locking import WriterLock
-from daq.recording.rows import SensorRows, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from daq.bench_model import Bench
+    from daq.bench.model import Bench
     from daq.protocols.block import Block, Event, HostTime
-    from daq.recording.layout import SensorLayout
+    from daq.recording.file_format import SensorLayout
 
 LIBVER = ("v110", "v110")
 _LEAST_CHUNK_ROWS = 64
@@ -102,7 +102,7 @@ class RecordingWriter:
         created : HostTime
             Now.
         control : (port, token), optional
-            Where the writing recorder takes commands (:mod:`daq.control`).
+            Where the writing recorder takes commands (:mod:`daq.recording.control`).
         attributes : dict, optional
             More attributes of the file, such as its origin.
         chunk_seconds : float
@@ -153,7 +153,7 @@ class RecordingWriter:
     ) -> None:
         """Record that samples from ``first_sample`` on are missing."""
         row = (first_sample, missing, estimated, _fixed(reason, 100))
-        self._sensors[sensor].gaps.add(np.array([row], layout.GAP_DTYPE))
+        self._sensors[sensor].gaps.add(np.array([row], file_format.GAP_DTYPE))
 
     def event(self, event: Event) -> None:
         """Record an event."""
@@ -164,7 +164,7 @@ class RecordingWriter:
             _fixed(event.kind, 32),
             _fixed(event.text, 200),
         )
-        self._events.add(np.array([row], layout.EVENT_DTYPE))
+        self._events.add(np.array([row], file_format.EVENT_DTYPE))
 
     def commit(self) -> Committed:
         """Make safe what can be made safe, then say how much that is.
@@ -210,7 +210,7 @@ class RecordingWriter:
                 sensor.gaps.write()
                 counts[number] = sensor.committable_rows, sensor.blocks.n_rows, sensor.gaps.n_rows
             self._events.write()
-            counts[-1, : layout.CLOSED + 1] = self._events.n_rows, closed
+            counts[-1, : file_format.CLOSED + 1] = self._events.n_rows, closed
             self._sync()
             self._committed[...] = counts
             self._sync()
@@ -272,8 +272,8 @@ def _describe(
         software = "huddle"
     file.attrs.update(
         {
-            "format": layout.FORMAT,
-            "format_version": layout.FORMAT_VERSION,
+            "format": file_format.FORMAT,
+            "format_version": file_format.FORMAT_VERSION,
             "run_id": uuid.uuid4().hex,
             "created": utc.isoformat(timespec="microseconds"),
             "created_utc_ns": created.utc_ns,
@@ -309,7 +309,7 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
             fletcher32=True,
             **filters,
         )
-        samples.attrs.update(layout.channel_attributes(sensor.channels))
+        samples.attrs.update(file_format.channel_attributes(sensor.channels))
         # Stays empty unless the sensor is polled.
         instants = group.create_dataset(
             "instants",
@@ -321,9 +321,9 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
             **filters,
         )
         instants.attrs["unit"] = "ns"
-        _make_table(group, "blocks", layout.BLOCK_DTYPE, layout.BLOCKS_PER_CHUNK)
-        _make_table(group, "gaps", layout.GAP_DTYPE, layout.GAPS_PER_CHUNK)
-    _make_table(file, "events", layout.EVENT_DTYPE, layout.EVENTS_PER_CHUNK)
+        _make_table(group, "blocks", file_format.BLOCK_DTYPE, file_format.BLOCKS_PER_CHUNK)
+        _make_table(group, "gaps", file_format.GAP_DTYPE, file_format.GAPS_PER_CHUNK)
+    _make_table(file, "events", file_format.EVENT_DTYPE, file_format.EVENTS_PER_CHUNK)
     committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
     committed.attrs["sensors"] = [sensor.name for sensor in sensors]
     committed.attrs["columns"] = ["rows", "blocks", "gaps"]

@@ -21,16 +21,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from daq.estimation import Settings, estimate
-from daq.formats.import_ import import_files
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.importer import import_files
+from daq.results.band_summary import correlation_of
+from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
-from tui.application.main import RecordingControls
-from tui.bands import band_means, log_edges
+from tui.commands.tui import RecordingControls
 from tui.report import drawing
 from tui.report.contents import report_of
 from tui.report.paper import pages
 from tui.report.source import sources
-from tui.results import correlation_of
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from daq.bench import load
-from daq.estimation import Settings, estimate
+from daq.drivers.bench_file import load
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from tests.acceptance import script
-from tests.acceptance.account import Account, Log, accounts
-from tests.acceptance.running import command, served
-from tui.demo import compare
-from tui.devices import scenario_of
-from tui.text import interval, level
+from tests.acceptance import fault_script
+from tests.acceptance.run_bench import command, served
+from tests.acceptance.sample_accounting import Account, Log, accounts
+from tui.commands.demo import compare
+from tui.output.formatting import interval, level
+from tui.simulation.devices import scenario_of
 
 if TYPE_CHECKING:
-    from daq.bench import Bench
+    from daq.bench.model import Bench
 
 BEGIN = 30.0
 """World time of the first fault, s."""
@@ -37,9 +38,9 @@ BEGIN = 30.0
 def main(minutes: float, folder: Path) -> int:
     """Run, print what was found, return the exit code."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
-    n_faults = max(len(kinds) for kinds in script.KINDS.values())
+    n_faults = max(len(kinds) for kinds in fault_script.KINDS.values())
     cycle = (minutes * 60 - BEGIN) / 2
-    faults = script.script(begin=BEGIN, spacing=cycle / n_faults, every=cycle)
+    faults = fault_script.script(begin=BEGIN, spacing=cycle / n_faults, every=cycle)
     out = folder / "recording.h5"
     with served(folder, faults, speed=1.0) as devices:
         run = command(
@@ -63,9 +64,9 @@ def _samples(screen: Console, spec: dict[str, Any], log: Log, out: Path) -> int:
     for one in found:
         table.add_row(*map(str, astuple(one)))
     screen.print(table)
-    for sensor, kinds in script.KINDS.items():
+    for sensor, kinds in fault_script.KINDS.items():
         struck = [told["kind"] for told in log.struck if told["sensors"] == [sensor]]
-        wanted = set(kinds) - set(script.SAMPLES_ONLY)
+        wanted = set(kinds) - set(fault_script.SAMPLES_ONLY)
         screen.print(
             f"{sensor}: {len(struck)} faults struck; not: {wanted - set(struck) or 'none'}"
         )

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.control import ask
-from tests.acceptance import script
-from tests.acceptance.account import Log, accounts
-from tests.acceptance.running import command, served
+from daq.recording.control import ask
+from tests.acceptance import fault_script
+from tests.acceptance.run_bench import command, served
+from tests.acceptance.sample_accounting import Log, accounts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +36,7 @@ ATTEMPTS = 3
 
 
 def test_every_sample_sent_is_recorded_and_every_gap_has_its_length(tmp_path: Path) -> None:
-    faults = script.script(begin=BEGIN, spacing=SPACING, every=ROUND)
+    faults = fault_script.script(begin=BEGIN, spacing=SPACING, every=ROUND)
     out, log = tmp_path / "r.h5", tmp_path / "log.jsonl"
     with served(tmp_path, faults, speed=SPEED) as devices:
         for _ in range(ATTEMPTS):
@@ -64,7 +64,9 @@ def test_every_sample_sent_is_recorded_and_every_gap_has_its_length(tmp_path: Pa
 
 def _all_struck(recorder: subprocess.Popen[str], log: Path) -> bool:
     """Return when every kind has struck every device and all have gone on; False if it ended."""
-    wanted = {s: set(kinds) - set(script.SAMPLES_ONLY) for s, kinds in script.KINDS.items()}
+    wanted = {
+        s: set(kinds) - set(fault_script.SAMPLES_ONLY) for s, kinds in fault_script.KINDS.items()
+    }
     until = math.inf
     while True:
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -8,9 +8,9 @@ import pytest
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.methods import METHODS, self_noise
 from estimator.planning import BOUND, plan, planned_csm, segments_needed
-from estimator.spectra import WelchSettings
-from estimator.windows import effective_averages, get_window
-from tests.estimator.models import planar_sensors, rotation, wishart
+from estimator.spectra.welch import WelchSettings
+from estimator.spectra.windows import effective_averages, get_window
+from tests.estimator.csm_models import planar_sensors, rotation, wishart
 
 PAPER = WelchSettings(200.0, 2000, 0.0, "rectangular")
 DIMS = (2, 2, 2)

@@ -14,18 +14,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols import brp, epson, gcf, labjack, rtu, scream
 from daq.protocols.block import Block, Event, HostTime
-from daq.protocols.epson import BurstFormat, CommandDecoder, Read
-from daq.protocols.epson_burst import BurstDecoder
+from daq.protocols.epson import commands
+from daq.protocols.epson.burst import BurstDecoder
+from daq.protocols.epson.commands import BurstFormat, CommandDecoder, Read
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.fifo import FifoDecoder
-from daq.protocols.guralp import ScreamDecoder, SerialDecoder
-from daq.protocols.labjack import Packet, StreamDecoder
-from daq.protocols.labjack_registers import AduFinder
-from daq.protocols.registers import RegisterDecoder, RegisterMap
-from daq.protocols.text import TextDecoder
-from daq.protocols.text_format import RASPBERRY_SHAKE, TextFormat
+from daq.protocols.guralp import brp, gcf, scream
+from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
+from daq.protocols.labjack import stream
+from daq.protocols.labjack.registers import AduFinder
+from daq.protocols.labjack.stream import Packet, StreamDecoder
+from daq.protocols.modbus import rtu
+from daq.protocols.modbus.fifo import FifoDecoder
+from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
+from daq.protocols.text.decoder import TextDecoder
+from daq.protocols.text.format import RASPBERRY_SHAKE, TextFormat
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -69,7 +72,7 @@ def _demand(found: Sequence[object], n_samples: int) -> None:
 
 
 ALL = BurstFormat.of("flag", "temperature", "x", "y", "z", "count", "checksum")
-BURSTS = epson.encode_bursts(
+BURSTS = commands.encode_bursts(
     ALL, flag=0x8E00, temperature=2637, x=np.arange(20), y=-1, z=0x0D80, count=np.arange(20)
 )
 
@@ -89,10 +92,10 @@ def epson_commands(fuzzed: bytes) -> None:
     decoder = CommandDecoder()
     for read, _ in _reads(fuzzed):
         decoder.receive(read)
-    decoder.receive(bytes([epson.DELIMITER] * 3))
-    if decoder.receive(epson.read(epson.ID))[-1] != Read(0x4C):
+    decoder.receive(bytes([commands.DELIMITER] * 3))
+    if decoder.receive(commands.read(commands.ID))[-1] != Read(0x4C):
         raise NotDecodedError("a read was not heard")
-    epson.find_reply(fuzzed, 0x4C)
+    commands.find_reply(fuzzed, 0x4C)
 
 
 WITMOTION = RegisterMap.of({"preset": "witmotion"}, 3)
@@ -163,7 +166,7 @@ def scream_udp(fuzzed: bytes) -> None:
 
 
 PACKETS = b"".join(
-    labjack.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
+    stream.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
 )
 
 
@@ -180,7 +183,7 @@ def labjack_registers(fuzzed: bytes) -> None:
         with contextlib.suppress(RemoteProtocolError):
             list(finder.receive(read))
     with contextlib.suppress(RemoteProtocolError):
-        labjack.decode_response(fuzzed)
+        stream.decode_response(fuzzed)
 
 
 def fifo(fuzzed: bytes) -> None:
@@ -247,7 +250,7 @@ def text_packets(fuzzed: bytes) -> None:
 
 TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
     "epson_bursts": (epson_bursts, [b"\xff" + BURSTS, b"\x10" + BURSTS[5:], bytes(60)]),
-    "epson_commands": (epson_commands, [b"\x02" + epson.read(epson.ID) * 3]),
+    "epson_commands": (epson_commands, [b"\x02" + commands.read(commands.ID) * 3]),
     "polled_registers": (polled_registers, [b"\x0d" + bytes(range(70)), b"\x0d" + b"\xff" * 56]),
     "guralp_serial": (guralp_serial, [b"\xff" + FRAMES, b"\x07" + FRAMES[30:]]),
     "gcf_block": (gcf_block, [gcf.encode_block(_gcf(0))]),

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from sim_devices import launch
-from tests.sim_devices.bench import scenario, spec
+from sim_devices.server import launch
+from sim_devices.world.world import World
+from tests.sim_devices.simulated_bench import scenario, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sim_devices.launch import RunningDevice
+    from sim_devices.server.launch import RunningDevice
 
 pytestmark = [pytest.mark.peer, pytest.mark.timeout(600)]
 
@@ -84,5 +85,8 @@ def test_async_labjack_reads_our_device(peer: Path, digitizer: RunningDevice, mo
     timer = scans[:, 0] + 65536 * scans[:, 1]
     assert set(np.diff(timer).tolist()) == {TICKS}
     first = int(timer[0]) // TICKS
-    truth = scenario("A", sampling_rate=RATE).samples("A", first, n_scans)[:, :2] * COUNTS + CENTER
+    truth = (
+        World(scenario("A", sampling_rate=RATE)).samples("A", first, n_scans)[:, :2] * COUNTS
+        + CENTER
+    )
     assert np.abs(truth - scans[:, 2:]).max() <= 0.5

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from daq.protocols.epson import COUNTS_PER_G, FILTERS, NOT_ON_A370
-from sim_devices import launch
-from tests.sim_devices.bench import device, spec
+from daq.protocols.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
+from sim_devices.server import launch
+from tests.sim_devices.simulated_bench import device, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

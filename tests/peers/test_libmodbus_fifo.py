@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.bench import Channel, Sensor
+from daq.bench.model import Channel, Sensor
 from daq.drivers.registry import driver_type
 from daq.protocols.block import BlockFlag
-from tests.drivers.reading import record
+from tests.daq.drivers.reading import record
 from tests.peers.libmodbus import build, ready, serial_cable
 
 if TYPE_CHECKING:

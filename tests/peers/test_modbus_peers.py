@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench import Channel, Sensor
-from daq.clock import SystemClock
+from daq.bench.model import Channel, Sensor
 from daq.drivers.registry import driver_type
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block
-from sim_devices import launch
+from sim_devices.server import launch
+from sim_devices.world.world import World
 from tests.peers.libmodbus import build, ready, running, serial_cable
-from tests.sim_devices.bench import device, scenario, spec
+from tests.sim_devices.simulated_bench import device, scenario, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sim_devices.launch import RunningDevice
+    from sim_devices.server.launch import RunningDevice
 
 pytestmark = pytest.mark.peer
 
@@ -58,7 +59,7 @@ def slave(request: pytest.FixtureRequest) -> Iterator[tuple[str, RunningDevice]]
 @pytest.fixture(scope="module")
 def reading() -> list[int]:
     """Return what the slave's registers hold, from the world itself."""
-    row = scenario("A", sampling_rate=RATE).samples("A", int(AGE * RATE), 1)[0]
+    row = World(scenario("A", sampling_rate=RATE)).samples("A", int(AGE * RATE), 1)[0]
     counts: list[int] = np.rint(row * COUNTS_PER_UNIT).astype(np.int16).astype(int).tolist()
     return counts
 

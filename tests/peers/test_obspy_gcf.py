@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench import Channel, Sensor
+from daq.bench.model import Channel, Sensor
 from daq.drivers.registry import driver_type
-from daq.protocols import brp, gcf, scream
 from daq.protocols.block import Block, HostTime
-from daq.protocols.gcf import SampleBlock
-from daq.protocols.guralp import ScreamDecoder, SerialDecoder
-from sim_devices.device import ChannelSpec, DeviceSpec, Source
-from sim_devices.guralp import Digitizer
-from tests.drivers.reading import record
-from tests.sim_devices.bench import scenario
+from daq.protocols.guralp import brp, gcf, scream
+from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
+from daq.protocols.guralp.gcf import SampleBlock
+from sim_devices.devices.guralp import Digitizer
+from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
+from sim_devices.world.world import World
+from tests.daq.drivers.reading import record
+from tests.sim_devices.simulated_bench import scenario
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,7 +73,7 @@ def test_obspy_reads_our_digitizer(rate: float, sensitivity: float, width: int |
     table["sensors"]["A"]["clock"] = {"offset": 0.3}
     n = found[0].stats.npts
     assert n >= seconds * rate * 0.8
-    truth = type(world).from_dict(table).samples("A", 0, n) * sensitivity
+    truth = World(type(world).from_dict(table)).samples("A", 0, n) * sensitivity
     for column, (component, stream) in enumerate(zip("ZNE", STREAMS, strict=True)):
         trace = next(t for t in found if t.stats.channel.endswith(component))
         assert trace.stats.starttime == obspy.UTCDateTime(START)

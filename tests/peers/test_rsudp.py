@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from sim_devices import launch
-from tests.sim_devices.bench import device, scenario, spec
+from sim_devices.server import launch
+from sim_devices.world.world import World
+from tests.sim_devices.simulated_bench import device, scenario, spec
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,7 +77,7 @@ def test_rsudp_reads_our_packets(tmp_path: Path) -> None:
     columns = {name: [v for n, _, values in found if n == name for v in values] for name in NAMES}
     whole = min(len(values) for values in columns.values())
     counts = np.column_stack([columns[name][:whole] for name in NAMES])
-    truth = scenario("A", sampling_rate=RATE).samples("A", 0, 20_000) * COUNTS
+    truth = World(scenario("A", sampling_rate=RATE)).samples("A", 0, 20_000) * COUNTS
     first = min(t for name, t, _ in found if name == "EHZ")
     start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
     assert np.abs(truth[start : start + whole] - counts).max() <= 0.5

@@ -7,31 +7,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.clock import SystemClock
-from daq.drivers.base import Checking
+from daq.bench.driver_rules import Checking
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.protocols import epson
-from daq.transport import open_port
-from sim_devices import launch
-from sim_devices.device import Source
-from sim_devices.pacing import utc_of
-from sim_devices.scenario import Scenario
-from sim_devices.serve import device_spec
-from tests.drivers.reading import record
-from tests.sim_devices.bench import device, sensors, spec
+from daq.host_clock import SystemClock
+from daq.protocols.epson import commands
+from daq.transport.ports import open_port
+from sim_devices.devices.interface import Source
+from sim_devices.server import launch
+from sim_devices.server.serve import device_spec
+from sim_devices.server.world_clock import utc_of
+from sim_devices.world.scenario import Scenario
+from tests.daq.drivers.reading import record
+from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from daq.bench import Sensor
-    from sim_devices.launch import RunningDevice
+    from daq.bench.model import Sensor
+    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 DRIVER = driver_type("epson")
-XYZ = [{"name": axis, "sensitivity": epson.COUNTS_PER_UNIT} for axis in "xyz"]
+XYZ = [{"name": axis, "sensitivity": commands.COUNTS_PER_UNIT} for axis in "xyz"]
 OFF = 500.0
 """ppm of the devices' own clocks."""
 TABLES = {
@@ -161,14 +161,14 @@ def checked(some: list[Sensor]) -> None:
 @pytest.mark.parametrize(
     ("name", "register", "expected"),
     [
-        ("none", epson.SIG_CTRL, 0x00),
-        ("none", epson.FILTER_CTRL, epson.FILTERS["K512_FC210"]),
-        ("A352", epson.SIG_CTRL, 0x04),
-        ("A352", epson.FILTER_CTRL, epson.FILTERS["K512_FC460"]),
+        ("none", commands.SIG_CTRL, 0x00),
+        ("none", commands.FILTER_CTRL, commands.FILTERS["K512_FC210"]),
+        ("A352", commands.SIG_CTRL, 0x04),
+        ("A352", commands.FILTER_CTRL, commands.FILTERS["K512_FC460"]),
     ],
 )
 async def test_a_model_is_set_to_what_it_has(
-    running: Running, name: str, register: epson.Register, expected: int
+    running: Running, name: str, register: commands.Register, expected: int
 ) -> None:
     """At 1000 Hz, with nothing said of filter and stabilisation."""
     assert await low_byte(connecting(running, name, sampling_rate=1000.0), register) == expected
@@ -187,16 +187,16 @@ async def test_a_model_is_set_to_what_it_has(
 async def test_the_register_says_so(running: Running, external: str, bits: int) -> None:
     """MSC_CTRL: bit 6 EXT_SEL, bit 5 EXT_POL; 1PPS is code 4 or 5 in bits 7:5."""
     sensor = connecting(running, "pps", settings={"external": external})
-    assert await low_byte(sensor, epson.MSC_CTRL) == bits << 5 | 0x06
+    assert await low_byte(sensor, commands.MSC_CTRL) == bits << 5 | 0x06
 
 
-async def low_byte(sensor: Sensor, register: epson.Register) -> int:
+async def low_byte(sensor: Sensor, register: commands.Register) -> int:
     """Return what a register holds after a session."""
     async with DRIVER.open([sensor], SystemClock(SPEED)):
         pass
     async with open_port(sensor.port, SystemClock()) as stream:
-        await stream.write(epson.read(register))
+        await stream.write(commands.read(register))
         received = b""
-        while (value := epson.find_reply(received, register.address)) is None:
+        while (value := commands.find_reply(received, register.address)) is None:
             received += (await stream.read())[0]
     return value & 0xFF

@@ -10,22 +10,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.clock import SystemClock
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.protocols import epson
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
-from daq.transport import open_port
-from sim_devices import launch
+from daq.protocols.epson import commands
+from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
-from sim_devices.scenario import Scenario
-from tests.sim_devices.bench import device, scenario, sensors, spec
+from sim_devices.server import launch
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.world import World
+from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daq.bench import Sensor
-    from sim_devices.launch import RunningDevice
+    from daq.bench.model import Sensor
+    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 DRIVER = driver_type("epson")
@@ -76,11 +77,11 @@ async def test_three_devices_at_once_without_a_gap_feel_one_motion(
         assert some[0].flags == BlockFlag.CLOCK_RESTART
         ends = [0] + [block.end_sample for block in some]
         assert [block.first_sample for block in some] == ends[:-1]  # COUNT of C wraps on the way
-    world = scenario("ABC")
+    world = World(scenario("ABC"))
     for name, some in zip("ABC", found, strict=True):
         counts = np.concatenate([block.counts for block in some])[:n]
         # when exactly the device was started shows by the motion itself
-        truth = world.samples(name, before, 50 * 200) * epson.COUNTS_PER_UNIT
+        truth = world.samples(name, before, 50 * 200) * commands.COUNTS_PER_UNIT
         start = int(np.argmin(np.abs(truth - counts[0, :3]).max(axis=1)))
         assert np.abs(truth[start : start + n] - counts[:, :3]).max() <= 0.5
         assert np.all(np.abs(counts[:, 3] - 2634) < 140)

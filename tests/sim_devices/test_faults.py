@@ -10,24 +10,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.bench import parse as parse_bench
-from daq.clock import SystemClock
+from daq.drivers.bench_file import parse as parse_bench
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
-from daq.protocols import epson
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
-from sim_devices import launch
+from daq.protocols.epson import commands
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import LineFaults, SampleFaults, parse
-from tests.sim_devices.bench import device, scenario, sensors, spec
-from tui.devices import specification, with_faults
+from sim_devices.server import launch
+from sim_devices.world.world import World
+from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
+from tui.simulation.devices import specification, with_faults
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from daq.bench import Sensor
-    from daq.drivers.base import Session
+    from daq.bench.model import Sensor
+    from daq.drivers.interface import Session
 
 UNIT = bytes(range(20))
 
@@ -184,7 +185,7 @@ async def test_every_sample_that_came_has_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each received sample is the world's at its index: so every gap is exact."""
-    monkeypatch.setattr("daq.protocols.counting.SLACK", SPEED)  # a second of a busy machine
+    monkeypatch.setattr("daq.protocols.sample_counter.SLACK", SPEED)  # a second of a busy machine
     table = device("A", settings={"first_count": 64000})
     log = tmp_path / "struck"
     world = spec(table, speed=SPEED) | {"faults": EVERYTHING, "fault_log": str(log)}
@@ -210,7 +211,7 @@ async def test_every_sample_that_came_has_its_place(
         for row, counts in enumerate(block.counts[:, :3].tolist())
     }
     assert len(found) == sum(block.n_samples for block in blocks)  # none twice
-    truth = np.rint(scenario("A").samples("A", 0, 600 * 200) * epson.COUNTS_PER_UNIT)
+    truth = np.rint(World(scenario("A")).samples("A", 0, 600 * 200) * commands.COUNTS_PER_UNIT)
     place = {tuple(row): index for index, row in enumerate(truth.astype(int).tolist())}
     begin = place[found[0]]
     assert {place.get(counts, -1) - index for index, counts in found.items()} == {begin}

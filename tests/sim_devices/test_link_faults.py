@@ -10,14 +10,14 @@ import pytest
 
 from daq.drivers.registry import driver_type
 from daq.protocols.block import Block, BlockFlag, Event
-from sim_devices import launch
-from tests.drivers.reading import reading, record
-from tests.sim_devices.bench import device, sensors, spec
+from sim_devices.server import launch
+from tests.daq.drivers.reading import reading, record
+from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sim_devices.launch import RunningDevice
+    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 RATE = 200.0
@@ -70,7 +70,7 @@ async def test_a_digitizer_counts_what_it_lost(
     running: tuple[RunningDevice, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Overflows of 1.5 s and lost packets, each gap by the device's own clock."""
-    monkeypatch.setattr("daq.protocols.counting.SLACK", SPEED)  # a second of a busy machine
+    monkeypatch.setattr("daq.protocols.sample_counter.SLACK", SPEED)  # a second of a busy machine
     blocks: list[Block] = []
     events: list[Event] = []
     async with (

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import special
 
-from sim_devices import plane_waves
-from sim_devices.scenario import PlaneWaves, Scenario
-from sim_devices.spectrum import White
-from sim_devices.world import World
+from sim_devices.world import plane_waves
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.spectrum import White
+from sim_devices.world.tables import PlaneWaves
+from sim_devices.world.world import World
 
 WAVES = PlaneWaves(spectrum=White(level=1.0), speed=150.0, n_directions=24)
 FREQUENCY = np.array([0.0, 1.0, 20.0, 50.0])

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.clock import SystemClock
-from daq.drivers.modbus import open_bus
+from daq.drivers.modbus.bus import open_bus
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.protocols import rtu
+from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
-from sim_devices import launch
-from tests.sim_devices.bench import device, sensors, spec
+from daq.protocols.modbus import rtu
+from sim_devices.server import launch
+from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from daq.bench import Sensor
-    from sim_devices.launch import RunningDevice
+    from daq.bench.model import Sensor
+    from sim_devices.server.launch import RunningDevice
 
 SPEED = 4.0
 DRIVER = driver_type("registers")

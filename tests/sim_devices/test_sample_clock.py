@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_devices.sample_clock import SampleClock
-from sim_devices.scenario import SensorClock, TemperatureStep
+from sim_devices.world.sample_clock import SampleClock
+from sim_devices.world.tables import SensorClock, TemperatureStep
 
 RATE = 200.0
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols import rtu
-from sim_devices.device import Source
-from sim_devices.fifo import FifoDevice
-from sim_devices.guralp import create as create_guralp
-from sim_devices.sampling import Samples
-from sim_devices.serve import device_spec
-from tests.sim_devices.bench import device, scenario
+from daq.protocols.modbus import rtu
+from sim_devices.devices.fifo import FifoDevice
+from sim_devices.devices.guralp import create as create_guralp
+from sim_devices.devices.interface import Source
+from sim_devices.devices.sampling import Samples
+from sim_devices.server.serve import device_spec
+from tests.sim_devices.simulated_bench import device, scenario
 
 if TYPE_CHECKING:
     import pytest

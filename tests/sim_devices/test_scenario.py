@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_devices import scenario as scenario_module
 from sim_devices.errors import ScenarioError
-from sim_devices.scenario import Scenario
-from sim_devices.spectrum import White
+from sim_devices.world import scenario as scenario_module
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.spectrum import White
+from sim_devices.world.world import World
 
 THREE_DIRECTIONS = {"spectra": [{"shape": "white", "level": 1.0}] * 3}
 
@@ -93,7 +94,7 @@ def test_a_sensor_must_fit_its_motion(
 
 def test_an_unknown_sensor_is_named_with_the_known_ones() -> None:
     with pytest.raises(ScenarioError, match="no sensor 'Z' in the simulation; it has A, B"):
-        scenario(A={}, B={}).samples("Z", 0, 1)
+        World(scenario(A={}, B={})).samples("Z", 0, 1)
 
 
 def test_rotation_turns_the_channels_and_not_the_motion() -> None:
@@ -118,5 +119,5 @@ def test_true_noise_is_that_of_the_channel() -> None:
 
 
 def test_the_description_loads_no_scipy() -> None:
-    code = "import sys, sim_devices.scenario; sys.exit('scipy' in sys.modules)"
+    code = "import sys, sim_devices.world.scenario; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from sim_devices.spectrum import Mixed, Pink, Resonance, Spectrum, Sum, Tabulated, White
+from sim_devices.world.spectrum import Mixed, Pink, Resonance, Spectrum, Sum, Tabulated, White
 
 SHAPES: list[Spectrum] = [
     White(level=2e-13),

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from sim_devices.gaussian import GaussianSeries, WhiteSources
-from sim_devices.scenario import Scenario
-from sim_devices.world import Motion, World
+from sim_devices.world.gaussian import GaussianSeries, WhiteSources
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.world import Motion, World
 
 if TYPE_CHECKING:
     from sim_devices.arrays import ComplexArray, FloatArray
@@ -58,7 +58,7 @@ def test_motion_and_noise_have_the_psd_asked_for_to_statistical_error() -> None:
         {"seed": 1, "motion": still, "sensors": {"A": {"noise": spectra}}}, sampling_rate=RATE
     )
     for model in (moved, noisy):
-        frequency, matrix, n = csm(*model.samples("A", 0, 800_000).T)
+        frequency, matrix, n = csm(*World(model).samples("A", 0, 800_000).T)
         for low, high in ((0.3, 1.0), (1.0, 7.0), (7.0, 9.0), (9.0, 60.0), (60.0, 89.0)):
             band = (frequency >= low) & (frequency < high)
             for channel, spectrum in enumerate(noisy.noise_spectra("A")):
@@ -71,8 +71,8 @@ def test_motion_and_noise_have_the_psd_asked_for_to_statistical_error() -> None:
 
 def test_the_motion_ends_below_nyquist_and_noise_does_not() -> None:
     model = scenario({"A": {}, "N": {"noise": white(1.0), "gain": 0.0}})
-    frequency, moved, _ = csm(*model.samples("A", 0, 200_000).T)
-    _, noise, n = csm(*model.samples("N", 0, 200_000).T)
+    frequency, moved, _ = csm(*World(model).samples("A", 0, 200_000).T)
+    _, noise, n = csm(*World(model).samples("N", 0, 200_000).T)
     # the last hertz holds no more than what interpolation and the cosine's end leave
     assert np.all(moved[frequency > 99.9, 0, 0].real < 1e-3)
     near = noise[(frequency > 90) & (frequency < 99.8), 0, 0].real
@@ -82,7 +82,7 @@ def test_the_motion_ends_below_nyquist_and_noise_does_not() -> None:
 def test_cross_psd_follows_the_mixing_matrix() -> None:
     mixing = [[1.0, 0.0], [0.6, 0.8], [-0.5, 2.0]]
     model = scenario({"A": {}}, spectra=[white(1.0), white(2.0)], mixing=mixing)
-    frequency, matrix, n = csm(*model.samples("A", 0, 400_000).T)
+    frequency, matrix, n = csm(*World(model).samples("A", 0, 400_000).T)
     band = (frequency > 1) & (frequency < 85)
     wanted = np.array(mixing) @ np.diag([1.0, 2.0]) @ np.array(mixing).T
     error = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)) * 1.94 / (n * band.sum()))
@@ -103,18 +103,19 @@ def test_sensors_feel_one_motion_whatever_their_rate_and_clock() -> None:
 
 def test_any_block_can_be_entered_and_read_in_any_pieces() -> None:
     noisy = {"A": {"noise": white(1.0), "clock": {"ppm": -20.0, "wander": 0.3}}}
-    whole = scenario(noisy).samples("A", 60_000, 20_000)
-    other = scenario(noisy)
+    whole = World(scenario(noisy)).samples("A", 60_000, 20_000)
+    other = World(scenario(noisy))
     pieces = [other.samples("A", first, 500) for first in range(60_000, 80_000, 500)]
     assert np.array_equal(np.concatenate(pieces), whole)
-    assert np.array_equal(scenario(noisy).samples("A", 71_234, 100), whole[11_234:11_334])
+    assert np.array_equal(World(scenario(noisy)).samples("A", 71_234, 100), whole[11_234:11_334])
 
 
 def test_another_process_makes_the_same_samples() -> None:
     model = scenario({"A": {"noise": {"shape": "pink", "level": 1.0}, "rotation": [5, 4, 3]}})
     code = (
-        "import json, sys; from sim_devices.scenario import Scenario;"
-        "s = Scenario.from_dict(json.load(sys.stdin));"
+        "import json, sys; from sim_devices.world.scenario import Scenario;"
+        "from sim_devices.world.world import World;"
+        "s = World(Scenario.from_dict(json.load(sys.stdin)));"
         "print(json.dumps(s.samples('A', 10**9, 50).tolist()))"
     )
     said = subprocess.run(
@@ -124,7 +125,7 @@ def test_another_process_makes_the_same_samples() -> None:
         check=True,
         text=True,
     )
-    assert np.array_equal(json.loads(said.stdout), model.samples("A", 10**9, 50))
+    assert np.array_equal(json.loads(said.stdout), World(model).samples("A", 10**9, 50))
 
 
 def test_interpolation_is_120_db_down_to_045_of_the_sampling_rate() -> None:
@@ -175,7 +176,7 @@ def test_a_response_shapes_what_the_sensor_feels() -> None:
     low_pass = {"poles": [[-corner, 0.0]], "normalised_at": 0.001}
     model = scenario({"A": {}, "B": {"response": low_pass}})
     frequency, matrix, _ = csm(
-        model.samples("A", 0, 200_000)[:, 0], model.samples("B", 0, 200_000)[:, 0]
+        World(model).samples("A", 0, 200_000)[:, 0], World(model).samples("B", 0, 200_000)[:, 0]
     )
     band = (frequency > 0.5) & (frequency < 80)
     found = matrix[band, 1, 0] / matrix[band, 0, 0]
@@ -185,7 +186,7 @@ def test_a_response_shapes_what_the_sensor_feels() -> None:
 def test_noise_is_each_sensors_and_each_channels_own() -> None:
     own = {"noise": white(1.0), "gain": 0.0}
     model = scenario({"A": own, "B": own, "C": {**own, "seed": 5}, "D": {**own, "seed": 6}})
-    channels = np.concatenate([model.samples(n, 0, 100_000).T for n in model.names])
+    channels = np.concatenate([World(model).samples(n, 0, 100_000).T for n in model.names])
     correlation = np.corrcoef(channels)
     off = correlation[~np.eye(len(correlation), dtype=bool)]
     assert np.max(np.abs(off)) < 5 / np.sqrt(100_000)
@@ -197,10 +198,10 @@ def test_the_true_cross_spectral_matrix_is_what_the_samples_have() -> None:
         "B": {"rotation": [40, 20, 0], "delay": 0.004, "noise": white(2.0), "gain": 1.5},
     }
     model = scenario(sensors, spectra=[white(1.0), white(2.0), white(0.5)])
-    channels = np.concatenate([model.samples(name, 0, 400_000) for name in "AB"], axis=1)
+    channels = np.concatenate([World(model).samples(name, 0, 400_000) for name in "AB"], axis=1)
     frequency, matrix, n = csm(*channels.T)
     band = np.flatnonzero((frequency > 1) & (frequency < 88))[::2]
-    true = model.true_csm(("A", "B"), frequency[band])
+    true = World(model).true_csm(("A", "B"), frequency[band])
     power = np.sqrt(np.einsum("fp,fq->fpq", *[np.einsum("fpp->fp", true.real)] * 2))
     away = np.abs(matrix[band] - true) / power * np.sqrt(n)
     assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.05)

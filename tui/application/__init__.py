@@ -1,4 +1,4 @@
-"""The application: follows a recording like anyone else, and starts and stops recorders.
+"""The Textual application. Follows a recording like any other reader.
 
-Nothing in the package is imported here: Textual is loaded when the application is opened.
+Nothing is imported here: Textual loads when the application opens.
 """

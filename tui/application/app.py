@@ -16,14 +16,21 @@ from textual.reactive import var
 from textual.widgets import Footer
 
 from daq.errors import HuddleError
-from tui.application import view
-from tui.application.board import Board, Shown
-from tui.application.messages import Following, Fresh, Looked, Messenger, Progress, Trouble
+from daq.estimation.follow import follow
+from tui.application import panels
+from tui.application.main_screen import Board, Shown
+from tui.application.messages import (
+    ErrorReported,
+    Messenger,
+    Progress,
+    RecordingOpened,
+    SnapshotReady,
+    StatusUpdated,
+)
 from tui.application.plot import PlainMonochrome
-from tui.application.result import details, result
+from tui.application.result_text import details, result
 from tui.application.screens import MarkScreen, ResultScreen, StopScreen, TextScreen, help_text
-from tui.following import follow
-from tui.text import clock_time
+from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,9 +40,10 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.filter import LineFilter
 
-    from daq.estimation import Settings, Snapshot
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
     from tui.application.controls import Controls
-    from tui.state import Now
 
 Outcome = TypeVar("Outcome")
 GROWTH = 0.01  # of the segments, from which on curves change to the eye
@@ -76,8 +84,8 @@ class HuddleApp(App[None]):
     ]
 
     snapshot: var[Snapshot | None] = var(None, always_update=True)
-    now: var[Now | None] = var(None, always_update=True)
-    choice: var[view.Choice] = var(view.Choice)
+    now: var[RecordingStatus | None] = var(None, always_update=True)
+    choice: var[panels.Choice] = var(panels.Choice)
     note: var[str] = var("")
     trouble: var[str] = var("")
 
@@ -103,7 +111,7 @@ class HuddleApp(App[None]):
         """Show what there is, and follow a recording that is given or already runs."""
         self._show()
         if self._path is not None:
-            self.post_message(Following(self._path))
+            self.post_message(RecordingOpened(self._path))
         elif self._start_at_once:
             self.action_start()
         else:
@@ -122,8 +130,8 @@ class HuddleApp(App[None]):
 
     # ------------------------------------------------------------------ following
 
-    @on(Following)
-    def _on_following(self, message: Following) -> None:
+    @on(RecordingOpened)
+    def _on_following(self, message: RecordingOpened) -> None:
         self._path = message.path
         self._starting, self.trouble, self.note = False, "", ""
         self.now = self.snapshot = None
@@ -139,16 +147,16 @@ class HuddleApp(App[None]):
             if messenger.result is not None:
                 self._try(partial(self._controls.keep, path, messenger.result))
 
-    @on(Looked)
-    def _on_looked(self, message: Looked) -> None:
+    @on(StatusUpdated)
+    def _on_looked(self, message: StatusUpdated) -> None:
         self.now = message.now
 
     @on(Progress)
     def _on_progress(self, message: Progress) -> None:
         self.note = f"the result is being computed: {message.done / message.total:.0%}"
 
-    @on(Fresh)
-    def _on_fresh(self, message: Fresh) -> None:
+    @on(SnapshotReady)
+    def _on_fresh(self, message: SnapshotReady) -> None:
         self._settings = message.settings
         before = self.snapshot
         if message.snapshot.closed:
@@ -161,13 +169,15 @@ class HuddleApp(App[None]):
         if message.snapshot.closed and before is not None and not before.closed:
             self.action_result()
 
-    @on(Trouble)
-    def _on_trouble(self, message: Trouble) -> None:
+    @on(ErrorReported)
+    def _on_trouble(self, message: ErrorReported) -> None:
         self._starting, self.note = False, ""
         if message.ended:
             self.trouble = message.text
         else:
-            self.notify(message.text, title="Trouble", severity="error", timeout=30, markup=False)
+            self.notify(
+                message.text, title="ErrorReported", severity="error", timeout=30, markup=False
+            )
 
     # -------------------------------------------------------------------- showing
 
@@ -322,13 +332,13 @@ class HuddleApp(App[None]):
     def _control(self, act: Callable[[], Path | None]) -> None:
         path = self._try(act)
         if path is not None:
-            self.post_message(Following(path))
+            self.post_message(RecordingOpened(path))
 
     def _try(self, act: Callable[[], Outcome]) -> Outcome | None:
         try:
             return act()
         except (HuddleError, OSError) as error:
-            self.post_message(Trouble(str(error)))
+            self.post_message(ErrorReported(str(error)))
         return None
 
     def action_stop(self) -> None:

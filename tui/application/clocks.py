@@ -9,8 +9,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from tui.application.curves import Line
-from tui.synchronisation import (
+from daq.results.clock_effect import (
     HARMLESS,
     MATTERS,
     NOTHING,
@@ -20,15 +19,17 @@ from tui.synchronisation import (
     reference,
     residuals,
 )
+from tui.application.curves import Line
 
 if TYPE_CHECKING:
-    from daq.clock_model import ClockState
-    from daq.estimation import Settings, Snapshot
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.timing.clock_model import ClockState
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
-_FEWEST_POINTS = 3
+_MIN_POINTS = 3
 
 
 def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
@@ -113,7 +114,7 @@ def _small(ppm: float) -> str:
 
 def drift_title(snapshot: Snapshot) -> str:
     """Return what the plot of the drift shows."""
-    if len(snapshot.drift) < _FEWEST_POINTS:
+    if len(snapshot.drift) < _MIN_POINTS:
         return "clock drift: seen from the third segment on"
     against = reference(snapshot)
     behind = "the computer" if against is None else against
@@ -126,7 +127,7 @@ def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]
     Minutes and microseconds; at most one point per column.
     """
     drift = lags(snapshot)
-    if len(drift) < _FEWEST_POINTS:
+    if len(drift) < _MIN_POINTS:
         return []
     step = max(1, len(drift) // n_points)
     minutes = drift[::step, 0] / 60

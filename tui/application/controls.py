@@ -9,8 +9,9 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.bench import Bench
-    from daq.estimation import Settings, Snapshot
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
 
 
 class Controls(Protocol):

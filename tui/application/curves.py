@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tui.bands import band_means, log_edges
+from estimator.self_noise.band_means import band_means, log_edges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from tui.bands import FloatArray
+    from estimator.self_noise.band_means import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,26 +13,27 @@ if TYPE_CHECKING:
 
     from textual.app import App
 
-    from daq.estimation import Settings, Snapshot
-    from tui.state import Now
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
 
 
 @dataclass
-class Following(Message):
+class RecordingOpened(Message):
     """A recording is there, and is followed from now on."""
 
     path: Path
 
 
 @dataclass
-class Looked(Message):
+class StatusUpdated(Message):
     """How the recording and its sensors are doing."""
 
-    now: Now
+    now: RecordingStatus
 
 
 @dataclass
-class Fresh(Message):
+class SnapshotReady(Message):
     """A snapshot came, made with these settings."""
 
     snapshot: Snapshot
@@ -48,7 +49,7 @@ class Progress(Message):
 
 
 @dataclass
-class Trouble(Message):
+class ErrorReported(Message):
     """Something failed; the text says what, and what to do."""
 
     text: str
@@ -77,16 +78,16 @@ class Messenger:
         self._was_open = False
         self.result: Snapshot | None = None
 
-    def look(self, now: Now) -> None:
+    def look(self, now: RecordingStatus) -> None:
         """Tell how the sensors are doing."""
         self._was_open |= not now.closed
-        self._post(Looked(now))
+        self._post(StatusUpdated(now))
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show an estimate."""
         if snapshot.closed and self._was_open:
             self.result = snapshot
-        self._post(Fresh(snapshot, settings))
+        self._post(SnapshotReady(snapshot, settings))
 
     def progress(self, done: int, total: int) -> None:
         """Tell how far the result is."""
@@ -94,7 +95,7 @@ class Messenger:
 
     def trouble(self, text: str) -> None:
         """Tell that it is not followed any more, and why."""
-        self._post(Trouble(text, ended=True))
+        self._post(ErrorReported(text, ended=True))
 
     def _post(self, message: Message) -> None:
         if not self._ended.is_set():

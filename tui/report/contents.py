@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from daq.bench import format_duration
+from daq.bench.durations import format_duration
+from daq.results.band_summary import band_of
 from tui.report.evidence import (
     advice_section,
     alignment_section,
@@ -16,14 +17,14 @@ from tui.report.evidence import (
 from tui.report.noise import judgements, limits_section, noise_section, verdict
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.wording import is_known, local_time, plain_number, span, utc_time
-from tui.results import band_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench import Channel
-    from daq.clock_model import ClockState
-    from daq.estimation import Settings, Snapshot
+    from daq.bench.model import Channel
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.timing.clock_model import ClockState
     from tui.report.source import RecordedSensor, Source
 
 _STATES = {

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from daq.results.clock_effect import lags
 from tui.report import drawing
 from tui.report.parts import Plot
-from tui.synchronisation import lags
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from daq.estimation import Snapshot
-    from tui.bands import FloatArray
+    from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import FloatArray
 
 POINTS = 400
 HEIGHT = 1.5

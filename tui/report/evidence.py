@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.model_test import rejected_below
-from tui.diagnosis import summary, why_not_tested
+from daq.results.band_summary import band_of
+from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
+from estimator.likelihood.goodness_of_fit import rejected_below
+from tui.output.diagnostics import summary, why_not_tested
+from tui.output.formatting import several, utc
+from tui.output.results import faulty_channels, left_out
 from tui.report.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import model_test_plot
@@ -21,17 +25,15 @@ from tui.report.wording import (
     share,
     span,
 )
-from tui.results import band_of, faulty_channels, left_out
-from tui.synchronisation import effect_by_sensor, grade, reference, residuals
-from tui.text import several, utc
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.clock_model import ClockState
-    from daq.estimation import Settings, Snapshot
-    from estimator.diagnostics import BandDiagnosis
-    from estimator.response import RelativeResponse
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.timing.clock_model import ClockState
+    from estimator.diagnostics.band import BandDiagnosis
+    from estimator.diagnostics.relative_response import RelativeResponse
     from tui.report.parts import Tone
     from tui.report.source import Happening, Source
 

@@ -7,28 +7,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tui.bands import band_edges
-from tui.limits import judged
+from daq.results.band_summary import band_of, channel_means, decibels
+from daq.results.limits import judged
+from estimator.self_noise.band_means import band_edges
+from tui.output.formatting import several
+from tui.output.results import flagged
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import noise_plots
 from tui.report.wording import decibel, plain_number, scientific, span
-from tui.results import band_of, channel_means, flagged
-from tui.text import decibels, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daq.bench import Bench
-    from daq.estimation import Settings, Snapshot
-    from tui.bands import BandMeans
-    from tui.limits import Judged
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.limits import LimitResult
+    from estimator.self_noise.band_means import BandMeans
     from tui.report.parts import Tone
 
 MOST_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
 
 
-def verdict(bench: Bench | None, found: list[Judged]) -> Paragraph:
+def verdict(bench: Bench | None, found: list[LimitResult]) -> Paragraph:
     """Return what it all comes to, in a sentence or two."""
     known = [each for each in found if each.known]
     if not known:
@@ -63,7 +65,9 @@ def verdict(bench: Bench | None, found: list[Judged]) -> Paragraph:
     return Paragraph(text, tone)
 
 
-def limits_section(bench: Bench | None, snapshot: Snapshot, found: list[Judged]) -> Section | None:
+def limits_section(
+    bench: Bench | None, snapshot: Snapshot, found: list[LimitResult]
+) -> Section | None:
     """Return every channel beside its limits; None where the bench file has none."""
     if bench is None or not bench.limits:
         return None
@@ -130,18 +134,18 @@ def noise_section(snapshot: Snapshot, settings: Settings, bench: Bench | None) -
     return Section("Self-noise", tuple(parts))
 
 
-def judgements(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[Judged]:
+def judgements(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[LimitResult]:
     """Return every channel beside its limits, worst first within each limit."""
     found = judged(bench, snapshot, settings)
     order = list(dict.fromkeys(each.limit for each in found))
     return sorted(found, key=lambda each: (order.index(each.limit), _rank(each)))
 
 
-def _rank(each: Judged) -> int:
+def _rank(each: LimitResult) -> int:
     return 3 if not each.known else 0 if not each.met else 1 if not each.certain else 2
 
 
-def _words(each: Judged) -> tuple[str, Tone]:
+def _words(each: LimitResult) -> tuple[str, Tone]:
     if not each.known:
         return "nothing can be said", "doubtful"
     if not each.met:

@@ -12,14 +12,14 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from scipy import special
 
-from estimator.model_test import REJECT, neighbour_correlation
-from estimator.windows import get_window
-from tui.bands import band_means, log_edges
-from tui.limits import concerns, mask_psd
+from daq.results.band_summary import correlation_of
+from daq.results.limits import concerns, mask_psd
+from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
+from estimator.self_noise.band_means import band_means, log_edges
+from estimator.spectra.windows import get_window
 from tui.report import drawing
 from tui.report.parts import Plot
 from tui.report.wording import power_of_ten
-from tui.results import correlation_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-    from daq.bench import Bench
-    from daq.estimation import Settings, Snapshot
-    from tui.bands import BandMeans, FloatArray
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import BandMeans, FloatArray
 
     BoolArray = NDArray[np.bool_]
 
@@ -151,7 +152,7 @@ def model_test_plot(snapshot: Snapshot, settings: Settings) -> Plot | None:
             continue
         total = float(degrees[inside][known[inside]].sum())
         pairs = np.maximum(n - np.arange(1, len(r) + 1), 0)
-        spread = 1 + 2 * float(pairs @ r**2) / n  # as estimator.model_test.pool
+        spread = 1 + 2 * float(pairs @ r**2) / n  # as estimator.likelihood.goodness_of_fit.pool
         ratio[number] = float(statistic[inside][known[inside]].sum()) / total
         limit[number] = special.chdtri(total / spread, REJECT) * spread / total
     if not count.any():

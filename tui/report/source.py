@@ -16,7 +16,7 @@ from daq.recording.reader import Recording
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench import Bench, Channel
+    from daq.bench.model import Bench, Channel
     from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000

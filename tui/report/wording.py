@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
-from tui.text import decibels
+from daq.results.band_summary import decibels
 
 if TYPE_CHECKING:
-    from daq.bench import Bench
+    from daq.bench.model import Bench
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "?"

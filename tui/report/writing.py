@@ -16,7 +16,8 @@ from tui.report.source import sources
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.estimation import Settings, Snapshot
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
     from tui.report.parts import Report
 
 PAPER = (".pdf",)

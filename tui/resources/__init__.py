@@ -1,1 +1,1 @@
-"""Files that come with the command: bench files and the application's style sheet."""
+"""Bench file templates."""

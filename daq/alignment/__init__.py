@@ -1,0 +1,4 @@
+"""Every sensor of a recording on one grid in physical units.
+
+Raw counts on disk are never touched. Knows no spectra.
+"""

@@ -1,0 +1,378 @@
+"""A recording on one common grid, in physical units.
+
+Theory of operation ------------------- Every sensor's samples are counted without error within an
+*epoch* of its clock; the clock says when each was taken (:mod:`daq.timing.clock_model`). The grid
+runs at one rate from the instant the last sensor has begun. Where a sensor's samples fall on the
+grid (sensors of one clock, recordings with exact times) they pass through untouched; elsewhere they
+are interpolated (:mod:`daq.alignment.resampling`).
+
+A grid instant is valid if every sensor has all samples it takes; gaps are never filled. Filtering
+is done on whole spans counted from the grid's start, so that what is read does not depend on how
+the reading is cut. Memory is that of the piece asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.alignment.grid import SNAP, Grid
+from daq.alignment.resampling import USABLE
+from daq.alignment.sensor_reader import DelayMeasurement, SensorSource, main_columns
+from daq.errors import CannotAlignError
+from daq.timing.clock_model import ClockState, nominal
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Channel
+    from daq.recording.reader import Recording, SensorRecord
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+_GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
+_FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
+_ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
+_LATEST = 5.0  # seconds that a device with UTC may take to send what it has
+
+
+class AlignedRecording:
+    """The sensors of a recording on one grid, as long as the recording is, or as it grows.
+
+    Parameters
+    ----------
+    recording : Recording
+        Open; may still be growing.
+    sampling_rate : float, optional
+        Of the grid, in Hz; the lowest of the sensors' where not given.
+    start_utc_ns, end_utc_ns : int, optional
+        Only what lies between.
+    at_face_value : bool
+        Take every clock to keep its nominal rate from the sample on that arrived first.
+
+    Raises
+    ------
+    CannotAlignError
+        If there are no main channels, or `sampling_rate` is above that of a sensor.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        sampling_rate: float | None = None,
+        start_utc_ns: int | None = None,
+        end_utc_ns: int | None = None,
+        nominal_clocks: bool = False,
+    ) -> None:
+        self._recording = recording
+        self._wanted = (start_utc_ns, end_utc_ns)
+        records = [record for record in recording.sensors if main_columns(record)]
+        if not records:
+            raise CannotAlignError(
+                f"{recording.path}: no sensor with a channel that is not auxiliary"
+            )
+        self.sampling_rate = _grid_rate(records, sampling_rate)
+        self.channels: tuple[tuple[str, Channel], ...] = tuple(
+            (record.name, record.channels[column])
+            for record in records
+            for column in main_columns(record)
+        )
+        self.dims = tuple(len(main_columns(record)) for record in records)
+        self._records = records
+        self._sources: list[SensorSource] = []
+        self._origin = (0, 0)
+        self._grid: Grid | None = None
+        self._set_at = (0, 0)
+        self._end = math.inf
+        self._at_face_value = nominal_clocks
+        self._measured_against: int | None = None
+        self.refresh()
+
+    @property
+    def start_utc_ns(self) -> int:
+        """UTC of grid sample 0, in ns since 1970."""
+        return self._origin[1] + round(self._start * 1e9)
+
+    @property
+    def clocks(self) -> tuple[ClockState, ...]:
+        """What is known about each sensor's clock, in the order of the sensors."""
+        return tuple(source.clock.state for source in self._sources if source.clock)
+
+    @property
+    def is_reference(self) -> tuple[bool, ...]:
+        """Which sensors run by the clock that the others are measured against."""
+        if not self._sources:
+            return ()
+        name = self._sources[self._reference].clock_name
+        return tuple(source.clock_name == name for source in self._sources)
+
+    @property
+    def n_available(self) -> int:
+        """Grid samples that can be read now."""
+        grid = self._grid
+        if grid is None:
+            return 0
+        ends = (
+            source.known_clock.end - (0.0 if grid.has(source) else grid.reach(source))
+            for source in self._sources
+        )
+        stop = (min(*ends, self._end) - grid.start) * self.sampling_rate
+        return max(0, math.floor(stop + SNAP) + 1)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether every sensor's samples fall on the grid, so that no clock had to be estimated."""
+        return self._untouched and not any(source.offset_in_doubt for source in self._sources)
+
+    @property
+    def usable(self) -> float:
+        """Frequency in Hz up to which samples on the grid are what sensors read."""
+        return (0.5 if self._untouched else USABLE) * self.sampling_rate
+
+    def delays(self, at: FloatArray) -> FloatArray:
+        """Return how far each sensor's count of time lags the grid, by the clocks as known now.
+
+        Parameters
+        ----------
+        at : float64, shape (n,)
+            Grid positions in samples.
+
+        Returns
+        -------
+        float64, shape (n, n_sensors)
+            In seconds; only differences mean anything.
+        """
+        seconds = self._start + at / self.sampling_rate
+        columns = [
+            seconds - source.known_clock.position(seconds) / source.record.sampling_rate
+            for source in self._sources
+        ]
+        return np.stack(columns, axis=1)
+
+    @property
+    def measurable(self) -> tuple[int, ...]:
+        """Sensors whose delay the samples could tell: the best reference, and one of each clock.
+
+        And those that share a clock, where it is in doubt how many samples apart they began.
+        Empty where no clock has to be estimated. Sensors are numbered in order.
+        """
+        if self.is_exact:
+            return ()
+        reference = self._preferred
+        seen = {self._sources[reference].clock_name}
+        free = []
+        for number, source in enumerate(self._sources):
+            known = source.device_utc or source.polled or number == reference
+            if not known and (source.clock_name not in seen or source.offset_in_doubt):
+                free.append(number)
+                seen.add(source.clock_name)
+        return (reference, *free) if free else ()
+
+    def learn(
+        self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FloatArray
+    ) -> None:
+        """Take delays that have been measured from what was read.
+
+        Parameters
+        ----------
+        at : float64, shape (n,)
+            Grid positions in samples, increasing from call to call.
+        delays, std : float64, shape (n, n_measurable)
+            By how much each sensor that is `measurable` lags the one whose standard deviation is
+            zero, in seconds; an infinite one where that is not known.
+        frame_delays : float64, shape (n_measurable,)
+            What is to be added to all delays since `forget`, in seconds.
+        """
+        if len(at) == 0:
+            return
+        certain = np.flatnonzero((std == 0).all(axis=0))
+        if len(certain):
+            self._measured_against = self.measurable[int(certain[0])]
+        seconds = self._start + at / self.sampling_rate
+        at_reference = self._sources[self._reference].known_clock.position(seconds)
+        for column, number in enumerate(self.measurable):
+            source = self._sources[number]
+            index = source.known_clock.position(seconds)
+            source.frame_delay = float(frame_delays[column])
+            source.learnt.append(
+                DelayMeasurement(index, at_reference, delays[:, column], std[:, column])
+            )
+
+    def forget(self) -> None:
+        """Drop what was learnt; the clocks stay as they are until they are set again."""
+        for source in self._sources:
+            source.learnt.clear()
+
+    def set_clocks(self) -> None:
+        """Set every clock by all that is known now."""
+        sources = self._sources
+        self._place_stated()
+        if self._at_face_value:
+            for source in sources:
+                rate = source.record.sampling_rate
+                source.clock = nominal(
+                    source.record.name,
+                    "nominal rate",
+                    end_sample=source.end_sample,
+                    sampling_rate=rate,
+                    first=round(source.arrivals.start * rate),
+                    residual=math.nan,
+                )
+            return
+        together = len({source.clock_name for source in sources}) == 1 and not any(
+            source.device_utc or source.polled for source in sources
+        )
+        together = together and len({source.record.sampling_rate for source in sources}) == 1
+        reference = sources[self._reference]
+        first_of: dict[str, SensorSource] = {}
+        for source in [reference, *(each for each in sources if each is not reference)]:
+            name = source.clock_name
+            first = first_of.get(name) or source.repeats(first_of.values()) or source
+            first_of[name] = first
+            measured = None if source is reference else source.measured(reference.known_clock)
+            if source.polled:
+                source.clock = source.by_instants()
+            elif first is not source and not source.device_utc:
+                source.share(first, measured)
+            elif together:
+                ppm, ppm_std = source.arrivals.rate()
+                source.clock = nominal(
+                    source.record.name,
+                    f"clock of {source.clock_name}",
+                    end_sample=source.end_sample,
+                    sampling_rate=source.record.sampling_rate,
+                    ppm=ppm,
+                    ppm_std=ppm_std,
+                )
+            else:
+                clock = source.arrivals.solve(source.record.name, measured)
+                if clock.state.refined:  # against the reference, whose rate is not certain either
+                    clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
+                source.clock = clock
+
+    def _place_stated(self) -> None:
+        """Move stated UTC to where it arrives, if the host's UTC, which others have, is wrong.
+
+        It is where no device's blocks arrive when they can. A block of all channels is there when
+        the slowest channel's is: where these are out of step, up to twice as long after its end.
+        """
+        stated = [source.arrivals for source in self._sources if source.device_utc]
+        if 0 < len(stated) < len(self._sources):
+            wrong = all(not 0 <= each.latency < _LATEST + 2 * each.longest_block for each in stated)
+            for each in stated:
+                each.moved = min(other.latency for other in stated) if wrong else 0.0
+
+    def refresh(self) -> None:
+        """Take what has been committed since, and set every clock by it."""
+        self._recording.refresh()
+        if not self._sources:
+            if any(record.n_samples == 0 for record in self._records):
+                return
+            at = self._recording.created_at
+            self._origin = (at.monotonic_ns, at.utc_ns)
+            self._sources = [SensorSource.of(record, *self._origin) for record in self._records]
+        for source in self._sources:
+            source.refresh()
+        n_samples = sum(source.end_sample for source in self._sources)
+        n_runs = sum(len(source.runs) for source in self._sources)
+        before, runs_before = self._set_at
+        enough = _ENOUGH * sum(source.record.sampling_rate for source in self._sources)
+        growth = max(_GROWTH * before, min(_FIRST_GROWTH * before, enough))
+        if n_runs > runs_before or n_samples > before + growth:
+            self._set_at = (n_samples, n_runs)
+            self.set_clocks()
+        else:
+            for source in self._sources:
+                source.clock = source.known_clock.extended(source.end_sample)
+        if self._grid is None:
+            self._grid = self._laid()
+
+    def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
+        """Return grid samples `start` to `stop` (not included).
+
+        Returns
+        -------
+        samples : float64, shape (stop - start, n_channels)
+            In physical units. Arbitrary where not valid.
+        valid : bool, shape (stop - start,)
+            False where any sensor has a gap.
+
+        Raises
+        ------
+        CannotAlignError
+            If the samples are not available (yet).
+        """
+        grid = self._grid
+        if grid is None or not 0 <= start <= stop <= self.n_available:
+            raise CannotAlignError(
+                f"{self._recording.path}: grid samples {start} to {stop} asked for,"
+                f" {self.n_available} available"
+            )
+        samples = np.zeros((stop - start, len(self.channels)))
+        valid = np.ones(stop - start, dtype=bool)
+        column = 0
+        for source in self._sources:
+            part = samples[:, column : column + len(source.columns)]
+            valid &= grid.read(source, start, part)
+            column += len(source.columns)
+        return samples, valid
+
+    @property
+    def _reference(self) -> int:
+        """The sensor others are measured against."""
+        return self._preferred if self._measured_against is None else self._measured_against
+
+    @property
+    def _preferred(self) -> int:
+        """The sensor others are best measured against: one with its own UTC, else the first."""
+        for number, source in enumerate(self._sources):
+            if source.device_utc:
+                return number
+        return 0
+
+    @property
+    def _untouched(self) -> bool:
+        """Whether all samples fall on the grid, as far as there is one."""
+        grid = self._grid
+        return grid is None or all(map(grid.has, self._sources))
+
+    @property
+    def _start(self) -> float:
+        """Seconds from the recording's creation to grid sample 0."""
+        return 0.0 if self._grid is None else self._grid.start
+
+    def _laid(self) -> Grid:
+        """Lay the grid from where all sensors have begun, and note where it is to end."""
+        start_utc_ns, end_utc_ns = self._wanted
+        start = max(source.known_clock.start for source in self._sources)
+        grid = Grid(self.sampling_rate, start)
+        if not all(map(grid.has, self._sources)):
+            start += max(map(grid.reach, self._sources))
+        first = self._sources[0].known_clock
+        if start_utc_ns is not None:
+            wanted = (start_utc_ns - self._origin[1]) * 1e-9
+            if wanted > start:  # the first sensor's next sample
+                epoch = first.epochs[0]
+                index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
+                start = float(epoch.at(index)[0])
+        if end_utc_ns is not None:
+            self._end = (end_utc_ns - self._origin[1]) * 1e-9
+        return Grid(self.sampling_rate, start)
+
+
+def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:
+    rates = {record.name: record.sampling_rate for record in records}
+    lowest = min(rates.values())
+    if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):
+        return lowest
+    if wanted > lowest or wanted <= 0:
+        listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise CannotAlignError(
+            f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
+            f" ask for {lowest:g} Hz or less"
+        )
+    return wanted

@@ -1,0 +1,117 @@
+"""The common grid of a recording: a sensor's samples on it, as they are or interpolated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.alignment.resampling import SPAN, all_there, reach, resample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.alignment.sensor_reader import SensorSource
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+SNAP = 1e-3
+"""Samples: constant offsets this small between exact clocks are rounding of the times."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Instants at one rate.
+
+    Attributes
+    ----------
+    sampling_rate : float
+        In Hz.
+    start : float
+        Seconds from the recording's creation to grid sample 0.
+    """
+
+    sampling_rate: float
+    start: float
+
+    def has(self, source: SensorSource) -> bool:
+        """Whether the sensor's samples fall on the grid."""
+        if source.record.sampling_rate != self.sampling_rate:
+            return False
+        for epoch in source.known_clock.epochs:
+            rate = (epoch.index[-1] - epoch.index[0]) / (epoch.seconds[-1] - epoch.seconds[0])
+            if len(epoch.index) > 2 or abs(rate / self.sampling_rate - 1) > 1e-12:
+                return False
+            position = epoch.position(np.array([self.start]))
+            if abs(position[0] - round(position[0])) > SNAP:
+                return False
+        return True
+
+    def reach(self, source: SensorSource) -> float:
+        """Return how far interpolation looks to both sides, in seconds."""
+        return reach(self._ratio(source)) / source.record.sampling_rate
+
+    def read(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
+        """Write a sensor's samples from grid sample `at` on; return which are valid.
+
+        Parameters
+        ----------
+        samples : float64, shape (n, n_channels)
+            Written to, in physical units; arbitrary where not valid.
+
+        Returns
+        -------
+        bool, shape (n,)
+        """
+        if self.has(source):
+            return self._pass_through(source, at, samples)
+        # Whole spans: then the same numbers come out however the reading is cut.
+        first = at // SPAN * SPAN
+        last = -(-(at + len(samples)) // SPAN) * SPAN
+        whole, present = self._interpolated(source, first, last)
+        wanted = slice(at - first, at - first + len(samples))
+        samples[:] = whole[wanted]
+        return present[wanted]
+
+    def _pass_through(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
+        second = np.array([self.start + at / self.sampling_rate])
+        valid = np.zeros(len(samples), dtype=bool)
+        for epoch in source.known_clock.epochs:
+            first = round(float(epoch.position(second)[0]))
+            low = max(first, epoch.first_sample)
+            high = min(first + len(samples), epoch.end_sample)
+            if low < high:
+                rows = slice(low - first, high - first)
+                valid[rows] = source.fill(samples[rows], low)
+        return valid
+
+    def _interpolated(
+        self, source: SensorSource, start: int, stop: int
+    ) -> tuple[FloatArray, BoolArray]:
+        seconds = self.start + np.arange(start, stop) / self.sampling_rate
+        samples = np.zeros((stop - start, len(source.columns)))
+        valid = np.zeros(stop - start, dtype=bool)
+        ratio = self._ratio(source)
+        for epoch in source.known_clock.epochs:
+            if epoch.end < seconds[0] or epoch.start > seconds[-1]:
+                continue
+            positions = epoch.position(seconds)
+            margin = reach(ratio)
+            low = math.floor(positions[0]) - margin
+            high = math.ceil(positions[-1]) + margin + 1
+            inputs = np.zeros((high - low, len(source.columns)))
+            present = source.fill(inputs, low)
+            inside = np.arange(low, high)
+            present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
+            inputs[~present] = 0.0
+            usable = all_there(present, positions - low, ratio=ratio)
+            if usable.any():
+                samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
+                valid |= usable
+        return samples, valid
+
+    def _ratio(self, source: SensorSource) -> float:
+        return max(1.0, source.record.sampling_rate / self.sampling_rate)

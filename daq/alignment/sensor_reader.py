@@ -1,0 +1,257 @@
+"""One sensor of a recording as alignment sees it: where its samples are, when they were taken."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import CannotAlignError
+from daq.protocols.block import BlockFlag
+from daq.timing.arrival_times import ArrivalTimes, MeasuredDelays
+from daq.timing.clock_model import from_instants
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from daq.recording.reader import SensorRecord
+    from daq.timing.clock_model import Clock
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+
+_CHUNK_BLOCKS = 1 << 14  # blocks
+_PROOF = 256  # samples whose counts are equal, one by one, are the same samples
+_APART = 1.0  # seconds by which two wires may deliver them apart
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Contiguous samples, in the file as well as in time."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+
+    @property
+    def last_row(self) -> int:
+        return self.first_row + self.n_samples
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DelayMeasurement:
+    """Delays measured where a sensor's sample `index` met the reference's `at_reference`."""
+
+    index: FloatArray
+    at_reference: FloatArray
+    delay: FloatArray
+    std: FloatArray
+
+
+@dataclass(slots=True)
+class SensorSource:
+    """One sensor of the recording: where its samples are, and when they were taken."""
+
+    record: SensorRecord
+    columns: list[int]
+    sensitivity: FloatArray
+    arrivals: ArrivalTimes
+    runs: list[_Run] = field(default_factory=list)
+    n_blocks: int = 0
+    device_utc: bool = False
+    polled: bool = False
+    clock: Clock | None = None
+    learnt: list[DelayMeasurement] = field(default_factory=list)
+    frame_delay: float = 0.0
+    offset_in_doubt: bool = False
+    """Whether how many samples apart it and others of its clock began had to be estimated."""
+
+    @property
+    def end_sample(self) -> int:
+        """Index of the sample after the last one."""
+        run = self.runs[-1]
+        return run.first_sample + run.n_samples
+
+    def refresh(self) -> None:
+        """Take the blocks that have been committed since."""
+        for first in range(self.n_blocks, len(self.record.blocks), _CHUNK_BLOCKS):
+            self._take(self.record.blocks[first : first + _CHUNK_BLOCKS])
+
+    def _take(self, blocks: NDArray[Any]) -> None:
+        if self.n_blocks == 0:
+            self.device_utc = bool(blocks["flags"][0] & int(BlockFlag.DEVICE_UTC))
+            self.polled = self.record.polled
+        self.arrivals.add(blocks)
+        first = blocks["first_sample"].astype(np.int64)
+        length = blocks["n_samples"].astype(np.int64)
+        expected = np.append(self.end_sample if self.runs else -1, (first + length)[:-1])
+        starts = np.flatnonzero(first != expected)
+        if len(starts) == 0 or starts[0] > 0:  # the run before goes on
+            until = int(starts[0]) if len(starts) else len(blocks)
+            run = self.runs[-1]
+            self.runs[-1] = _Run(
+                run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
+            )
+        for start, end in itertools.pairwise([*starts.tolist(), len(blocks)]):
+            n_samples = int(length[start:end].sum())
+            self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
+        self.n_blocks += len(blocks)
+
+    def fill(self, samples: FloatArray, first: int) -> BoolArray:
+        """Write samples from `first` on in physical units; return which of them are there."""
+        last = first + len(samples)
+        present = np.zeros(len(samples), dtype=bool)
+        begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
+        for run in itertools.islice(self.runs, max(begin, 0), None):
+            if run.first_sample >= last:
+                break
+            low = max(first, run.first_sample)
+            high = min(last, run.first_sample + run.n_samples)
+            if low >= high:
+                continue
+            row = run.first_row + low - run.first_sample
+            counts = self.record.counts(row, row + high - low)
+            if len(self.columns) < counts.shape[1]:
+                counts = counts[:, self.columns]
+            np.divide(counts, self.sensitivity, out=samples[low - first : high - first])
+            present[low - first : high - first] = True
+        return present
+
+    @classmethod
+    def of(cls, record: SensorRecord, monotonic_ns: int, utc_ns: int) -> SensorSource:
+        """Return the source of a sensor, nothing taken yet, times from this origin."""
+        columns = main_columns(record)
+        return cls(
+            record,
+            columns,
+            np.array([record.channels[column].sensitivity for column in columns]),
+            ArrivalTimes(record.sampling_rate, monotonic_ns, utc_ns),
+        )
+
+    @property
+    def clock_name(self) -> str:
+        """Name of the clock that samples it: its own where the recording does not say."""
+        return self.record.clock or self.record.name
+
+    @property
+    def known_clock(self) -> Clock:
+        """The clock, once a block has come."""
+        if self.clock is None:
+            raise CannotAlignError(f"sensor {self.record.name!r}: no block recorded yet")
+        return self.clock
+
+    def by_instants(self) -> Clock:
+        """Return the clock of a polled sensor: every sample has its instant."""
+        instants_ns = self.record.instants_ns(0, self.runs[-1].last_row)
+        elapsed_ns = instants_ns - self.arrivals.origin_monotonic_ns
+        return from_instants(
+            self.record.name,
+            np.asarray(elapsed_ns * 1e-9, dtype=np.float64),
+            sampling_rate=self.record.sampling_rate,
+            runs=[(run.first_sample, run.first_row, run.n_samples) for run in self.runs],
+        )
+
+    def measured(self, reference: Clock) -> MeasuredDelays | None:
+        """Return when samples were taken, from the delays learnt against the reference."""
+        if not self.learnt:
+            return None
+        index = np.concatenate([each.index for each in self.learnt])
+        at_reference = np.concatenate([each.at_reference for each in self.learnt])
+        delay = np.concatenate([each.delay for each in self.learnt])
+        seconds = reference.at(at_reference) - delay - self.frame_delay
+        std = np.concatenate([each.std for each in self.learnt])
+        return MeasuredDelays(index, seconds, std)
+
+    def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
+        """Return the one of others that is the same sensor, read over another wire."""
+        for other in others:
+            apart = self.arrivals.start - other.arrivals.start
+            guess = round(apart * self.record.sampling_rate)
+            lag = self._lag(other, self.runs[0].first_sample, guess)
+            if lag is not None and not self._departs(other, lag):
+                return other
+        return None
+
+    def _departs(self, other: SensorSource, lag: int) -> bool:
+        """Whether counts that were the other's at first are not at the end of the first epoch.
+
+        Coarse counts of one motion can be equal by chance, until clocks have drifted apart.
+        """
+        mine, others = (next(each.arrivals.earliest())[1] for each in (self, other))
+        first = min(mine, others - lag) - _PROOF
+        last, other_last = self._counts(first, _PROOF), other._counts(first + lag, _PROOF)
+        return last is not None and other_last is not None and bool((last != other_last).any())
+
+    def _lag(self, other: SensorSource, first: int, guess: int) -> int | None:
+        """Return the n for which its samples i, soon after `first`, are the other's i + n.
+
+        By their counts; None if they are not the same, or stand still, or repeat themselves.
+        """
+        stated = self.device_utc or self.polled or other.device_utc or other.polled
+        if stated or self.record.sampling_rate != other.record.sampling_rate:
+            return None
+        reach = math.ceil(_APART * self.record.sampling_rate)
+        first = max(first, other.runs[0].first_sample - guess) + 2 * reach
+        mine = self._counts(first, _PROOF)
+        others = other._counts(first + guess - reach, _PROOF + 2 * reach)
+        if mine is None or others is None or mine.shape[1] != others.shape[1]:
+            return None
+        if np.count_nonzero(np.diff(mine, axis=0).any(axis=1)) < _PROOF // 4:
+            return None
+        stretches = np.lib.stride_tricks.sliding_window_view(others, _PROOF, axis=0)
+        same = np.flatnonzero((stretches == mine.T).all(axis=(1, 2)))
+        return guess - reach + int(same[0]) if len(same) == 1 else None
+
+    def _counts(self, first: int, n_samples: int) -> NDArray[Any] | None:
+        """Return counts of contiguous samples from `first` on, if they are there."""
+        for run in self.runs:
+            if run.first_sample <= first and first + n_samples <= run.first_sample + run.n_samples:
+                row = run.first_row + first - run.first_sample
+                return self.record.counts(row, row + n_samples)[:, self.columns]
+        return None
+
+    def share(self, first: SensorSource, measured: MeasuredDelays | None) -> None:
+        """Set the clock to that of another sensor, which the same oscillator samples.
+
+        Sensors whose blocks are received together count alike. Others have begun to count at
+        different samples: how many apart, the samples tell, or else the arrival times. If it is
+        the same sensor, its counts tell.
+        """
+        name, known = self.record.name, first.known_clock
+        self.offset_in_doubt = not self.arrivals.arrives_with(first.arrivals)
+        if not self.offset_in_doubt:
+            self.clock = known.shared_by(name, end_sample=self.end_sample)
+            return
+        # Arrivals are compared with arrivals: the other's clock may be the timeline itself.
+        stated = first.device_utc or first.polled
+        heard = known if stated else first.arrivals.solve(name)
+        stretches, by_samples = [], measured is not None
+        for begin, end, index, seconds in self.arrivals.earliest():
+            apart = float((heard.position(seconds) - index).min())
+            lag = None
+            if self.clock_name != first.clock_name:
+                lag = self._lag(first, begin, round(apart))
+            if lag is not None:
+                apart, by_samples = lag, True
+            elif measured is not None:
+                mine = (measured.index >= begin) & (measured.index < end)
+                mine &= np.isfinite(measured.std)
+                if mine.any():
+                    position = known.position(measured.seconds[mine])
+                    apart = float(np.median(position - measured.index[mine]))
+                else:
+                    by_samples = False
+            stretches.append((begin, end, round(apart)))
+        self.clock = known.shifted(name, stretches, by_samples=by_samples)
+
+
+def main_columns(record: SensorRecord) -> list[int]:
+    """Return the columns of the channels that take part in the huddle test."""
+    return [column for column, channel in enumerate(record.channels) if not channel.auxiliary]

@@ -1,0 +1,371 @@
+"""The tables of a bench file. Read them with :mod:`daq.bench.loading`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+from cronsim import CronSim, CronSimError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    model_validator,
+)
+
+from daq.bench.durations import parse_duration
+from daq.bench.toml_text import to_toml
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+METHODS = ("two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
+WINDOWS = (
+    "rectangular",
+    "boxcar",
+    "bartlett",
+    "barthann",
+    "blackman",
+    "blackmanharris",
+    "bohman",
+    "cosine",
+    "flattop",
+    "hamming",
+    "hann",
+    "nuttall",
+    "parzen",
+    "triang",
+)
+PARAMETRIC_WINDOWS = ("chebwin", "dpss", "gaussian", "general_hamming", "kaiser", "tukey")
+"""Of one parameter each, as in ``kaiser,8``."""
+
+
+def _name(value: str) -> str:
+    if value in {".", ".."} or "/" in value or not value.isprintable() or value != value.strip():
+        raise ValueError("expected a printable name without '/' and outer spaces")
+    if not 0 < len(value.encode()) <= 64:
+        raise ValueError("expected a name of 1 to 64 bytes")
+    return value
+
+
+def _method(value: str) -> str:
+    return _one_of(value, METHODS)
+
+
+def _window(value: str) -> str:
+    name, _, parameter = value.partition(",")
+    if name not in PARAMETRIC_WINDOWS:
+        return _one_of(value, WINDOWS)
+    try:
+        positive = 0 < float(parameter) < math.inf
+    except ValueError:
+        positive = False
+    if not positive:
+        raise ValueError(f"expected its parameter as well, above 0, as in {name},0.5")
+    return value
+
+
+def _one_of(value: str, known: tuple[str, ...]) -> str:
+    if value not in known:
+        close = difflib.get_close_matches(value.lower(), known, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise ValueError(f"expected one of {', '.join(known)}{hint}")
+    return value
+
+
+def _cron_line(value: str) -> str:
+    try:
+        CronSim(value, datetime(2026, 1, 1, tzinfo=UTC))
+    except CronSimError as error:
+        raise ValueError(
+            'expected a cron line "minute hour day month weekday", such as "0 22 * * 1-5"'
+            f" ({error})"
+        ) from None
+    return value
+
+
+def _time_zone(value: str) -> str:
+    try:
+        ZoneInfo(value)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError('expected a time zone such as "UTC" or "Europe/Berlin"') from None
+    return value
+
+
+def _pair_to_complex(value: object) -> object:
+    if isinstance(value, (list, tuple)) and len(value) == 2:
+        real, imaginary = value
+        if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
+            return complex(real, imaginary)
+    if isinstance(value, (int, float, complex)) and not isinstance(value, bool):
+        return complex(value)
+    raise ValueError("expected a number or [real, imaginary], in rad/s")
+
+
+def _dimension(value: object) -> object:
+    if value is None or value == "auto":
+        return value
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value
+    raise ValueError('expected "auto", or a number of dimensions such as 3')
+
+
+def _gain(value: object) -> object:
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
+        return float(value)
+    raise ValueError("expected a number other than 0, such as 1.02")
+
+
+Number = Annotated[float, Field(strict=True)]
+PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
+Name = Annotated[str, AfterValidator(_name)]
+Duration = Annotated[float, BeforeValidator(parse_duration)]
+ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
+
+
+class Table(BaseModel):
+    """A table of the bench file: unknown keys are faults."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PolesZeros(Table):
+    """Frequency response as poles and zeros of the Laplace transform.
+
+    ``H(s) = normalization * prod(s - zeros) / prod(s - poles)``, to be multiplied by the channel's
+    sensitivity. Without ``normalization``, ``|H| = 1`` at ``frequency``.
+    """
+
+    zeros: tuple[ComplexNumber, ...] = Field((), description="zeros in rad/s")
+    poles: tuple[ComplexNumber, ...] = Field((), description="poles in rad/s")
+    normalization: Number | None = None
+    frequency: PositiveNumber = 1.0
+    """Frequency in Hz at which the sensitivity holds."""
+
+    def at(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the response, without sensitivity.
+
+        Parameters
+        ----------
+        frequency : float64, any shape
+            In Hz.
+        """
+
+        def shape(s: NDArray[np.complexfloating[Any]]) -> NDArray[np.complex128]:
+            value = np.ones_like(s, dtype=np.complex128)
+            # Factor by factor in turn, so that high orders neither overflow nor underflow.
+            for index in range(max(len(self.zeros), len(self.poles))):
+                if index < len(self.zeros):
+                    value = value * (s - self.zeros[index])
+                if index < len(self.poles):
+                    value = value / (s - self.poles[index])
+            return value
+
+        value = shape(2j * np.pi * np.asarray(frequency, dtype=np.float64))
+        if self.normalization is not None:
+            return value * self.normalization
+        return value / np.abs(shape(np.array(2j * np.pi * self.frequency)))
+
+
+class Channel(Table):
+    """One digitised input."""
+
+    name: Name = Field(description="the channel's name")
+    sensitivity: Number = Field(description="counts per unit, not zero")
+    unit: str = "m/s²"
+    direction: str | None = None
+    response: PolesZeros | None = None
+    auxiliary: bool = False
+    """Recorded but not part of the huddle test (temperature, …)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_zero(cls, table: object) -> object:
+        if isinstance(table, Mapping) and table.get("sensitivity") == 0:
+            raise ValueError("sensitivity: expected counts per unit, not zero")
+        return table
+
+
+class Sensor(Table):
+    """One sensor with its digitizer, at one port."""
+
+    name: Name = Field(description="the sensor's name")
+    model: str = ""
+    serial_number: str = ""
+    driver: str = Field(description="the name of a driver")
+    port: str = Field(min_length=1, description="a port, such as /dev/ttyUSB0")
+    sampling_rate: PositiveNumber = Field(description="the sampling rate in Hz")
+    """In Hz; the bench's where the file does not say."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Options of the driver, validated by its own model."""
+    channels: tuple[Channel, ...] = Field(min_length=1, description="[[sensors.channels]] tables")
+    clock: Name | None = None
+    """Sensors of one clock name are sampled by one clock."""
+
+    def clock_name(self, *, shares_clock: bool) -> str:
+        """Return the name of the clock that samples this sensor."""
+        return self.clock or (self.port if shares_clock else self.name)
+
+    @property
+    def n_main_channels(self) -> int:
+        """Number of channels that take part in the huddle test."""
+        return sum(not channel.auxiliary for channel in self.channels)
+
+
+class EstimateSettings(Table):
+    """How the self-noise is estimated, unless the command says otherwise."""
+
+    segment: Duration = 10.0
+    overlap: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.5
+    window: Annotated[str, AfterValidator(_window)] = "hann"
+    detrend: Literal["none", "constant", "linear"] = "constant"
+    method: Annotated[str, AfterValidator(_method)] = "three-sensor"
+    correct: bool = True
+    target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
+    """Wanted coefficient of variation of the noise PSD within ``band``."""
+    band: tuple[PositiveNumber, PositiveNumber] | None = None
+    """Lowest and highest frequency of interest, in Hz."""
+    reject: Annotated[bool, Field(strict=True)] | None = None
+    """Whether segments with transients are left out; those that are clipped, if not given."""
+    octaves: Annotated[bool, Field(strict=True)] = False
+    """Whether each octave has segments of its own length."""
+    dimension: Annotated[int | Literal["auto"] | None, BeforeValidator(_dimension)] = None
+    """Dimensions of the common motion, for maximum likelihood; a sensor's, if not given."""
+    gains: dict[str, Annotated[float, BeforeValidator(_gain)]] = Field(default_factory=dict)
+    """What sensors ("B") or channels ("B.X") make of the motion, for the two-channel method."""
+
+
+class RecordingSettings(Table):
+    """Where recordings go, and for how long."""
+
+    directory: Path = Path("recordings")
+    """Relative to the bench file."""
+    duration: Duration | None = None
+    retention: Duration | None = None
+    """Recordings older than this are removed by ``huddle serve``; never, if not given."""
+    report: Literal["html", "pdf"] | None = None
+    """Whether a calibration report is written beside each recording, and as what."""
+
+
+class Schedule(Table):
+    """When ``huddle serve`` starts a run."""
+
+    cron: tuple[Annotated[str, AfterValidator(_cron_line)], ...] = ()
+    time_zone: Annotated[str, AfterValidator(_time_zone)] = "UTC"
+
+
+class Limit(Table):
+    """A noise mask for pass or fail: the noise PSD's upper bound, straight in log-log between."""
+
+    name: Name = Field(description="the limit's name")
+    frequency: tuple[PositiveNumber, ...] = Field(min_length=2, description="frequencies in Hz")
+    psd: tuple[PositiveNumber, ...] = Field(min_length=2, description="noise PSD in unit²/Hz")
+    sensors: tuple[str, ...] = ()
+    """Names of the sensors it holds for; all, if empty."""
+    channels: tuple[str, ...] = ()
+    """Names of the channels it holds for; all, if empty."""
+
+
+class Bench(Table):
+    """A bench: what one bench file describes."""
+
+    name: Name = Field(description="the bench's name")
+    operator: str = ""
+    location: str = ""
+    sampling_rate: PositiveNumber = Field(description="the sampling rate in Hz")
+    """In Hz, of the common grid, and of every sensor that does not say its own."""
+    sensors: tuple[Sensor, ...] = Field(min_length=1, description="[[sensors]] tables")
+    estimate: EstimateSettings = EstimateSettings()
+    recording: RecordingSettings = RecordingSettings()
+    schedule: Schedule = Schedule()
+    limits: tuple[Limit, ...] = ()
+    simulation: dict[str, Any] = Field(default_factory=dict)
+    """Handed to the simulated devices unread, but for ``speed``."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_sampling_rate(cls, table: object) -> object:
+        if not isinstance(table, Mapping) or not isinstance(table.get("sensors"), (list, tuple)):
+            return table
+        # A bench rate that is itself at fault is reported once, not again at every sensor.
+        default = {"sampling_rate": valid_rate(table) or 1.0}
+        filled = [default | s if isinstance(s, dict) else s for s in table["sensors"]]
+        return dict(table) | {"sensors": filled}
+
+    _text: str = PrivateAttr("")
+    _source: Path | None = PrivateAttr(None)
+
+    def model_post_init(self, context: object) -> None:
+        """Keep the text and the file it was parsed from, which the validation context names."""
+        if isinstance(context, Mapping):
+            self._text = context["text"]
+            self._source = context["source"]
+
+    @property
+    def text(self) -> str:
+        """The TOML it came from."""
+        return self._text or self.dump()
+
+    @property
+    def source(self) -> Path | None:
+        """The file it came from, where it came from one."""
+        return self._source
+
+    def dump(self) -> str:
+        """Return TOML text that parses to an equal bench."""
+        return to_toml(_plain(self.model_dump(exclude_defaults=True)))
+
+    @property
+    def recording_directory(self) -> Path:
+        """Where recordings go; a relative directory is relative to the bench file."""
+        directory = self.recording.directory.expanduser()
+        return directory if self.source is None else self.source.parent / directory
+
+    @property
+    def speed(self) -> float:
+        """How many times as fast as life the (simulated) bench runs."""
+        return float(self.simulation.get("speed", 1.0))
+
+    def sensor(self, name: str) -> Sensor:
+        """Return the sensor of this name."""
+        for sensor in self.sensors:
+            if sensor.name == name:
+                return sensor
+        raise KeyError(name)
+
+    def ports(self) -> dict[str, tuple[Sensor, ...]]:
+        """Return the sensors of each port, in the order of the file."""
+        ports: dict[str, tuple[Sensor, ...]] = {}
+        for sensor in self.sensors:
+            ports[sensor.port] = (*ports.get(sensor.port, ()), sensor)
+        return ports
+
+
+def valid_rate(table: Mapping[str, Any]) -> float | None:
+    """Return the bench's sampling rate from its unchecked table, if it is one."""
+    rate = table.get("sampling_rate")
+    if isinstance(rate, (int, float)) and not isinstance(rate, bool) and 0 < rate < math.inf:
+        return float(rate)
+    return None
+
+
+def _plain(value: object) -> Any:  # noqa: ANN401  (whatever TOML holds)
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, Path):
+        return value.as_posix()
+    return value

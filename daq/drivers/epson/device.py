@@ -1,0 +1,342 @@
+"""Identify an Epson accelerometer and set it up: its settings in the bench file, its registers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, PositiveFloat, Strict, field_validator
+
+from daq.drivers.interface import DeviceInformation
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.epson import commands
+from daq.protocols.epson.burst import BurstDecoder
+from daq.protocols.epson.commands import BurstFormat, Register
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench.model import Sensor
+    from daq.errors import DeviceError
+    from daq.transport.byte_stream import ByteStream
+
+REPLY_TIMEOUT = 0.3
+QUIET = 0.03
+"""Without a byte for so long, in s, the device has stopped streaming: six frames at 200 Hz."""
+ATTEMPTS, READ_ATTEMPTS = 5, 3
+SETTLE_TIMEOUT = 3.0
+"""For the device to get ready (flash, reset) or change its mode or filter, s."""
+WRITE_INTERVAL = 0.001
+"""Between two commands, s; the data sheet asks for 350 µs."""
+
+Field = Literal["x", "y", "z", "temperature"]
+EXTERNAL = {
+    "off": 0,
+    "trigger-rising": 2,
+    "trigger-falling": 3,
+    "pps-rising": 4,
+    "pps-falling": 5,
+}
+
+
+class EpsonSettings(BaseModel):
+    """``[sensors.settings]`` of an Epson accelerometer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    baud_rate: Literal[460800, 230400, 115200] = 460800
+    """As the device is set (it leaves the factory at 460800)."""
+    filter: str | None = None
+    """Name of the filter; the usual one for model and sampling rate if not given."""
+    fields: Annotated[tuple[Field, ...], Strict(strict=False)] | None = None
+    """What each channel is, in order; x, y, z, and temperature for an auxiliary channel."""
+    flags: bool = True
+    """Whether bursts carry the error flag."""
+    tilt: bool = False
+    """Whether x, y, z are tilt angles instead of accelerations."""
+    reduced_noise: bool = False
+    """The reduced-noise-floor condition of the M-A352."""
+    temperature_stabilisation: bool | None = None
+    """Bias stabilisation against thermal shock of the M-A352; on there, if not given."""
+    external: Literal["off", "trigger-rising", "trigger-falling", "pps-rising", "pps-falling"] = (
+        "off"
+    )
+    """What the EXT pin does; 1PPS on the M-A370 only."""
+    full_scale: PositiveFloat = 15.0
+    """In g, peak; samples beyond are marked as clipped."""
+
+    @field_validator("filter")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None and value not in commands.FILTERS:
+            raise ValueError(f"expected one of {', '.join(commands.FILTERS)}")
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """What a sensor's settings come to in the device's registers."""
+
+    sampling_rate: int
+    filter: str
+    fields: tuple[Field, ...]
+    burst: BurstFormat
+    settings: EpsonSettings
+    is_a370: bool
+
+    @classmethod
+    def of(cls, sensor: Sensor, model: str = "") -> Configuration:
+        """Raise BenchFileError for what the device cannot do.
+
+        ``model`` is what the device says it is; until it is asked, what the bench file says holds.
+        """
+        settings = EpsonSettings.model_validate(sensor.settings)
+        model = (model or sensor.model).upper()
+        who = f"sensor {sensor.name!r}"
+        rate = round(sensor.sampling_rate)
+        if rate not in commands.RATES or rate != sensor.sampling_rate:
+            rates = ", ".join(map(str, commands.RATES))
+            raise BenchFileError(
+                f"{who}: sampling_rate = {sensor.sampling_rate:g}; the device has {rates} Hz"
+            )
+        axes: Iterator[Field] = iter(("x", "y", "z"))
+        fields = settings.fields or tuple(
+            "temperature" if channel.auxiliary else next(axes, "temperature")
+            for channel in sensor.channels
+        )
+        if len(fields) != len(sensor.channels) or len(set(fields)) < len(fields):
+            raise BenchFileError(
+                f"{who}: {len(sensor.channels)} channels, but settings.fields = {list(fields)};"
+                " expected a different one of x, y, z, temperature for each channel"
+            )
+        flags = ("flag",) if settings.flags else ()
+        burst = BurstFormat.of(*flags, *fields, "count", "checksum")
+        if (needed := rate * burst.size * 10) > settings.baud_rate:
+            raise BenchFileError(
+                f"{who}: {rate} Hz of {burst.size} bytes need {needed} baud;"
+                f" settings.baud_rate = {settings.baud_rate} (fewer fields, or a lower rate)"
+            )
+        if lacking := _lacking(settings, model):
+            raise BenchFileError(f"{who}: {lacking}")
+        is_a370 = "A370" in model
+        usual = commands.USUAL_FILTER[min(rate, 500) if is_a370 else rate]
+        return cls(rate, settings.filter or usual, fields, burst, settings, is_a370)
+
+    @property
+    def hint(self) -> str:
+        """What to look at if no sample comes."""
+        is_triggered = self.settings.external.startswith("trigger")
+        return ", one for each trigger: is there a signal at EXT?" if is_triggered else ""
+
+    def decoder(self, sensor: str) -> BurstDecoder:
+        """Return a decoder of the bursts the device will send."""
+        full_scale = self.settings.full_scale * commands.COUNTS_PER_G
+        return BurstDecoder(
+            sensor,
+            self.burst,
+            fields=self.fields,
+            sampling_rate=self.sampling_rate,
+            full_scale_counts=min(round(full_scale), 2**31 - 1),
+        )
+
+    def writes(self) -> list[tuple[Register, bool, int]]:
+        """Return what to set: which register, whether its high byte, and to what."""
+        s, burst_ctrl = self.settings, self.burst.burst_ctrl
+        stabilises = s.temperature_stabilisation
+        if stabilises is None:
+            stabilises = not self.is_a370
+        sig_low = 0xE0 * s.tilt | commands.REDUCED_NOISE * s.reduced_noise
+        sig_low |= commands.TEMPERATURE_STABILISATION * stabilises
+        sig_high = (burst_ctrl >> 8 & 0x07) << 1 | 0x80 * ("temperature" in self.burst)
+        return [
+            (commands.MSC_CTRL, False, EXTERNAL[s.external] << 5 | 0x06),
+            (commands.SIG_CTRL, True, sig_high),
+            (commands.SIG_CTRL, False, sig_low),
+            (commands.SMPL_CTRL, True, commands.RATES[self.sampling_rate]),
+            (commands.FILTER_CTRL, False, commands.FILTERS[self.filter]),
+            (commands.UART_CTRL, False, commands.UART_AUTO),
+            (commands.BURST_CTRL, True, burst_ctrl >> 8),
+            (commands.BURST_CTRL, False, burst_ctrl & 0xFF),
+        ]
+
+
+def _lacking(settings: EpsonSettings, model: str) -> str:
+    """Say what of the settings a model does not have; nothing if it has all, or is not known."""
+    if "A370" in model:
+        if settings.filter in commands.NOT_ON_A370:
+            known = ", ".join(name for name in commands.FILTERS if name not in commands.NOT_ON_A370)
+            return f'settings.filter = "{settings.filter}"; an M-A370 has {known}'
+        for key in ("reduced_noise", "temperature_stabilisation"):
+            if getattr(settings, key):
+                return f"settings.{key} = true; only an M-A352 has it: leave it out"
+    if "A352" in model and settings.external.startswith("pps"):
+        return f'settings.external = "{settings.external}"; only an M-A370 follows 1PPS'
+    return ""
+
+
+class Device:
+    """Registers of one device in configuration mode."""
+
+    def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
+        self._sensor = sensor
+        self._stream = stream
+
+    async def write(self, register: Register, value: int, *, high: bool = False) -> None:
+        """Set the low or high byte of a register."""
+        await self._stream.write(commands.write(register, value, high=high))
+        await asyncio.sleep(WRITE_INTERVAL)
+
+    async def read(self, register: Register) -> int:
+        """Read a register; an answer that was lost on the way is asked for again."""
+        for _ in range(READ_ATTEMPTS - 1):
+            with contextlib.suppress(NoAnswerError, WrongDeviceError):
+                return await self._read(register)
+        return await self._read(register)
+
+    async def _read(self, register: Register) -> int:
+        self._stream.discard()
+        await self._stream.write(commands.read(register))
+        received = b""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                while True:
+                    received += (await self._stream.read())[0]
+                    value = commands.find_reply(received, register.address)
+                    if value is not None:
+                        return value
+        expected = f"expected {register.address:02X} xx xx 0D for register {register.address:02X}"
+        if received:
+            raise WrongDeviceError(
+                f"{self._stream.label}: no Epson accelerometer: {expected} of window"
+                f" {register.window}, got {received[-16:].hex(' ')}"
+            )
+        raise NoAnswerError(
+            f"{self._stream.label}: no answer: {expected} of window {register.window}, got nothing;"
+            " check cable, power and settings.baud_rate"
+        )
+
+    async def wait_clear(self, register: Register, bits: int, doing: str) -> int:
+        """Read a register until bits of it are clear; return it."""
+        try:
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while (value := await self.read(register)) & bits:
+                    pass
+        except TimeoutError as error:
+            raise NoAnswerError(
+                f"{self._stream.label}: the device is still {doing} after {SETTLE_TIMEOUT:g} s"
+            ) from error
+        return value
+
+    async def stop(self) -> None:
+        """Enter configuration mode and let what was on its way pass."""
+        await self.write(commands.MODE_CTRL, commands.CONFIGURATION, high=True)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while True:
+                    async with asyncio.timeout(QUIET):
+                        await self._stream.read()
+
+    async def identify(self, attempts: int = ATTEMPTS) -> None:
+        """Find the device, streaming or not, in the middle of a command or not."""
+        failure: DeviceError | None = None
+        for _ in range(attempts):
+            await self.stop()
+            try:
+                found = await self._read(commands.ID)
+            except (NoAnswerError, WrongDeviceError) as error:
+                failure = error
+                await self._stream.write(bytes([commands.DELIMITER]))
+                continue
+            if found == commands.DEVICE_ID:
+                return
+            failure = WrongDeviceError(
+                f"{self._stream.label}: expected ID {commands.DEVICE_ID:04X}, got {found:04X}"
+            )
+        if failure is not None:
+            raise failure
+
+    async def answers(self) -> bool:
+        """Whether a device is there that does not stream; one that does is not disturbed."""
+        await self._stream.write(bytes([commands.DELIMITER]))
+        for _ in range(READ_ATTEMPTS - 1):
+            with contextlib.suppress(NoAnswerError, WrongDeviceError):
+                await self._read(commands.ID)
+                return True
+        return False
+
+    async def information(self) -> DeviceInformation:
+        """Read what the device says about itself; refuse it if it is not the one expected."""
+        await self.wait_clear(commands.GLOB_CMD, commands.NOT_READY, "starting")
+        model, serial_number = await self._identity()
+        if refusal := self._refusal(model, serial_number):
+            raise WrongDeviceError(f"{self._stream.label}: {refusal}")
+        version = await self.read(commands.VERSION)
+        high = await self.read(commands.TEMP_HIGH)
+        low = await self.read(Register(commands.TEMP_HIGH.window, commands.TEMP_HIGH.address + 2))
+        count = (high << 16 | low) - (1 << 32) * (high >> 15)
+        diagnosis = await self.read(commands.DIAG_STAT)
+        return DeviceInformation(
+            sensor=self._sensor.name,
+            model=model,
+            serial_number=serial_number,
+            firmware=f"{version >> 8:X}.{version & 0xFF:X}",
+            temperature=round(commands.temperature(count), 2) if count else None,
+            details={"DIAG_STAT": f"{diagnosis:04X}"} if diagnosis else {},
+        )
+
+    async def _identity(self) -> tuple[str, str]:
+        """Return model and serial number, read twice alike: replies bear no checksum.
+
+        A wrong one would be taken for the device's own, and the device refused ever after.
+        """
+        before: tuple[str, str] | None = None
+        for _ in range(ATTEMPTS):
+            model = commands.text(tuple([await self.read(r) for r in commands.PROD_ID]))
+            found = model, commands.text(tuple([await self.read(r) for r in commands.SERIAL_NUM]))
+            if found == before:
+                return found
+            before = found
+        raise WrongDeviceError(
+            f"{self._stream.label}: model and serial number differ each time they are read,"
+            f" last {' '.join(before or ())!r}; check the cable"
+        )
+
+    def _refusal(self, model: str, serial_number: str) -> str:
+        """Say why this is not the device the bench file names; nothing if it is."""
+        wanted = self._sensor.model
+        named = re.search(r"A\d{3}", wanted.upper())
+        if named and named[0] not in model:
+            return f"expected model {wanted!r}, got {model!r}"
+        if self._sensor.serial_number not in {"", serial_number}:
+            return f"expected serial number {self._sensor.serial_number!r}, got {serial_number!r}"
+        return ""
+
+    async def sampling_rate(self) -> float | None:
+        """Read the rate the device is set to, in Hz."""
+        code = await self.read(commands.SMPL_CTRL) >> 8
+        return next((float(rate) for rate, c in commands.RATES.items() if c == code), None)
+
+    async def configure(self, configuration: Configuration) -> None:
+        """Set every register that matters, and read each back."""
+        for register, high, value in configuration.writes():
+            await self._set(register, value, high=high)
+        for register, high, value in configuration.writes():
+            for _ in range(READ_ATTEMPTS):
+                found = await self.read(register) >> (8 if high else 0) & 0xFF
+                if found == value:
+                    break
+                await self._set(register, value, high=high)
+            else:
+                raise WrongDeviceError(
+                    f"{self._stream.label}: register {register.address + high:02X} of window"
+                    f" {register.window} was set to {value:02X} and reads {found:02X}:"
+                    " this model does not have that setting"
+                )
+
+    async def _set(self, register: Register, value: int, *, high: bool) -> None:
+        await self.write(register, value, high=high)
+        if register is commands.FILTER_CTRL:
+            await self.wait_clear(register, commands.FILTER_BUSY, "changing its filter")

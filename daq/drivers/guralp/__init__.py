@@ -1,0 +1,1 @@
+"""Güralp digitizers: GCF over a serial line or from a Scream server."""

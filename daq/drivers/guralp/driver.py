@@ -1,0 +1,263 @@
+"""Driver for Güralp digitizers: GCF over a serial line, or from a Scream server.
+
+Nothing is configured: a digitizer sends what its own terminal was told. The driver listens until
+every stream has been heard, takes the sampling rate from the blocks, acknowledges them and asks
+again for those that were lost. Blocks state UTC, so no clock is fitted.
+
+============================ =====================================================================
+``port``                     what is spoken
+============================ =====================================================================
+serial, ``socket://``        frames with block recovery (``link = "serial"``)
+``socket://``                a Scream server over TCP (``link = "scream"``)
+``udp://host:port``          a Scream server over UDP; lost packets over TCP (``recovery_port``)
+============================ =====================================================================
+
+One port may serve several sensors, each with its own streams.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.drivers.guralp.links import open_link
+from daq.drivers.guralp.settings import GuralpSettings
+from daq.drivers.interface import DeviceInformation
+from daq.drivers.port_rules import require_address, require_alike
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.block import Block, Event
+from daq.protocols.guralp.gcf import component, serial_number
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Sequence
+
+    from daq.bench.model import Sensor
+    from daq.drivers.guralp.links import Link
+    from daq.host_clock import HostClock
+    from daq.protocols.guralp.streams import Streams
+
+MARGIN = 3.0
+"""Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""
+COMPONENTS = "ZNEX1234"
+
+
+class GuralpSession:
+    """Streams that have all been heard."""
+
+    def __init__(
+        self,
+        link: Link,
+        *,
+        label: str,
+        information: tuple[DeviceInformation, ...],
+        heard: list[Block | Event],
+        identify: Callable[[str], DeviceInformation],
+    ) -> None:
+        self.information = information
+        self._link = link
+        self._label = label
+        self._heard = heard
+        self._identify = identify
+        self._absent = {one.sensor for one in information if one.trouble}
+        self._refused: set[str] = set()
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Yield blocks and events."""
+        longest = 1.0  # of a block, s
+        found, self._heard = self._heard, []
+        while True:
+            for item in found:
+                if isinstance(item, Block):
+                    if item.sensor in self._absent:
+                        yield self._identified(item)
+                    if item.sensor in self._refused:
+                        continue
+                    rate = self._link.streams.sampling_rate(item.sensor)
+                    longest = max(longest, item.n_samples / (rate or 1.0))
+                yield item
+            patience = 2 * longest + MARGIN
+            try:
+                async with asyncio.timeout(patience):
+                    found = await self._link.receive()
+            except TimeoutError as error:
+                raise NoAnswerError(
+                    f"{self._label}: nothing came for {patience:g} s;"
+                    f" expected a block at least every {longest:g} s"
+                ) from error
+
+    def _identified(self, first: Block) -> Event:
+        """See who it is that was not there at the beginning: another device is left out."""
+        self._absent.discard(first.sensor)
+        try:
+            self._identify(first.sensor)
+        except WrongDeviceError as error:
+            self._refused.add(first.sensor)
+            return Event(first.sensor, "refused", str(error)[:200], first.received)
+        return Event(first.sensor, "connected", "its streams come now", first.received)
+
+
+class GuralpDriver:
+    """See :class:`daq.drivers.interface.DriverType`."""
+
+    name = "guralp"
+    summary = "Güralp digitizer: GCF over a serial line, or from a Scream server (UDP, TCP)"
+    settings = GuralpSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return int32."""
+        return np.dtype(np.int32)
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.interface.Checking.check`."""
+        _configured(sensors)
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[GuralpSession]:
+        """Open the port and listen until every stream has been heard."""
+        first = sensors[0]
+        settings = GuralpSettings.model_validate(first.settings)
+        names = ", ".join(repr(sensor.name) for sensor in sensors)
+        label = f"sensor {names} on {first.port}"
+        ids = _configured(sensors)
+        async with open_link(first.port, settings, clock, ids, label=label) as link:
+            heard: list[Block | Event] = []
+            if not ids[first.name]:
+                await _discover(link, first, settings, label, heard)
+            by_name = {sensor.name: sensor for sensor in sensors}
+            yield GuralpSession(
+                link,
+                label=label,
+                information=await _listen(link, sensors, settings, label, heard),
+                heard=heard,
+                identify=lambda name: _identity(link.streams, by_name[name], label),
+            )
+
+
+def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
+    """Return the streams of each sensor; of the only one perhaps none, which are to be found."""
+    every = {s.name: GuralpSettings.model_validate(s.settings) for s in sensors}
+    require_address(sensors[0])
+    require_alike(sensors, every, GuralpSettings.model_fields.keys() - {"streams", "system_id"})
+    ids: dict[str, tuple[str, ...]] = {}
+    taken: dict[str, str] = {}
+    for sensor in sensors:
+        settings = every[sensor.name]
+        if settings.streams is None and len(sensors) == 1:
+            return {sensor.name: ()}
+        if settings.streams is None or len(settings.streams) != len(sensor.channels):
+            raise BenchFileError(
+                f"sensor {sensor.name!r}: settings.streams = {settings.streams};"
+                f" expected a stream ID for each of its {len(sensor.channels)} channels"
+            )
+        for stream in settings.streams:
+            if stream in taken:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: settings.streams: {stream} is already of a channel of"
+                    f" {taken[stream]!r}"
+                )
+            taken[stream] = sensor.name
+        ids[sensor.name] = settings.streams
+    return ids
+
+
+async def _discover(
+    link: Link,
+    sensor: Sensor,
+    settings: GuralpSettings,
+    label: str,
+    heard: list[Block | Event],
+) -> None:
+    """Listen until one digitizer has sent as many streams as the sensor has channels."""
+    n_channels = len(sensor.channels)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(settings.patience):
+            while True:
+                found = await link.receive()
+                heard += [
+                    replace(item, sensor=sensor.name) for item in found if isinstance(item, Event)
+                ]
+                if not link.streams.repeated:
+                    continue
+                by_serial: dict[str, list[str]] = {}
+                for stream in link.streams.unknown:
+                    by_serial.setdefault(serial_number(stream), []).append(stream)
+                for streams in by_serial.values():
+                    if len(streams) == n_channels:
+                        heard += link.streams.found(sensor.name, sorted(streams, key=_component))
+                        return
+    streams_heard = ", ".join(sorted(link.streams.unknown)) or "nothing"
+    raise NoAnswerError(
+        f"{label}: expected {n_channels} streams of one digitizer, heard {streams_heard} in"
+        f" {settings.patience:g} s; say which with settings.streams"
+    )
+
+
+def _component(stream: str) -> tuple[int, str]:
+    return COMPONENTS.find(component(stream)) % (len(COMPONENTS) + 1), stream
+
+
+async def _listen(
+    link: Link,
+    sensors: Sequence[Sensor],
+    settings: GuralpSettings,
+    label: str,
+    heard: list[Block | Event],
+) -> tuple[DeviceInformation, ...]:
+    """Listen until every stream has come; return what the blocks say.
+
+    Where one sensor of several does not come, the others go on without it: it may come later.
+    """
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(settings.patience):
+            while link.streams.silent:
+                heard += await link.receive()
+    information = []
+    for sensor in sensors:
+        silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)
+        if not silent:
+            information.append(_identity(link.streams, sensor, label))
+            continue
+        others = ", ".join(sorted(link.streams.unknown)) or "no other"
+        trouble = (
+            f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} did not come within"
+            f" {settings.patience:g} s; heard {others}"
+        )
+        information.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
+    if all(one.trouble for one in information):
+        raise NoAnswerError(information[0].trouble)
+    return tuple(information)
+
+
+def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation:
+    ids = streams.stream_ids(sensor.name)
+    rate = streams.sampling_rate(sensor.name)
+    system = streams.system(sensor.name)
+    wanted = GuralpSettings.model_validate(sensor.settings).system_id
+    for what, expected, found in (
+        ("serial number", sensor.serial_number, serial_number(ids[0])),
+        ("system ID", wanted, system),
+    ):
+        if expected and expected != found:
+            raise WrongDeviceError(f"{label}: expected {what} {expected!r}, got {found!r}")
+    if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-9:
+        raise WrongDeviceError(
+            f"{label}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz; set the digitizer, or"
+            " sampling_rate"
+        )
+    return DeviceInformation(
+        sensor=sensor.name,
+        model="Güralp digitizer",
+        serial_number=serial_number(ids[0]),
+        sampling_rate=rate,
+        details={"system ID": system, "streams": ", ".join(ids)},
+    )
+
+
+DRIVER = GuralpDriver()

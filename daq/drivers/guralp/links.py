@@ -1,0 +1,191 @@
+"""The ways to GCF blocks: a serial line, a Scream server over TCP, or one over UDP.
+
+A link receives, has what came decoded, and says what has to be said to the other end: replies to
+blocks on a serial line, requests for packets that were lost over UDP.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Protocol
+
+from daq.protocols.block import Block, Event
+from daq.protocols.guralp import scream
+from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
+from daq.protocols.guralp.gcf import BLOCK_SIZE
+from daq.transport.address import host_and_port
+from daq.transport.ports import open_port
+from daq.transport.udp import open_datagrams
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from daq.drivers.guralp.settings import GuralpSettings
+    from daq.host_clock import HostClock
+    from daq.protocols.block import HostTime
+    from daq.protocols.guralp.streams import Streams
+    from daq.transport.byte_stream import ByteStream
+    from daq.transport.udp import DatagramStream
+
+SEND_INTERVAL = 10.0
+"""Between two requests to go on sending, s."""
+RECOVERY_TIMEOUT = 2.0
+FIRST_RETRY, LONGEST_RETRY = 5.0, 300.0
+"""After a recovery that failed, when the next is tried, s; twice as long after each."""
+
+
+class Link(Protocol):
+    """One way to blocks."""
+
+    @property
+    def streams(self) -> Streams:
+        """What has been heard."""
+        ...
+
+    async def receive(self) -> list[Block | Event]:
+        """Wait for what comes next, and say what is to be said to it."""
+        ...
+
+
+class _SerialLink:
+    def __init__(
+        self, stream: ByteStream, ids: dict[str, tuple[str, ...]], *, replies: bool
+    ) -> None:
+        self._stream = stream
+        self._decoder = SerialDecoder(ids, replies=replies)
+
+    @property
+    def streams(self) -> Streams:
+        return self._decoder.streams
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        found = self._decoder.receive(received, at)
+        replies = self._decoder.take_replies()
+        if replies:
+            await self._stream.write(replies)
+        return found
+
+
+class _TcpLink:
+    def __init__(self, stream: ByteStream, ids: dict[str, tuple[str, ...]]) -> None:
+        self._stream = stream
+        self._decoder = ScreamDecoder(ids, patience=0)  # in order, or lost before
+
+    @property
+    def streams(self) -> Streams:
+        return self._decoder.streams
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        return self._decoder.receive(received, at)
+
+
+class _UdpLink:
+    def __init__(
+        self,
+        stream: DatagramStream,
+        ids: dict[str, tuple[str, ...]],
+        clock: HostClock,
+        recovery: tuple[str, int] | None,
+    ) -> None:
+        self._stream = stream
+        self._clock = clock
+        self._recovery = recovery
+        self._delay = FIRST_RETRY
+        self._retry_ns: int | None = None  # where the last recovery failed
+        self._name = next(iter(ids)) if len(ids) == 1 else ""
+        self._decoder = ScreamDecoder(ids)
+
+    @property
+    def streams(self) -> Streams:
+        return self._decoder.streams
+
+    async def receive(self) -> list[Block | Event]:
+        received, at = await self._stream.read()
+        found = self._decoder.receive_datagram(received, at)
+        due = self._retry_ns is None or at.monotonic_ns >= self._retry_ns
+        if self._decoder.missing and self._recovery is not None and due:
+            found += await self._recover(self._recovery, at)
+        return found
+
+    async def _recover(self, where: tuple[str, int], at: HostTime) -> list[Block | Event]:
+        """Ask for missing packets over TCP; where that fails, not again for a while."""
+        found: list[Block | Event] = []
+        try:
+            async with asyncio.timeout(RECOVERY_TIMEOUT):
+                reader, writer = await asyncio.open_connection(*where)
+                try:
+                    for number in self._decoder.missing:
+                        writer.write(scream.TCP_AGAIN + number.to_bytes(2, "big"))
+                        data = await _packet(reader)
+                        if data is None:
+                            self._decoder.not_available(number)
+                        else:
+                            found += self._decoder.receive_datagram(data, self._clock.now())
+                finally:
+                    writer.close()
+                    await writer.wait_closed()
+        except (OSError, TimeoutError, asyncio.IncompleteReadError) as error:
+            why = str(error) or "no answer"
+            text = f"no recovery of lost packets over TCP, again in {self._delay:g} s: {why}"
+            self._retry_ns = at.monotonic_ns + round(self._delay * 1e9)
+            self._delay = min(2 * self._delay, LONGEST_RETRY)
+            return [*found, Event(self._name, "status", text[:200], at)]
+        if self._retry_ns is not None:
+            text = "lost packets are recovered over TCP again"
+            found.append(Event(self._name, "status", text, at))
+        self._retry_ns, self._delay = None, FIRST_RETRY
+        return found
+
+
+async def _packet(reader: asyncio.StreamReader) -> bytes | None:
+    """Read one packet of a Scream server over TCP, None where it no longer has it."""
+    start = await reader.readexactly(4)
+    if start == scream.NOT_AVAILABLE:
+        return None
+    data = start + await reader.readexactly(BLOCK_SIZE + 1 - len(start))
+    size = scream.SIZES.get(data[-1], len(data))
+    return data + await reader.readexactly(size - len(data))
+
+
+@contextlib.asynccontextmanager
+async def open_link(
+    port: str,
+    settings: GuralpSettings,
+    clock: HostClock,
+    ids: dict[str, tuple[str, ...]],
+    *,
+    label: str,
+) -> AsyncIterator[Link]:
+    """Open a port; yield a link that joins the streams of each sensor."""
+    if port.startswith("udp://"):
+        async with open_datagrams(port, clock, listen=False, label=label) as datagrams:
+            host, number = host_and_port(port)
+            recovery = number if settings.recovery_port is None else settings.recovery_port
+            asking = asyncio.create_task(_keep_asking(datagrams), name=label)
+            try:
+                yield _UdpLink(datagrams, ids, clock, (host, recovery) if recovery else None)
+            finally:
+                await _stop_asking(asking, datagrams)
+        return
+    async with open_port(port, clock, label=label, baud_rate=settings.baud_rate) as stream:
+        if settings.link == "scream":
+            await stream.write(scream.TCP_SEND)
+            yield _TcpLink(stream, ids)
+        else:
+            yield _SerialLink(stream, ids, replies=settings.acknowledge)
+
+
+async def _keep_asking(stream: DatagramStream) -> None:
+    while True:
+        stream.send(scream.SEND)
+        await asyncio.sleep(SEND_INTERVAL)
+
+
+async def _stop_asking(asking: asyncio.Task[None], stream: DatagramStream) -> None:
+    asking.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await asking
+    stream.send(scream.STOP)

@@ -1,0 +1,1 @@
+"""LabJack T7 and T8."""

@@ -1,0 +1,376 @@
+"""Identify a LabJack and set it up: its settings in the bench file, its registers on the wire."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+from urllib.parse import urlsplit
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+)
+
+from daq.drivers.interface import DeviceInformation
+from daq.drivers.port_rules import require_alike
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.labjack import registers as reg
+from daq.protocols.labjack import stream as labjack
+from daq.protocols.labjack.registers import Adu, AduFinder, Calibration, Read, Write
+from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
+from daq.transport.address import host_and_port
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.bench.model import Sensor
+    from daq.protocols.block import HostTime
+    from daq.protocols.labjack.registers import Command
+    from daq.transport.byte_stream import ByteStream
+
+REPLY_TIMEOUT = 2.0
+PACKETS_PER_SECOND = 10
+PRODUCTS = {7.0: "T7", 8.0: "T8"}
+MODBUS_PORT = 502
+OWN = ("inputs", "range", "negative_inputs")
+"""Settings of a sensor; the others are of the stream, and taken from the port's first sensor."""
+BUFFERS = {"T7": 32768, "T8": 262144}
+
+
+def _input_number(value: object) -> object:
+    text = str(value).upper().removeprefix("AIN")
+    return int(text) if text.isdigit() else value
+
+
+def _range(value: float) -> float:
+    if value not in reg.GAINS:
+        raise ValueError(f"expected one of {', '.join(f'{volts:g}' for volts in reg.GAINS)} V")
+    return value
+
+
+def _power_of_two(value: int) -> int:
+    if value.bit_count() != 1:
+        raise ValueError("expected a power of 2")
+    return value
+
+
+Input = Annotated[int, BeforeValidator(_input_number), Field(ge=0, le=254)]
+
+
+class LabJackSettings(BaseModel):
+    """``[sensors.settings]`` of a sensor on a LabJack; ``inputs`` and ranges are the sensor's own.
+
+    What concerns the stream as a whole is taken from the port's first sensor.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    inputs: tuple[Input, ...] | None = None
+    """The analog input of each channel, such as ``["AIN0", "AIN1", "AIN2"]``; if not given, those
+    that follow the inputs of the port's sensors before."""
+    range: Annotated[float, AfterValidator(_range)] = 10.0
+    """Of the inputs, in volts, peak (T7)."""
+    negative_inputs: tuple[Input, ...] | None = None
+    """Of differential inputs, one for each channel; single-ended, if not given."""
+    resolution_index: Annotated[int, Field(ge=0, le=16)] = 0
+    settling_us: NonNegativeFloat = 0.0
+    mode: Literal["spontaneous", "command-response"] = "spontaneous"
+    stream_port: Annotated[int, Field(gt=0, le=65535)] = 702
+    samples_per_packet: Annotated[int, Field(gt=0, le=512)] | None = None
+    buffer_bytes: Annotated[int, Field(gt=0), AfterValidator(_power_of_two)] | None = None
+    """A power of 2; the largest the model has, if not given."""
+    core_timer: bool = True
+    external_clock_divisor: Annotated[int, Field(gt=0)] | None = None
+    """Scan on an external clock, divided by this; internal, if not given."""
+    trigger_index: NonNegativeInt = 0
+    """What starts the stream; 0: at once."""
+
+
+class Registers:
+    """One connection to port 502."""
+
+    def __init__(self, stream: ByteStream) -> None:
+        self._stream = stream
+        self._finder = AduFinder()
+        self._transaction = 0
+
+    @property
+    def label(self) -> str:
+        """Name sensors and port, for error messages."""
+        return self._stream.label
+
+    async def exchange(self, *commands: Command) -> tuple[bytes, HostTime]:
+        """Do several reads and writes at once; return what was read, and when it came."""
+        self._transaction = (self._transaction + 1) % 65536
+        request = Adu(self._transaction, 255, reg.encode_feedback(commands))
+        await self._stream.write(reg.encode_adu(request))
+        size = sum(2 * c.n_registers for c in commands if isinstance(c, Read))
+        try:
+            async with asyncio.timeout(REPLY_TIMEOUT):
+                while True:
+                    received, at = await self._stream.read()
+                    for adu in self._finder.receive(received):
+                        if adu.transaction == self._transaction:  # else a late reply
+                            return reg.feedback_values(adu.pdu, size), at
+        except TimeoutError as error:
+            raise NoAnswerError(
+                f"{self.label}: no reply of the device within {REPLY_TIMEOUT:g} s"
+            ) from error
+
+    async def do(self, doing: str, *commands: Command) -> bytes:
+        """Exchange, and say what the device refused and why."""
+        try:
+            return (await self.exchange(*commands))[0]
+        except RemoteProtocolError as error:
+            reason = await self.reason()
+            raise WrongDeviceError(f"{self.label}: {doing}: {error}{reason}") from error
+
+    async def reason(self) -> str:
+        """Return what the device says about its last refusal."""
+        with contextlib.suppress(RemoteProtocolError):
+            values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 1))
+            return f", reason {int.from_bytes(values, 'big')}"
+        return ""
+
+    async def real(self, address: int) -> float:
+        """Read a FLOAT32."""
+        values = await self.do(f"reading register {address}", Read(address, 2))
+        return float(struct.unpack(">f", values)[0])
+
+    async def stop_stream(self) -> None:
+        """End the stream, if one runs."""
+        with contextlib.suppress(RemoteProtocolError):  # 2620: none runs
+            await self.exchange(long(reg.STREAM_ENABLE, 0))
+
+
+def long(address: int, value: int) -> Write:
+    """Write a UINT32."""
+    return Write(address, value.to_bytes(4, "big"))
+
+
+def real(address: int, value: float) -> Write:
+    """Write a FLOAT32."""
+    return Write(address, struct.pack(">f", value))
+
+
+def exact(rate: float) -> float:
+    """Return the rate whose interval is a whole number of the device's ticks: FLOAT32 rounds."""
+    return reg.CORE_HZ / max(1, round(reg.CORE_HZ / rate))
+
+
+def address_of(sensor: Sensor) -> tuple[str, int]:
+    """Return host and port number of a device."""
+    url = sensor.port if "://" in sensor.port else f"modbus-tcp://{sensor.port}"
+    try:
+        if urlsplit(url).port is None:
+            url = f"{url}:{MODBUS_PORT}"
+        host, number = host_and_port(url)
+    except ValueError as error:
+        raise BenchFileError(
+            f"sensor {sensor.name!r}: port = {sensor.port!r}; expected modbus-tcp://host, or"
+            " modbus-tcp://host:port"
+        ) from error
+    return f"[{host}]" if ":" in host else host, number
+
+
+def inputs_of(
+    sensors: Sequence[Sensor], settings: dict[str, LabJackSettings]
+) -> dict[str, tuple[int, ...]]:
+    """Return the analog inputs of each sensor's channels.
+
+    Raises
+    ------
+    BenchFileError
+        An input is given twice, or not one for each channel; or sensors differ in what is common.
+    """
+    require_alike(sensors, settings, LabJackSettings.model_fields.keys() - OWN)
+    inputs: dict[str, tuple[int, ...]] = {}
+    taken: dict[int, str] = {}
+    for sensor in sensors:
+        own = settings[sensor.name]
+        n_channels = len(sensor.channels)
+        numbers = own.inputs
+        if numbers is None:
+            numbers = tuple(range(len(taken), len(taken) + n_channels))
+        for what, given in (("inputs", numbers), ("negative_inputs", own.negative_inputs)):
+            if given is not None and len(given) != n_channels:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: settings.{what} = {list(given)};"
+                    f" expected one for each of its {n_channels} channels"
+                )
+        for number in numbers:
+            if number in taken:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: AIN{number} is already an input of {taken[number]!r}"
+                )
+            taken[number] = sensor.name
+        if sensor.sampling_rate != sensors[0].sampling_rate:
+            raise BenchFileError(
+                f"sensor {sensor.name!r}: sampling_rate = {sensor.sampling_rate:g}; expected"
+                f" {sensors[0].sampling_rate:g}, as of all sensors on port {sensor.port}"
+            )
+        inputs[sensor.name] = numbers
+    for sensor in sensors:
+        for number in settings[sensor.name].negative_inputs or ():
+            if number in taken:
+                raise BenchFileError(
+                    f"sensor {sensor.name!r}: AIN{number} is a negative input, and already an input"
+                    f" of {taken[number]!r}"
+                )
+    return inputs
+
+
+async def identify(
+    registers: Registers, sensors: Sequence[Sensor]
+) -> tuple[str, DeviceInformation]:
+    """Return which product it is and what it says about itself; refuse it if it is another."""
+    values = await registers.do(
+        "identifying",
+        Read(reg.TEST, 2),
+        Read(reg.PRODUCT_ID, 2),
+        Read(reg.FIRMWARE_VERSION, 2),
+        Read(reg.SERIAL_NUMBER, 2),
+        Read(reg.TEMPERATURE_DEVICE_K, 2),
+    )
+    test, product_id, firmware, serial, kelvin = struct.unpack(">IffIf", values)
+    product = PRODUCTS.get(product_id)
+    if test != reg.TEST_VALUE or product is None:
+        raise WrongDeviceError(
+            f"{registers.label}: expected a T7 or T8 (test {reg.TEST_VALUE:08X}, product 7 or 8),"
+            f" got test {test:08X}, product {product_id:g}"
+        )
+    for sensor in sensors:
+        if sensor.serial_number and sensor.serial_number != str(serial):
+            raise WrongDeviceError(
+                f"{registers.label}: expected serial number {sensor.serial_number!r}, got"
+                f" '{serial}'"
+            )
+    return product, DeviceInformation(
+        sensor=sensors[0].name,
+        model=f"LabJack {product}",
+        serial_number=str(serial),
+        firmware=f"{firmware:.4f}",
+        temperature=round(kelvin - 273.15, 2),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Uptime:
+    """What the device's 32-bit timer of 20 Hz stood at, and when.
+
+    It wraps in 6.8 years only. (LabJack does not say where it begins; here it need not be known.)
+    """
+
+    ticks: int
+    at: HostTime
+
+    def went_on_until(self, later: Uptime) -> bool:
+        """Whether the device was not restarted until ``later``: its timer went on meanwhile."""
+        elapsed = (later.at.monotonic_ns - self.at.monotonic_ns) * 1e-9
+        went_on = (later.ticks - self.ticks) % (1 << 32) / reg.SYSTEM_HZ
+        return abs(went_on - elapsed) <= SLACK + CLOCK_TOLERANCE * elapsed
+
+
+async def read_uptime(registers: Registers) -> Uptime | None:
+    """Read the timer that tells a restart; None of a device that has none."""
+    with contextlib.suppress(RemoteProtocolError):
+        values, at = await registers.exchange(Read(reg.SYSTEM_TIMER_20HZ, 2))
+        return Uptime(int.from_bytes(values, "big"), at)
+    return None
+
+
+async def set_inputs(
+    registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
+) -> None:
+    """Set the range and the negative side of a sensor's inputs."""
+    negative = settings.negative_inputs or (reg.SINGLE_ENDED,) * len(numbers)
+    for number, other in zip(numbers, negative, strict=True):
+        commands: list[Command] = [real(reg.AIN_RANGE + 2 * number, settings.range)]
+        if product == "T7":  # the T8's inputs are differential, each with a ground of its own
+            commands.append(Write(reg.AIN_NEGATIVE_CHANNEL + number, other.to_bytes(2, "big")))
+        await registers.do(f"setting AIN{number}", *commands)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamPlan:
+    """What is to be scanned, and how."""
+
+    scan_list: tuple[int, ...]
+    rate: float
+    packet_size: int
+
+
+def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: float) -> StreamPlan:
+    """Plan the stream of all sensors' inputs."""
+    timer = labjack.TIMER_ADDRESSES if settings.core_timer else ()
+    scan_list = (*timer, *(reg.ain(n) for numbers in inputs.values() for n in numbers))
+    if len(scan_list) > 128:
+        raise BenchFileError(f"{len(scan_list)} addresses to scan; a LabJack scans at most 128")
+    n_columns = len(scan_list)
+    scans = max(1, min(labjack.MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
+    return StreamPlan(scan_list, rate, settings.samples_per_packet or scans * n_columns)
+
+
+async def set_stream(
+    registers: Registers, settings: LabJackSettings, stream: StreamPlan, product: str
+) -> float:
+    """Set the stream up; return the scan rate the device makes, in Hz."""
+    command_response = settings.mode == "command-response"
+    target = reg.TARGET_COMMAND_RESPONSE if command_response else reg.TARGET_ETHERNET
+    divisor = settings.external_clock_divisor
+    await registers.do(
+        "setting up the stream",
+        real(reg.STREAM_SCANRATE_HZ, stream.rate),
+        long(reg.STREAM_NUM_ADDRESSES, len(stream.scan_list)),
+        long(reg.STREAM_SAMPLES_PER_PACKET, stream.packet_size),
+        real(reg.STREAM_SETTLING_US, settings.settling_us),
+        long(reg.STREAM_RESOLUTION_INDEX, settings.resolution_index),
+        long(reg.STREAM_BUFFER_SIZE_BYTES, settings.buffer_bytes or BUFFERS[product]),
+        long(reg.STREAM_CLOCK_SOURCE, 0 if divisor is None else 2),
+        long(reg.STREAM_AUTO_TARGET, target),
+        long(reg.STREAM_DATATYPE, 0),
+        long(reg.STREAM_NUM_SCANS, 0),
+        long(reg.STREAM_EXTERNAL_CLOCK_DIVISOR, divisor or 1),
+        long(reg.STREAM_TRIGGER_INDEX, settings.trigger_index),
+    )
+    for start in range(0, len(stream.scan_list), 32):
+        values = b"".join(a.to_bytes(4, "big") for a in stream.scan_list[start : start + 32])
+        await registers.do("setting the scan list", Write(reg.STREAM_SCANLIST + 2 * start, values))
+    return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
+
+
+async def read_calibrations(registers: Registers, product: str) -> tuple[Calibration, ...]:
+    """Return what the flash of a T7 holds, nothing for a T8."""
+    if product != "T7":
+        return ()
+    flash = await registers.do(
+        "reading the calibration",
+        long(reg.FLASH_READ_POINTER, reg.CALIBRATION_ADDRESS),
+        Read(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
+    )
+    return reg.decode_calibrations(flash)
+
+
+def details_of(
+    settings: LabJackSettings,
+    inputs: tuple[int, ...],
+    calibrations: tuple[Calibration, ...],
+) -> dict[str, str]:
+    """Return what is to be told of a sensor's inputs: their range and calibration."""
+    details = {"inputs": ", ".join(f"AIN{number}" for number in inputs)}
+    details["range"] = f"±{settings.range:g} V"
+    if calibrations:
+        calibration = calibrations[list(reg.GAINS).index(settings.range)]
+        details["counts per volt"] = f"{1 / calibration.positive_slope:.4f}"
+        details["counts per volt, negative"] = f"{-1 / calibration.negative_slope:.4f}"
+        details["counts at 0 V"] = f"{calibration.center:g}"
+    return details

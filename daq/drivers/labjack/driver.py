@@ -1,0 +1,269 @@
+"""Driver for LabJack T7 and T8 digitizers, which stream analog inputs over Ethernet.
+
+All sensors of one port share the device: each says with ``inputs`` which of its channels is which
+analog input, and one scan list holds them all, so they are sampled by one clock and their samples
+have the same indices.
+
+What is recorded are the converter's counts (uint16), as they come. The device's calibration is read
+from its flash and told (``DeviceInformation.details``): counts per volt of each range. A channel's
+``sensitivity`` in the bench file is that times the sensor's volts per unit; at ±10 V the nominal
+3166.5 counts/V make 3166.5 × 1.27 for a sensor of 1.27 V/(m/s²). The centre of the converter (33523
+counts) is an offset like any other. The T8 does not show its calibration.
+
+The device has few sockets: one on port 502 does everything but spontaneous streams, by function 76.
+With ``core_timer`` the scan list leads with the device's 40 MHz clock, so that gaps are counted
+exactly. A stream that breaks off (2942, 2943, 2945) is started anew. So is that of a device that
+was lost; what went missing is counted by the same clock, unless the device was restarted meanwhile,
+which its slower timer tells (SYSTEM_TIMER_20HZ).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.drivers.labjack import device as setup
+from daq.drivers.labjack.device import LabJackSettings, Registers, StreamPlan, Uptime
+from daq.errors import DeviceError, NoAnswerError
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.labjack import registers as reg
+from daq.protocols.labjack import stream as labjack
+from daq.protocols.labjack.registers import Read
+from daq.protocols.labjack.stream import StreamDecoder
+from daq.transport.ports import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+    from contextlib import AbstractAsyncContextManager
+
+    from daq.bench.model import Sensor
+    from daq.drivers.interface import DeviceInformation, Session
+    from daq.host_clock import HostClock
+    from daq.protocols.block import Block, Event
+
+STALLED = 3.0
+"""Beyond two packets, how long nothing may come, s."""
+POLL_INTERVAL = 0.05
+"""Between two reads of a stream by command, s, once it has been read up."""
+MOST_RESTARTS = 3
+"""Of a stream that breaks off with its first packet."""
+
+
+class LabJackSession:
+    """A digitizer whose scan list is set."""
+
+    def __init__(
+        self,
+        registers: Registers,
+        settings: LabJackSettings,
+        decoder: StreamDecoder,
+        *,
+        information: tuple[DeviceInformation, ...],
+        clock: HostClock,
+        stream_address: str,
+        packet_seconds: float,
+        uptime: Uptime | None,
+        resumed: bool,
+    ) -> None:
+        self.information = information
+        self.decoder = decoder
+        self.uptime = uptime
+        self.resumed = resumed
+        """Whether blocks go on in the index of the session before."""
+        self._registers = registers
+        self._settings = settings
+        self._clock = clock
+        self._stream_address = stream_address
+        self._patience = STALLED + 2 * packet_seconds
+
+    @property
+    def recovers(self) -> bool:
+        """Whether no samples need come for now: the buffer has overflowed, and the device goes on.
+
+        Who supervises decides how long that may take (:mod:`daq.acquisition.stall_detector`).
+        """
+        return self.decoder.recovers
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Start the stream and yield its blocks; start it anew where it breaks off."""
+        if self._settings.mode == "command-response":
+            received = self._by_command()
+        else:
+            received = self._spontaneous()
+        fruitless = 0
+        async with contextlib.aclosing(received):
+            async for items in received:
+                for item in items:
+                    yield item
+                if self.decoder.fatal is None:
+                    fruitless = 0 if items else fruitless
+                    continue
+                fruitless += 1
+                if fruitless > MOST_RESTARTS:
+                    why = labjack.FATAL[self.decoder.fatal]
+                    raise DeviceError(f"{self._registers.label}: the stream does not go on: {why}")
+                await self._registers.stop_stream()
+                self.decoder.restart()
+                await self._start()
+
+    async def _start(self) -> None:
+        await self._registers.do("starting the stream", setup.long(reg.STREAM_ENABLE, 1))
+
+    async def _spontaneous(self) -> AsyncGenerator[list[Block | Event]]:
+        label = self._registers.label
+        async with open_port(self._stream_address, self._clock, label=label) as stream:
+            await self._start()
+            while True:
+                try:
+                    async with asyncio.timeout(None if self.recovers else self._patience):
+                        received, at = await stream.read()
+                except TimeoutError as error:
+                    raise NoAnswerError(
+                        f"{label}: no samples for {self._patience:g} s from {self._stream_address}"
+                    ) from error
+                yield self.decoder.receive(received, at)
+
+    async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
+        await self._start()
+        silent_since = self._clock.now().monotonic_ns
+        read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
+        while True:
+            try:
+                values, at = await self._registers.exchange(read)
+            except RemoteProtocolError as error:
+                reason = await self._registers.reason()
+                raise DeviceError(
+                    f"{self._registers.label}: reading the stream: {error}{reason}"
+                ) from error
+            packet = labjack.decode_response(values)
+            if len(packet.samples) or packet.status == labjack.AUTO_RECOVER_ACTIVE:
+                silent_since = at.monotonic_ns
+            elif (at.monotonic_ns - silent_since) * 1e-9 > self._patience:
+                raise NoAnswerError(
+                    f"{self._registers.label}: no samples for {self._patience:g} s in register"
+                    f" {reg.STREAM_DATA_CR}"
+                )
+            yield self.decoder.receive_response(packet, at)
+            if len(packet.samples) < labjack.MAX_CR_SAMPLES:
+                await asyncio.sleep(POLL_INTERVAL)
+
+
+class LabJackDriver:
+    """See :class:`daq.drivers.interface.DriverType`."""
+
+    name = "labjack"
+    summary = "LabJack T7 or T8: analog inputs streamed over Ethernet, several sensors on one"
+    settings = LabJackSettings
+    shares_clock = True
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return uint16."""
+        return np.dtype(np.uint16)
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.interface.Checking.check`."""
+        _Planned.of(sensors)
+
+    def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AbstractAsyncContextManager[LabJackSession]:
+        """Connect, identify, read the calibration and set the stream up."""
+        return _opened(sensors, clock, None)
+
+    def resume(
+        self, sensors: Sequence[Sensor], clock: HostClock, before: Session
+    ) -> AbstractAsyncContextManager[LabJackSession]:
+        """Do the same; count on where the session before ended, if the device went on meanwhile."""
+        return _opened(sensors, clock, before if isinstance(before, LabJackSession) else None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """What the bench file says of one device."""
+
+    settings: dict[str, LabJackSettings]
+    inputs: dict[str, tuple[int, ...]]
+    stream: StreamPlan
+    address: tuple[str, int]
+
+    @classmethod
+    def of(cls, sensors: Sequence[Sensor]) -> _Planned:
+        first = sensors[0]
+        settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
+        inputs = setup.inputs_of(sensors, settings)
+        stream = setup.plan(settings[first.name], inputs, first.sampling_rate)
+        return cls(settings, inputs, stream, setup.address_of(first))
+
+
+@contextlib.asynccontextmanager
+async def _opened(
+    sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
+) -> AsyncIterator[LabJackSession]:
+    first = sensors[0]
+    planned = _Planned.of(sensors)
+    settings, inputs, stream_plan = planned.settings, planned.inputs, planned.stream
+    common, (host, number) = settings[first.name], planned.address
+    names = ", ".join(repr(sensor.name) for sensor in sensors)
+    label = f"sensor {names} on {first.port}"
+    async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
+        registers = Registers(stream)
+        product, identity = await setup.identify(registers, sensors)
+        uptime = await setup.read_uptime(registers)
+        await registers.stop_stream()
+        try:
+            for name, numbers in inputs.items():
+                await setup.set_inputs(registers, numbers, settings[name], product)
+            rate = await setup.set_stream(registers, common, stream_plan, product)
+            calibrations = await setup.read_calibrations(registers, product)
+            information = tuple(
+                replace(
+                    identity,
+                    sensor=name,
+                    sampling_rate=rate,
+                    details=setup.details_of(settings[name], numbers, calibrations),
+                )
+                for name, numbers in inputs.items()
+            )
+            decoder = StreamDecoder(
+                {name: [reg.ain(n) for n in numbers] for name, numbers in inputs.items()},
+                scan_list=stream_plan.scan_list,
+                scan_rate=rate,
+            )
+            resumed = before is not None and _goes_on(before, uptime, information)
+            if before is not None and resumed:
+                decoder = before.decoder
+                decoder.restart()
+            yield LabJackSession(
+                registers,
+                common,
+                decoder,
+                information=information,
+                clock=clock,
+                stream_address=f"socket://{host}:{common.stream_port}",
+                packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
+                uptime=uptime,
+                resumed=resumed,
+            )
+        finally:
+            with contextlib.suppress(DeviceError, RemoteProtocolError):
+                await registers.stop_stream()
+
+
+def _goes_on(
+    before: LabJackSession, uptime: Uptime | None, now: tuple[DeviceInformation, ...]
+) -> bool:
+    """Whether it is the same device at the same rate, and its clock ran on meanwhile."""
+    then = before.information
+    is_same = [(i.serial_number, i.sampling_rate) for i in then] == [
+        (i.serial_number, i.sampling_rate) for i in now
+    ]
+    if not is_same or before.uptime is None or uptime is None:
+        return False
+    return before.decoder.can_go_on and before.uptime.went_on_until(uptime)
+
+
+DRIVER = LabJackDriver()

@@ -1,0 +1,1 @@
+"""Modbus devices: readings in registers, and block FIFOs."""

@@ -1,0 +1,244 @@
+"""Driver for devices with a block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT).
+
+The sampling rate is written to its register, and the reply compared; then the FIFO is read as fast
+as it fills. There is neither a counter nor a time on the device: samples are numbered as they come
+and placed by arrival (:mod:`daq.protocols.modbus.fifo`). Counts are i16; a channel's sensitivity is
+8192 counts/g ÷ 9.80665 = 835.35 counts/(m/s²) by a client's assumption, not by a data sheet.
+
+Public clients disagree on what the first register of a read means, so ``header`` says it. With
+``"left"`` for a device that means ``"size"`` words are asked for that do not wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+
+from daq.drivers.interface import DeviceInformation
+from daq.drivers.port_rules import only
+from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.protocols.modbus import rtu
+from daq.protocols.modbus.fifo import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
+from daq.protocols.modbus.rtu import ReplyFinder
+from daq.transport.ports import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from daq.bench.model import Sensor
+    from daq.host_clock import HostClock
+    from daq.protocols.block import Block, Event
+    from daq.transport.byte_stream import ByteStream
+
+ATTEMPTS = 3
+HIGHEST_RATE = 65_535
+MOST_UNANSWERED = 5
+"""Reads without a reply, one after the other, after which the device is gone."""
+STALLED = 2.0
+"""Without a sample for so long, in s, the device has stopped."""
+NOT_LESS = 3.0
+"""While as many words wait for so long, in s, the FIFO fills as fast as it is read."""
+
+
+class FifoSettings(BaseModel):
+    """``[sensors.settings]`` of a device with a block FIFO."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    baud_rate: PositiveInt = 3_000_000
+    parity: Literal["N", "E", "O"] = "N"
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    header: Literal["size", "left"] = "size"
+    """What the first register of a read means: words that waited, or words left after it."""
+    capacity: PositiveInt | None = None
+    """Words the FIFO holds, where known: a level there means that samples were dropped."""
+    set_rate: bool = True
+    """Whether the sampling rate is written to the device."""
+    poll_interval: PositiveFloat = 0.02
+    """Between two reads, s, once the FIFO has been read up."""
+    timeout: PositiveFloat = 0.3
+    """How long a reply may take, s."""
+
+
+class FifoSession:
+    """A device that samples into its FIFO."""
+
+    def __init__(
+        self,
+        stream: ByteStream,
+        settings: FifoSettings,
+        decoder: FifoDecoder,
+        *,
+        information: DeviceInformation,
+        clock: HostClock,
+    ) -> None:
+        self.information = (information,)
+        self._stream = stream
+        self._settings = settings
+        self._decoder = decoder
+        self._clock = clock
+
+    async def read(self) -> AsyncIterator[Block | Event]:
+        """Read the FIFO and yield its blocks."""
+        loop = asyncio.get_running_loop()
+        unanswered, fed = 0, loop.time()
+        least, lessened = math.inf, loop.time()
+        while True:
+            items, answered = await self._once()
+            for item in items:
+                yield item
+            unanswered = 0 if answered else unanswered + 1
+            if unanswered > MOST_UNANSWERED:
+                raise NoAnswerError(f"{self._stream.label}: {unanswered} reads without a reply")
+            if (items and answered) or self._decoder.level:
+                fed = loop.time()
+            elif loop.time() - fed > STALLED:
+                raise NoAnswerError(
+                    f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
+                )
+            level = self._decoder.level or math.inf  # none is known before a first reply
+            if self._decoder.started or level < least or least == math.inf:
+                least, lessened = level, loop.time()
+            elif loop.time() - lessened > NOT_LESS:
+                raise NoAnswerError(
+                    f"{self._stream.label}: the FIFO is never read up, {self._decoder.level} words"
+                    " wait: the link is too slow for the sampling rate (a higher"
+                    " settings.baud_rate on both ends, or a lower rate)"
+                )
+            if self._decoder.level < MAX_WORDS:
+                await asyncio.sleep(self._settings.poll_interval)
+
+    async def _once(self) -> tuple[list[Block | Event], bool]:
+        """Read once; return what came, and whether it was a reply."""
+        decoder, stream = self._decoder, self._stream
+        stream.discard()  # a late reply to an earlier read is none to this one
+        await stream.write(decoder.request())
+        items: list[Block | Event] = []
+        try:
+            async with asyncio.timeout(self._settings.timeout):
+                while decoder.waiting:
+                    received, at = await stream.read()
+                    items += decoder.receive(received, at)
+        except TimeoutError:
+            return [*items, *decoder.timed_out(self._clock.now())], False
+        return items, True
+
+
+class FifoDriver:
+    """See :class:`daq.drivers.interface.DriverType`."""
+
+    name = "fifo"
+    summary = "Block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT vibration units)"
+    settings = FifoSettings
+    shares_clock = False
+
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+        """Return int16."""
+        return np.dtype(np.int16)
+
+    def check(self, sensors: Sequence[Sensor]) -> None:
+        """See :meth:`daq.drivers.interface.Checking.check`."""
+        _checked(sensors)
+
+    @contextlib.asynccontextmanager
+    async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
+        """Open the port, see that the device answers, and set its sampling rate."""
+        sensor, settings = _checked(sensors)
+        async with open_port(
+            sensor.port,
+            clock,
+            label=f"sensor {sensor.name!r} on {sensor.port}",
+            baud_rate=settings.baud_rate,
+            parity=settings.parity,
+        ) as stream:
+            await _set_up(stream, sensor, settings)
+            decoder = FifoDecoder(
+                sensor.name,
+                sensor.sampling_rate,
+                n_channels=len(sensor.channels),
+                header=settings.header,
+                unit=settings.unit,
+                capacity=settings.capacity,
+            )
+            information = DeviceInformation(
+                sensor=sensor.name,
+                model=sensor.model or "block FIFO",
+                sampling_rate=sensor.sampling_rate,
+                details={"unit": str(settings.unit), "header": settings.header},
+            )
+            yield FifoSession(stream, settings, decoder, information=information, clock=clock)
+
+
+def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
+    """Return the sensor and its settings; raise BenchFileError for what cannot be."""
+    sensor = only(sensors, "reading one FIFO takes all of a line")
+    settings = FifoSettings.model_validate(sensor.settings)
+    who, rate = f"sensor {sensor.name!r}", sensor.sampling_rate
+    if settings.set_rate and not 1 <= rate == round(rate) <= HIGHEST_RATE:
+        raise BenchFileError(
+            f"{who}: sampling_rate = {rate:g}; expected whole Hz up to {HIGHEST_RATE}, as the"
+            " device's register holds (or settings.set_rate = false)"
+        )
+    n_channels = len(sensor.channels)
+    samples_a_read = MAX_WORDS // n_channels
+    if not samples_a_read:
+        raise BenchFileError(
+            f"{who}: {n_channels} channels; a read takes {MAX_WORDS} words at most"
+        )
+    bytes_a_sample = 2 * n_channels + READ_OVERHEAD / samples_a_read
+    needed = math.ceil(rate * bytes_a_sample * (10 if settings.parity == "N" else 11))
+    if needed > settings.baud_rate:
+        raise BenchFileError(
+            f"{who}: {rate:g} Hz of {n_channels} channels need {needed} baud;"
+            f" settings.baud_rate = {settings.baud_rate} (or a lower rate)"
+        )
+    return sensor, settings
+
+
+async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:
+    """Set the sampling rate, or read the FIFO's level, until the device answers."""
+    request = rtu.read_request(settings.unit, 2, 1)
+    if settings.set_rate:
+        rate = round(sensor.sampling_rate)
+        request = rtu.write_request(settings.unit, RATE_REGISTER, rate)
+    finder = ReplyFinder()
+    instead = ""
+    for _ in range(ATTEMPTS):
+        stream.discard()
+        finder.expect(request)
+        await stream.write(request)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(settings.timeout):
+                while True:
+                    reply = finder.receive((await stream.read())[0])
+                    if reply is not None:
+                        break
+            if reply.exception is not None:
+                why = rtu.EXCEPTIONS.get(reply.exception, f"exception {reply.exception}")
+                raise WrongDeviceError(
+                    f"{stream.label}: the device refused {_said(settings)}: {why}"
+                )
+            if settings.set_rate and reply.payload != request[2:-2]:
+                raise WrongDeviceError(
+                    f"{stream.label}: set {sensor.sampling_rate:g} Hz, the device says"
+                    f" {int.from_bytes(reply.payload[2:4], 'big')}"
+                )
+            return
+        instead = finder.instead or instead
+    raise NoAnswerError(
+        f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}:"
+        f" {instead or 'nothing came'};"
+        " check cable, power, settings.baud_rate and settings.unit"
+    )
+
+
+def _said(settings: FifoSettings) -> str:
+    return "setting the sampling rate" if settings.set_rate else "reading the FIFO's level"
+
+
+DRIVER = FifoDriver()

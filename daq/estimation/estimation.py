@@ -1,0 +1,387 @@
+"""Keeps an estimate up with recordings as they grow.
+
+Theory of operation
+-------------------
+Segments lie on a fixed lattice of the common grid. One that touches a gap or a clipped block is
+left out, for every sensor, and so is one that something disturbed where that is asked for. Each
+new segment is transformed once, with what is known about the clocks by then. When what is known
+has become materially better for segments already taken (looked at whenever their number has grown
+by a quarter), they are taken again.
+
+``finish`` is one pass over the whole recording with the final clocks: a function of the file
+alone. So what is shown when a run ends is what ``huddle estimate`` says about its file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.bench.units import canonical
+from daq.errors import CannotAlignError
+from daq.estimation.clipping import clipped_shares
+from daq.estimation.diagnosis import diagnosis, synchronisation
+from daq.estimation.noise_estimates import (
+    Dimensions,
+    Estimates,
+    averages,
+    in_units,
+    known_gains,
+    noise_estimates,
+    time_left,
+    up_to,
+)
+from daq.estimation.recording_set import check_same, check_span, open_another
+from daq.estimation.segment_pass import Pass
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import ChannelLabel, Octave, SensorState, Snapshot
+from estimator.errors import InsufficientDataError
+from estimator.spectra.segment_rejection import Reason, RejectionSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from daq.recording.reader import Recording
+    from estimator.spectra.multiresolution import Band
+
+Progress = Callable[[int, int], None]
+
+_LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are taken again
+_FINAL_TOLERANCE = 1e-7
+_REVIEW = 1.25  # growth after which that is looked at
+_FIRST_REVIEW = 8  # segments
+_RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
+_MOST_PASSES = 4
+_MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
+
+
+class Estimation:
+    """The estimate from recordings, kept up with them as they grow.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Several recordings of the same sensors accumulate into one estimate.
+    settings : Settings, optional
+        What the bench in the first recording says, where not given.
+
+    Raises
+    ------
+    RecordingError
+        If a file cannot be read.
+    CannotAlignError
+        If the sensors cannot be brought onto one grid, or the recordings do not match.
+    WrongSettingError
+        If one recording is given twice, or a unit or gain does not fit the sensors.
+    """
+
+    def __init__(self, paths: Sequence[str | Path], settings: Settings | None = None) -> None:
+        if not paths:
+            raise CannotAlignError("no recording given; expected at least one")
+        self._recordings: list[Recording] = []
+        try:
+            for path in paths:
+                self._recordings.append(open_another(path, self._recordings))
+            self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
+            self._passes = [Pass(recording, self.settings) for recording in self._recordings]
+            check_same(self._passes)
+            self._unit = canonical(
+                self.settings.unit or self._passes[0].aligned.channels[0][1].unit
+            )
+            self._gains = known_gains(self.settings, self._passes[0].aligned.channels)
+        except BaseException:
+            self.close()
+            raise
+        self._next_review = _FIRST_REVIEW
+        self._dimensions: Dimensions | None = None
+        self._chosen_at = 0
+
+    def close(self) -> None:
+        """Close the recordings."""
+        for recording in self._recordings:
+            recording.close()
+
+    def __enter__(self) -> Estimation:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is followed: as of the last `update`."""
+        return tuple(self._recordings)
+
+    @property
+    def n_segments(self) -> int:
+        """Segments taken so far."""
+        return sum(each.n_segments for each in self._passes)
+
+    @property
+    def n_seen(self) -> int:
+        """Segments looked at so far, those left out for gaps included."""
+        return sum(each.n_seen for each in self._passes)
+
+    @property
+    def lacking(self) -> float:
+        """Seconds that the recording, as of the last `update`, lacks to hold one more segment."""
+        last = self._passes[-1]
+        welch = last.welch
+        end = last.n_seen * welch.hop + welch.segment_length
+        return (end - last.aligned.n_available) / welch.sampling_rate
+
+    def update(self) -> bool:
+        """Take what has been committed since; return whether there was a new segment.
+
+        Raises
+        ------
+        RecordingError
+            If a file is damaged.
+        """
+        before = self.n_seen
+        for each in self._passes:
+            each.aligned.refresh()
+            each.advance()
+        seen = self.n_seen
+        if seen >= self._next_review:
+            for each in self._passes:
+                for _ in range(_MOST_LIVE_PASSES):
+                    each.set_clocks()
+                    if not each.is_outdated(_LIVE_TOLERANCE):
+                        break
+                    each.restart()
+                    each.advance()
+            awaited = [each.awaited for each in self._passes if each.awaited > seen]
+            self._next_review = min([math.ceil(_REVIEW * seen), *awaited])
+        return seen > before
+
+    def finish(self, progress: Progress | None = None) -> Snapshot:
+        """Return the one result: the same while the recording was followed and afterwards.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told how many segments are done, and of how many.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no method can say anything; the message says why.
+        WrongSettingError
+            If nothing lies between start and end.
+        """
+        for number, each in enumerate(self._passes):
+            each.aligned.refresh()
+            if each.n_seen and not each.aligned.is_exact:
+                self._passes[number] = Pass(each.recording, self.settings)
+        check_span(self._passes, self.settings)
+        total = sum(each.n_complete for each in self._passes)
+        done = self.n_seen
+
+        def count(n: int) -> None:
+            nonlocal done
+            done += n
+            if progress is not None:
+                progress(done, total)
+
+        for each in self._passes:
+            each.advance(count)
+            for _ in range(_MOST_PASSES - 1):
+                each.set_clocks()
+                if not each.is_outdated(_FINAL_TOLERANCE):
+                    break
+                total += each.n_seen
+                each.restart()
+                each.advance(count)
+        snapshot = self._snapshot(final=True)
+        if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
+            raise InsufficientDataError(self._why_nothing(snapshot))
+        return snapshot
+
+    def snapshot(self) -> Snapshot:
+        """Return the estimate as it stands, from the segments taken so far."""
+        return self._snapshot(final=False)
+
+    def _snapshot(self, *, final: bool) -> Snapshot:
+        first, last = self._passes[0], self._passes[-1]
+        dims, channels = first.aligned.dims, first.aligned.channels
+        usable = min(each.aligned.usable for each in self._passes)
+        bands = tuple(
+            in_units(up_to(band, usable), channels, self._unit) for band in averages(self._passes)
+        )
+        if bands:
+            frequency = np.concatenate([band.frequencies for band in bands])
+            csm = np.concatenate([band.csm for band in bands])
+        else:
+            frequency = first.welch.frequencies
+            shape = (len(frequency), first.n_channels, first.n_channels)
+            csm = np.full(shape, np.nan, dtype=np.complex128)
+        n_segments, n_effective = self.n_segments, bands[-1].n_effective if bands else 0.0
+        estimates = self._estimates(bands, final=final)
+        diagnostics: dict[str, Any] = {
+            "synchronisation": synchronisation(
+                last.aligned.clocks,
+                last.aligned.is_reference,
+                last.moved(),
+                dims=dims,
+                frequency=frequency,
+                csm=csm,
+                results=estimates.results,
+            )
+        }
+        if estimates.dimensions is not None and estimates.dimensions.chosen:
+            diagnostics["dimension"] = estimates.dimensions.chosen
+        if final:
+            faulty = self._clipped() | self._dead_for_a_while()
+            diagnostics |= diagnosis(
+                bands,
+                dims,
+                channels,
+                dimensions=estimates.dimensions,
+                faulty=set().union(*faulty.values()),
+            )
+            diagnostics |= faulty
+        return Snapshot(
+            frequency=frequency,
+            csm=csm,
+            results=estimates.results,
+            refused=estimates.refused,
+            channels=tuple(
+                ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
+            ),
+            dims=dims,
+            unit=self._unit,
+            n_segments=n_segments,
+            n_dropped=self.n_seen - n_segments,
+            n_effective=n_effective,
+            elapsed=sum(each.elapsed for each in self._passes),
+            time_left=time_left(
+                self.settings,
+                frequency,
+                estimates.results,
+                nyquist=first.welch.sampling_rate / 2,
+                taken=n_segments * first.welch.hop / first.welch.sampling_rate,
+            ),
+            start_utc_ns=first.aligned.start_utc_ns,
+            sensors=tuple(SensorState.of(record) for record in self._recordings[-1].sensors),
+            clocks=last.aligned.clocks,
+            drift=last.drift(),
+            closed=all(recording.closed for recording in self._recordings),
+            left_out=self._left_out(),
+            octaves=tuple(map(Octave.of, bands)) if self.settings.octaves else (),
+            diagnostics=diagnostics,
+        )
+
+    def _estimates(self, bands: tuple[Band, ...], *, final: bool) -> Estimates:
+        """Estimate; while following, the dimension is chosen anew when segments have grown."""
+        if not bands:
+            return Estimates({}, {}, None)
+        dims = self._passes[0].aligned.dims
+        keep = not final and self.n_segments < _RECHOICE * self._chosen_at
+        estimates = noise_estimates(
+            bands,
+            self.settings,
+            dims=dims,
+            gains=self._gains,
+            dimensions=self._dimensions if keep and self._fits(bands) else None,
+        )
+        if estimates.dimensions is not self._dimensions:
+            self._dimensions, self._chosen_at = estimates.dimensions, self.n_segments
+        return estimates
+
+    def _fits(self, bands: tuple[Band, ...]) -> bool:
+        """Whether the dimensions chosen before are for the same frequencies."""
+        before = () if self._dimensions is None else self._dimensions.n_factors
+        return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
+
+    def _clipped(self) -> dict[str, dict[str, float]]:
+        """Return which channels stand at the end of their range, and in what share of samples."""
+        taking_part = {
+            (sensor, channel.name) for sensor, channel in self._passes[0].aligned.channels
+        }
+        shares: dict[str, float] = {}
+        for recording in self._recordings:
+            for record in recording.sensors:
+                for channel, share in clipped_shares(record).items():
+                    if (record.name, channel) in taking_part:
+                        label = f"{record.name}.{channel}"
+                        shares[label] = max(share, shares.get(label, 0.0))
+        return {"clipped": shares} if shares else {}
+
+    def _dead_for_a_while(self) -> dict[str, dict[str, float]]:
+        """Return which channels stood still for a while in segments that count, and how long.
+
+        Rejection leaves such segments out, but takes what lasts for a change for good.
+        """
+        welch = self._passes[0].welch
+        lasting = RejectionSettings().start_up * welch.hop / welch.sampling_rate
+        least = lasting if self.settings.reject else 0.0
+        seconds = sum(each.stillness.for_a_while() for each in self._passes)
+        found = {
+            f"{sensor}.{channel.name}": float(still)
+            for (sensor, channel), still in zip(
+                self._passes[0].aligned.channels, np.atleast_1d(seconds), strict=True
+            )
+            if still > least
+        }
+        return {"stood_still": found} if found else {}
+
+    def _left_out(self) -> dict[str, int]:
+        counts: Counter[Reason] = Counter()
+        for each in self._passes:
+            counts.update(each.left_out)
+        counts[Reason.TRANSIENT] = self.n_seen - self.n_segments - counts.total()
+        return {reason.value: counts[reason] for reason in Reason}
+
+    def _why_nothing(self, snapshot: Snapshot) -> str:
+        names = ", ".join(str(recording.path) for recording in self._recordings)
+        if snapshot.n_segments == 0:
+            welch = self._passes[0].welch
+            available = sum(each.aligned.n_available for each in self._passes)
+            return (
+                f"{names}: not one whole segment: {available / welch.sampling_rate:.3g} s with all"
+                f" sensors, {snapshot.n_dropped} segments left out (gaps, clipping), and a segment"
+                f" takes {self.settings.segment:g} s; record longer or choose a shorter segment"
+            )
+        if snapshot.results:
+            advice = snapshot.diagnostics.get("advice", ())
+            why = [f"{each.text} {each.remedy}" for each in advice if each.level != "note"]
+            return (
+                f"{names}: nothing can be said of any channel at any frequency by "
+                f"{', '.join(snapshot.results)}: "
+                + (" ".join(why) or "look at the samples and the bench file")
+            )
+        return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
+
+
+def estimate(
+    paths: Sequence[str | Path],
+    settings: Settings | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Snapshot:
+    """Estimate the self-noise from finished recordings (or from what there is of a growing one).
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Several recordings of the same sensors accumulate into one estimate.
+    settings : Settings, optional
+        What the bench in the first recording says, where not given.
+    progress : callable, optional
+        Told how many segments are done, and of how many.
+
+    Raises
+    ------
+    RecordingError, CannotAlignError
+        If a file cannot be read, or its sensors not be aligned.
+    InsufficientDataError
+        If there is too little for any of the methods.
+    """
+    with Estimation(paths, settings) as estimation:
+        return estimation.finish(progress)

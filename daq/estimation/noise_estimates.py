@@ -1,0 +1,242 @@
+"""From averages to noise spectra in physical units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.bench.units import conversion
+from daq.errors import WrongSettingError
+from estimator.errors import InsufficientDataError
+from estimator.likelihood.dimension import BandDimension, choose_dimension
+from estimator.likelihood.goodness_of_fit import neighbour_correlation
+from estimator.methods import METHODS, self_noise
+from estimator.self_noise.result import SelfNoise
+from estimator.spectra.multiresolution import Band, MultiResolution
+from estimator.spectra.welch import CrossSpectra, scale
+from estimator.spectra.windows import effective_averages, get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Channel
+    from daq.estimation.segment_pass import Pass
+    from daq.estimation.settings import Settings
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+    ComplexArray = NDArray[np.complex128]
+    Channels = Sequence[tuple[str, Channel]]
+
+ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
+"""The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
+FEWEST_AVERAGES = 20
+"""Of an octave with its own segments: with fewer it goes with the octave above."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dimensions:
+    """Dimension of the motion at every frequency of each band, and why."""
+
+    n_factors: tuple[IntArray, ...]
+    chosen: tuple[BandDimension, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates:
+    """What every method says, why others say nothing, and the dimension of the motion."""
+
+    results: dict[str, SelfNoise]
+    refused: dict[str, str]
+    dimensions: Dimensions | None
+
+
+def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
+    """Return cross-spectra of all recordings together, in the channels' own units.
+
+    One band, or one an octave; none before the first segment.
+    """
+    first = passes[0]
+    n_segments = sum(each.n_segments for each in passes)
+    if n_segments == 0:
+        return ()
+    if first.octaves is not None:
+        octaves = MultiResolution.like(first.octaves)
+        for each in passes:
+            if each.octaves is not None:
+                octaves.merge(each.octaves)
+        highest = octaves.bands()[-1]
+        wanted = max(FEWEST_AVERAGES, first.n_channels + 2)
+        return octaves.bands(min(wanted, highest.n_effective))
+    spectra = CrossSpectra(first.welch, first.n_channels)
+    for each in passes:
+        spectra.merge(each.spectra)
+    window = get_window(first.welch.window, first.welch.segment_length)
+    n_effective = sum(
+        effective_averages(window, each.welch.hop, count)
+        for each in passes
+        if (count := each.n_segments)
+    )
+    return (Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective),)
+
+
+def up_to(band: Band, usable: float) -> Band:
+    """Return averages of which nothing is known above `usable` Hz."""
+    beyond = band.frequencies > usable
+    if not beyond.any():
+        return band
+    csm = band.csm.copy()
+    csm[beyond] = np.nan
+    return replace(band, csm=csm)
+
+
+def in_units(band: Band, channels: Channels, unit: str) -> Band:
+    """Return averages in ``unit**2/Hz``, the channels' responses taken out."""
+    frequency = band.frequencies
+    response = np.ones((len(frequency), len(channels)), dtype=np.complex128)
+    for column, (_, channel) in enumerate(channels):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            response[:, column] = 1 / conversion(channel.unit, unit, frequency)
+        if channel.response is not None:
+            response[:, column] *= channel.response.at(frequency)
+    return band if np.all(response == 1) else replace(band, csm=scale(band.csm, response))
+
+
+def known_gains(settings: Settings, channels: Channels) -> FloatArray:
+    """Return what each channel makes of the motion, as the settings say.
+
+    Raises
+    ------
+    WrongSettingError
+        If they name a sensor or channel that is not there, or a gain of 0.
+    """
+    gains = np.ones(len(channels))
+    names = [(sensor, f"{sensor}.{channel.name}") for sensor, channel in channels]
+    for name, gain in settings.gains.items():
+        named = [number for number, known in enumerate(names) if name in known]
+        if not named or not np.isfinite(gain) or gain == 0:
+            listed = ", ".join(dict.fromkeys(sensor for sensor, _ in names))
+            raise WrongSettingError(
+                f"gain {name}={gain:g}: expected a sensor ({listed}) or one of its channels"
+                f" ({names[0][1]}, …), and a number other than 0"
+            )
+        gains[named] *= gain
+    return gains
+
+
+def neighbours(band: Band) -> FloatArray:
+    """Return how averages at neighbouring frequencies of a band are correlated."""
+    window = get_window(band.settings.window, band.settings.segment_length)
+    return neighbour_correlation(window, band.settings.hop, band.n_segments)
+
+
+def noise_estimates(
+    bands: Sequence[Band],
+    settings: Settings,
+    *,
+    dims: tuple[int, ...],
+    gains: FloatArray,
+    dimensions: Dimensions | None = None,
+) -> Estimates:
+    """Estimate by every method that is wanted.
+
+    Parameters
+    ----------
+    bands : sequence of Band
+        Rising, in physical units.
+    settings : Settings
+    dims : tuple of int
+    gains : float64, shape (n_channels,)
+    dimensions : Dimensions, optional
+        Those chosen before, where they are not to be chosen anew.
+    """
+    results: dict[str, SelfNoise] = {}
+    refused: dict[str, str] = {}
+    wanted = ALL_METHODS if "all" in settings.methods else settings.methods
+    with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
+        for method in wanted:
+            try:
+                options: list[dict[str, Any]] = [{} for _ in bands]
+                if method == "two-channel":
+                    options = [{"response": gains.astype(np.complex128)} for _ in bands]
+                elif method == "maximum-likelihood" and settings.dimension is not None:
+                    dimensions = dimensions or _dimensions(bands, settings, dims)
+                    options = [{"n_factors": q} for q in dimensions.n_factors]
+                parts = [
+                    self_noise(
+                        method,
+                        band.csm,
+                        dims=dims,
+                        n_effective=band.n_effective,
+                        correct=settings.correct,
+                        real=band.settings.real(band.frequencies),
+                        **option,
+                    )
+                    for band, option in zip(bands, options, strict=True)
+                ]
+            except InsufficientDataError as error:
+                refused[method] = str(error)
+            else:
+                results[method] = _joined(parts)
+    return Estimates(results, refused, dimensions)
+
+
+def time_left(
+    settings: Settings,
+    frequency: FloatArray,
+    results: dict[str, SelfNoise],
+    *,
+    nyquist: float,
+    taken: float,
+) -> float | None:
+    """Return how many seconds more reach the wanted c.o.v. in the wanted band.
+
+    ``taken`` is what the averages so far took, in seconds; None where nothing can be said.
+    """
+    target = settings.target_cov
+    if target is None or not results:
+        return None
+    band = settings.band or (0.0, 0.9 * nyquist)
+    inside = (frequency >= band[0]) & (frequency <= band[1])
+    inside[0] = False
+    cov = next(iter(results.values())).cov[inside]
+    cov = cov[:, np.isfinite(cov).any(axis=0)]  # a dead channel never gets there
+    if not cov.size:
+        return None
+    reached = float(np.nanmax(np.nanmedian(cov, axis=0)))
+    # c.o.v. ~ 1 / √n, and averages come at a steady pace.
+    return taken * max(0.0, (reached / target) ** 2 - 1)
+
+
+def _dimensions(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]) -> Dimensions:
+    if isinstance(settings.dimension, int):
+        q = settings.dimension
+        return Dimensions(tuple(np.full(len(band.frequencies), q) for band in bands))
+    found = [
+        choose_dimension(
+            band.csm,
+            band.frequencies,
+            dims=dims,
+            n_effective=band.n_effective,
+            neighbours=neighbours(band),
+        )
+        for band in bands
+    ]
+    return Dimensions(
+        tuple(n_factors for n_factors, _ in found),
+        tuple(choice for _, choices in found for choice in choices),
+    )
+
+
+def _joined(parts: Sequence[SelfNoise]) -> SelfNoise:
+    if len(parts) == 1:
+        return parts[0]
+    arrays = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("noise_psd", "cov", "low", "high", "flags")
+    )
+    return SelfNoise(parts[0].method, *arrays)

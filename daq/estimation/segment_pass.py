@@ -1,0 +1,291 @@
+"""The segments of one recording, taken in order."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from daq.alignment.aligned_recording import AlignedRecording
+from daq.alignment.delay_estimation import DelayEstimator
+from daq.estimation.flatline import FlatlineDetector, stands_still
+from estimator.spectra.multiresolution import MultiResolution
+from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from datetime import datetime
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.settings import Settings
+    from daq.recording.reader import Recording
+
+    FloatArray = NDArray[np.float64]
+
+_Piece = TypeVar("_Piece")
+_Read = TypeVar("_Read")
+
+_VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
+_READERS = 2  # pieces being read while one is worked on
+OCTAVES = 12
+"""Stages of the multi-resolution mode: those without segments cost nothing."""
+_MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
+
+
+class Pass:
+    """Segments of one recording, taken in order."""
+
+    def __init__(self, recording: Recording, settings: Settings) -> None:
+        self.recording = recording
+        self.aligned = AlignedRecording(
+            recording,
+            sampling_rate=settings.sampling_rate,
+            start_utc_ns=_utc_ns(settings.start),
+            end_utc_ns=_utc_ns(settings.end),
+            nominal_clocks=settings.clocks == "nominal",
+        )
+        names = {sensor for sensor, _ in self.aligned.channels}
+        self._sensors = [record for record in recording.sensors if record.name in names]
+        rate = self.aligned.sampling_rate
+        self.welch = WelchSettings(
+            sampling_rate=rate,
+            segment_length=round(settings.segment * rate),
+            overlap=settings.overlap,
+            window=settings.window,
+            detrend=settings.detrend,
+        )
+        self.n_channels = len(self.aligned.channels)
+        self._settings = settings
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again, with the clocks as they are now."""
+        wanted = self._settings
+        self.octaves: MultiResolution | None = None
+        self._undisturbed: SelectedSpectra | None = None
+        if wanted.octaves:
+            self.octaves = MultiResolution(
+                self.welch,
+                self.n_channels,
+                n_stages=OCTAVES,
+                rejection=RejectionSettings() if wanted.reject else None,
+            )
+        elif wanted.reject:
+            self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
+        # The other processors read ahead.
+        self._all = CrossSpectra(self.welch, self.n_channels, threads=1)
+        self._selected: CrossSpectra | None = None
+        self.n_seen = self._n_taken = 0
+        self._fed = 0  # grid samples that the octaves have had
+        self.left_out: Counter[Reason] = Counter()
+        self.stillness = FlatlineDetector(self.welch.hop, self.n_channels, self.welch.sampling_rate)
+        self.taken_at: list[FloatArray] = []
+        self.aligned.forget()
+        self._meter: DelayEstimator | None = None
+
+    @property
+    def spectra(self) -> CrossSpectra:
+        """Spectra of the segments that count; none with octaves."""
+        if self._undisturbed is None:
+            return self._all
+        if self._selected is None:
+            self._selected = self._undisturbed.spectra()
+        return self._selected
+
+    @property
+    def n_segments(self) -> int:
+        """Segments that count; with octaves those of the highest."""
+        if self.octaves is not None:
+            return self.octaves.n_segments
+        return self._n_taken if self._undisturbed is None else self.spectra.n_segments
+
+    @property
+    def n_complete(self) -> int:
+        """Segments of the lattice that are available now."""
+        beyond = self.aligned.n_available - self.welch.segment_length
+        return max(0, beyond // self.welch.hop + 1)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of the grid that have been looked at."""
+        if self.n_seen == 0:
+            return 0.0
+        length = (self.n_seen - 1) * self.welch.hop + self.welch.segment_length
+        return length / self.welch.sampling_rate
+
+    def advance(self, progress: Callable[[int], None] | None = None) -> None:
+        """Take every segment that is complete."""
+        hop, length = self.welch.hop, self.welch.segment_length
+        at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
+        total = self.n_complete
+        pieces = [
+            (first, min(at_once, total - first)) for first in range(self.n_seen, total, at_once)
+        ]
+
+        def read(piece: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
+            first, count = piece
+            return self.aligned.read(first * hop, (first + count - 1) * hop + length)
+
+        for (first, count), (samples, valid) in zip(pieces, _ahead(read, pieces), strict=True):
+            starts = np.arange(count) * hop
+            usable = valid & self._finite(samples)
+            self._silence(samples)
+            self.stillness.add(samples[: count * hop], usable[: count * hop])
+            clipped = self._clipped(first * hop, len(samples))
+            starts = np.arange(count) * hop
+            whole = _whole(usable, starts, length)
+            clean = whole if clipped is None else _whole(usable & ~clipped, starts, length)
+            self.left_out[Reason.GAP] += count - int(whole.sum())
+            self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
+            starts = starts[clean]
+            if self.octaves is not None:
+                complete = usable if clipped is None else usable & ~clipped
+                new = self._fed - first * hop
+                self.octaves.add(samples[new:], complete[new:])
+                self._fed = first * hop + len(samples)
+            elif self._undisturbed is None:
+                self._all.add(samples, starts)
+            else:
+                self._undisturbed.add(samples, starts)
+                self._selected = None
+            self._n_taken += len(starts)
+            self.taken_at.append(self._positions(np.arange(first, first + count)))
+            self._measure(samples, starts, first * hop)
+            self.n_seen += count
+            if progress is not None:
+                progress(count)
+
+    def _silence(self, samples: FloatArray) -> None:
+        """Make channels that stand still exactly zero: the rounding of their mean is no signal."""
+        if self.welch.detrend == "none":
+            return
+        rows = samples[:: max(1, len(samples) // 4)]
+        for column in np.flatnonzero(stands_still(rows)):
+            if stands_still(samples[:, column]):
+                samples[:, column] = 0.0
+
+    def _finite(self, samples: FloatArray) -> NDArray[np.bool_]:
+        """Return which samples are finite numbers, in every channel."""
+        with np.errstate(invalid="ignore"):
+            if np.isfinite(samples.sum()):
+                return np.ones(len(samples), dtype=np.bool_)
+        return np.asarray(np.isfinite(samples).all(axis=1))
+
+    def _clipped(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
+        """Return which grid samples lie in blocks that are clipped; None if none do."""
+        if self._settings.reject is False:
+            return None
+        found = None
+        for number, record in enumerate(self._sensors):
+            clipped = record.blocks.clipped
+            if len(clipped) == 0:
+                continue
+            found = np.zeros(n_samples, dtype=np.bool_) if found is None else found
+            at = np.arange(start, start + n_samples, dtype=np.float64)
+            origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
+            seconds = origin * 1e-9 + at / self.welch.sampling_rate
+            position = (seconds - self.aligned.delays(at)[:, number]) * record.sampling_rate
+            before = np.searchsorted(clipped[:, 0], position, side="right") - 1
+            found |= (before >= 0) & (position < clipped[before, 1])
+        return found
+
+    @property
+    def awaited(self) -> int:
+        """Segments with which delays could be measured first; 0 where they are, or need not be."""
+        return 0 if self._meter is None or self._meter.has_frame else self._meter.fewest
+
+    def moved(self) -> FloatArray:
+        """Return by how much clocks, as known now, differ from those that segments were taken by.
+
+        In seconds, shape (n_segments, n_sensors); what all sensors have in common is left out.
+        """
+        if not self.taken_at:
+            return np.empty((0, len(self.aligned.dims)))
+        before = np.concatenate(self.taken_at)
+        moved = self._positions(np.arange(len(before))) - before
+        return np.asarray(moved - moved.mean(axis=1, keepdims=True))
+
+    def set_clocks(self) -> None:
+        """Set the clocks by what the segments taken say."""
+        if self._meter is not None:
+            self.aligned.set_clocks()
+
+    def is_outdated(self, tolerance: float) -> bool:
+        """Whether clocks, as known now, differ from those that segments were taken by.
+
+        By more than `tolerance` in seconds rms, that is; or whether delays could be measured now
+        and could not yet when segments came one by one.
+        """
+        if not self.taken_at or self.aligned.is_exact:
+            return False
+        if self._meter is not None and not self._meter.has_frame:
+            return self.n_seen >= self._meter.fewest
+        moved = self.moved()
+        constant = moved.mean(axis=0)
+        varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
+        return varying > tolerance or bool(
+            np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
+        )
+
+    def drift(self) -> FloatArray:
+        """Return middles of segments in seconds, and every sensor's delay there."""
+        n_sensors = len(self.aligned.dims)
+        taken = np.concatenate(self.taken_at) if self.taken_at else np.empty((0, n_sensors))
+        middle = np.arange(len(taken)) * self.welch.hop + self.welch.segment_length / 2
+        return np.column_stack([middle / self.welch.sampling_rate, taken])
+
+    def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
+        """Measure what delays are left, for the clocks' next setting."""
+        measurable = self.aligned.measurable if self._settings.clocks == "refined" else ()
+        if not measurable:
+            return
+        if self._meter is None:
+            edges = np.cumsum([0, *self.aligned.dims])
+            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in measurable)
+            window = get_window(self.welch.window, self.welch.segment_length)
+            self._meter = DelayEstimator(self.welch.sampling_rate, window, columns)
+        delays, std = self._meter.measure(samples, starts)
+        at = first + starts + self.welch.segment_length / 2
+        self.aligned.learn(
+            np.asarray(at, dtype=np.float64),
+            delays,
+            std=std,
+            frame_delays=self._meter.frame_delays(),
+        )
+
+    def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
+        middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
+        return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+
+
+def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) -> NDArray[np.bool_]:
+    """Return which segments have usable samples only."""
+    missing = np.concatenate([[0], np.cumsum(~usable)])
+    return np.asarray(missing[starts + length] == missing[starts])
+
+
+def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
+    """Read pieces in order, the next ones while the one before is worked on."""
+    if len(pieces) < 2:
+        yield from map(read, pieces)
+        return
+    with ThreadPoolExecutor(_READERS) as pool:
+        coming: deque[Future[_Read]] = deque()
+        for piece in pieces:
+            coming.append(pool.submit(read, piece))
+            if len(coming) > _READERS:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
+
+
+def _utc_ns(instant: datetime | None) -> int | None:
+    if instant is None:
+        return None
+    return math.floor(instant.timestamp()) * 10**9 + instant.microsecond * 1000

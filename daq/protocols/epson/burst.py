@@ -1,0 +1,211 @@
+"""Decode the stream of bursts of an Epson accelerometer; see :mod:`daq.protocols.epson.commands`.
+
+Theory of operation
+-------------------
+A whole read is decoded at once: frames are found by length, header, delimiter and checksum
+together, COUNT gives each its sample index, and rows that follow one another become one block. What
+is no frame is skipped, counted, and reported as an event at most once a second; what it cost shows
+as a gap in COUNT. The first block of a session starts at index 0.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, word_sums
+from daq.protocols.framing import PIECE, BoolArray, OctetArray, find_frames
+from daq.protocols.plural import several
+from daq.protocols.sample_counter import Run, SampleCounter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.protocols.block import HostTime
+    from daq.protocols.epson.commands import BurstFormat
+
+COUNT_MODULUS = 65536
+LEAST_FOLLOWING = 3
+"""Bursts in a row by which a stream is known again."""
+REPORT_INTERVAL_NS = 1_000_000_000
+"""Least host time between two events of one kind."""
+
+
+class BurstDecoder:
+    """Bytes in, blocks out.
+
+    Parameters
+    ----------
+    sensor : str
+        Name for the blocks and events.
+    burst : BurstFormat
+        What the device was told to send.
+    fields : sequence of str
+        Which fields become channels, in the order wanted: x, y, z, temperature.
+    sampling_rate : float
+        In Hz.
+    full_scale_counts : int
+        Samples of x, y, z at or beyond this are clipped.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        burst: BurstFormat,
+        *,
+        fields: Sequence[str],
+        sampling_rate: float,
+        full_scale_counts: int,
+    ) -> None:
+        self._sensor = sensor
+        self._burst = burst
+        self._dtype = burst.dtype
+        self._size = burst.size
+        self._fields = tuple(fields)
+        self._axes = [column for column, field in enumerate(fields) if field != "temperature"]
+        self._full_scale = full_scale_counts
+        self._counter = SampleCounter(COUNT_MODULUS, sampling_rate)
+        self._left = b""
+        self._started = False
+        self._lost_frames = 0  # without COUNT: frames since the last one that were no frames
+        self._next = 0  # without COUNT: index of the next frame
+        self._error = False
+        self._counts = dict.fromkeys(("checksum", "resynchronised", "repeated"), 0)
+        self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
+
+    @property
+    def begun(self) -> int:
+        """Bytes of a frame that are here while the rest is on its way."""
+        return len(self._left)
+
+    def follows(self, data: bytes, at: HostTime) -> bool:
+        """Whether ``data``, heard on a new connection, is the stream of before, gone on meanwhile.
+
+        ``data`` holds bursts of the same format, some in a row, and COUNT stands where host time
+        says it should. Nothing is taken; :meth:`resume` and :meth:`receive` do.
+        """
+        if not self._started or "count" not in self._burst:
+            return False
+        runs, _ = find_frames(np.frombuffer(data, np.uint8), self._size, self._valid)
+        for offset, length in runs[::-1]:
+            if length >= LEAST_FOLLOWING:
+                frames = np.frombuffer(data, self._dtype, count=length, offset=offset)
+                counters = frames["count"][-LEAST_FOLLOWING:].astype(np.int64)
+                in_order = bool((np.diff(counters) % COUNT_MODULUS == 1).all())
+                return in_order and self._counter.expects(int(counters[-1]), at)
+        return False
+
+    def resume(self) -> None:
+        """Note that what comes now follows on a new connection."""
+        self._left = b""
+        self._counter.resume()
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Return the blocks and events of all frames completed by ``data``."""
+        found: list[Block | Event] = []
+        for start in range(0, len(data), PIECE):
+            found += self._receive(self._left + data[start : start + PIECE], at)
+        return found
+
+    def _receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        octets = np.frombuffer(data, np.uint8)
+        runs, consumed = find_frames(octets, self._size, self._valid)
+        self._left = data[consumed:]
+        skipped = consumed - sum(length for _, length in runs) * self._size
+        if skipped:
+            self._note_skipped(octets, runs, skipped)
+        frames = [
+            np.frombuffer(data, self._dtype, count=length, offset=offset) for offset, length in runs
+        ]
+        found: list[Block | Event] = []
+        if frames:
+            together = frames[0] if len(frames) == 1 else np.concatenate(frames)
+            found += self._blocks(together, at)
+            found += self._error_flag(together, at)
+        return found + self._report(at)
+
+    def _valid(self, windows: OctetArray) -> BoolArray:
+        good: BoolArray = (windows[:, 0] == BURST_HEADER) & (windows[:, -1] == DELIMITER)
+        if "checksum" in self._burst:
+            rows = np.flatnonzero(good)
+            octets = windows if rows.size == good.size else windows[rows]
+            given = octets[:, -3].astype(np.uint16) << 8 | octets[:, -2]
+            good[rows] = word_sums(octets[:, 1:-3]) == given
+        return good
+
+    def _note_skipped(self, octets: OctetArray, runs: list[tuple[int, int]], skipped: int) -> None:
+        # A frame in its place with header and delimiter, but not its checksum: changed on the way
+        ends = np.array([0] + [start + length * self._size for start, length in runs])
+        ends = ends[ends + self._size <= octets.size]
+        looks = (octets[ends] == BURST_HEADER) & (octets[ends + self._size - 1] == DELIMITER)
+        starts = {start for start, _ in runs}
+        bad = sum(1 for end in ends[looks].tolist() if end not in starts)
+        self._counts["checksum"] += bad
+        self._counts["resynchronised"] += max(0, skipped - bad * self._size)
+        self._lost_frames += max(1, round(skipped / self._size))
+
+    def _blocks(self, frames: NDArray[np.void], at: HostTime) -> list[Block | Event]:
+        if "count" in self._burst:
+            counters = frames["count"].astype(np.int64)
+            runs, repeated = self._counter.place(counters, at)
+            self._counts["repeated"] += repeated
+        else:  # the best there is without COUNT: what was skipped stands for frames
+            lost = self._lost_frames
+            runs = [Run(0, frames.size, self._next + lost, missing=lost)]
+            self._next, self._lost_frames = runs[0].first_sample + frames.size, 0
+        counts = np.empty((frames.size, len(self._fields)), np.int32)
+        for column, field in enumerate(self._fields):
+            counts[:, column] = frames[field]
+        found: list[Block | Event] = []
+        for run in runs:
+            if run.restarted:
+                text = f"COUNT began anew; missing: about {several(run.missing, 'sample')}"
+                found.append(Event(self._sensor, "reset", text, at))
+            found.append(self._block(run, counts[run.start : run.stop], at))
+        return found
+
+    def _block(self, run: Run, counts: NDArray[np.int32], at: HostTime) -> Block:
+        flags, reason = BlockFlag.NONE, ""
+        if run.restarted or not self._started:
+            flags |= BlockFlag.CLOCK_RESTART
+        if run.missing:
+            reason = several(run.missing, "sample", "not received")
+            if run.restarted:
+                reason = "the device was reset"
+            if run.restarted or "count" not in self._burst:
+                flags |= BlockFlag.MISSING_ESTIMATED
+        # the most negative count has no positive twin: compare both ends
+        axes = counts[:, self._axes]
+        if axes.size and (axes.max() >= self._full_scale or axes.min() <= -self._full_scale):
+            flags |= BlockFlag.CLIPPED
+        self._started = True
+        return Block(self._sensor, run.first_sample, counts, at, run.counter, flags, reason)
+
+    def _error_flag(self, frames: NDArray[np.void], at: HostTime) -> list[Event]:
+        if "flag" not in self._burst:
+            return []
+        error = bool((frames["flag"] & FLAG_ERROR).any())
+        changed, self._error = error != self._error, error
+        if not changed:
+            return []
+        text = "the device reports an error" if error else "the device reports no error any more"
+        return [Event(self._sensor, "status", text, at)]
+
+    def _report(self, at: HostTime) -> list[Event]:
+        said = {
+            "checksum": ("frame", "with a wrong checksum"),
+            "resynchronised": ("byte", "skipped between frames"),
+            "repeated": ("frame", "came twice"),
+        }
+        events = []
+        for kind, n in self._counts.items():
+            if n and at.monotonic_ns - self._reported[kind] >= REPORT_INTERVAL_NS:
+                self._counts[kind] = 0
+                self._reported[kind] = at.monotonic_ns
+                kind_of_event = "resynchronised" if kind == "repeated" else kind
+                events.append(Event(self._sensor, kind_of_event, several(n, *said[kind]), at))
+        return events

@@ -1,0 +1,171 @@
+"""GCF of Güralp digitizers over a serial line with block recovery, and from Scream servers.
+
+What came by either goes to :class:`~daq.protocols.guralp.streams.Streams`, told what is still
+awaited.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daq.protocols.block import Block, Event, HostTime
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.guralp.brp import MAX_SIZE, Anew, Damaged, Frame, Lost, Receiver, Skipped
+from daq.protocols.guralp.gcf import decode_block
+from daq.protocols.guralp.scream import (
+    ACKNOWLEDGED,
+    NO_SERVER,
+    Packet,
+    PacketFinder,
+    decode_packet,
+)
+from daq.protocols.guralp.streams import Streams, cut, only
+from daq.protocols.plural import several
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+MOST_PACKETS = 1024
+"""Packets whose number lies further from what is due are of a server that was restarted."""
+
+
+class SerialDecoder:
+    """GCF over a serial line with block recovery; see :mod:`daq.protocols.guralp.brp`.
+
+    Parameters
+    ----------
+    sensors : mapping of str to sequence of str
+        For each sensor the stream ID of each channel.
+    replies : bool
+        Whether blocks are acknowledged and lost ones asked for again.
+    """
+
+    def __init__(self, sensors: Mapping[str, Iterable[str]], *, replies: bool = True) -> None:
+        self.streams = Streams(sensors)
+        self._name = only(sensors)
+        self._receiver = Receiver(replies=replies)
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take bytes from the line; replies are then to be taken and sent."""
+        found: list[Block | Event] = []
+        for item in self._receiver.receive(data):
+            match item:
+                case Frame(_, block):
+                    found += self._frame(block, at)
+                case Damaged(sequence):
+                    found.append(Event(self._name, "checksum", f"block {sequence} was damaged", at))
+                    self.streams.lost("damaged block")
+                case Lost(sequence, n_frames):
+                    text = f"{several(n_frames, 'block')} from number {sequence} did not come again"
+                    found.append(Event(self._name, "resynchronised", text, at))
+                    self.streams.lost("lost block")
+                case Anew(sequence, due):
+                    text = f"the digitizer numbers anew: block {sequence} came, {due} was due"
+                    found.append(Event(self._name, "reset", text, at))
+                    self.streams.lost("digitizer restarted")
+                case Skipped(n_bytes, start):
+                    found.append(Event(self._name, "status", _told(n_bytes, start), at))
+        return found
+
+    def take_replies(self) -> bytes:
+        """Return what is to be sent to the digitizer, once."""
+        return self._receiver.take_replies()
+
+    def _frame(self, data: bytes, at: HostTime) -> Iterator[Block | Event]:
+        try:
+            block = decode_block(data)
+        except RemoteProtocolError as error:
+            yield Event(self._name, "checksum", cut(str(error)), at)
+            return
+        yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
+
+
+def _told(n_bytes: int, start: bytes) -> str:
+    if sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in start) > 0.9 * len(start):
+        return cut("terminal: " + " ".join(start.decode("ascii", "replace").split()))
+    if start[:1] == b"G" and len(start) >= 4 and int.from_bytes(start[2:4], "big") > MAX_SIZE:
+        size = int.from_bytes(start[2:4], "big")
+        return f"skipped {n_bytes} bytes: a block of {size} bytes announced, at most {MAX_SIZE} fit"
+    return f"skipped {n_bytes} bytes that are no block"
+
+
+class ScreamDecoder:
+    """GCF from a Scream server: ``receive`` for TCP, ``receive_datagram`` for UDP.
+
+    Packets that were overtaken on the way, or are asked for again by number (``missing``), are put
+    in their place if they come before ``patience`` others: while they are awaited nothing goes out,
+    which must not look like a stall. A number that was due before, with a block later than all
+    others, is of a server that was restarted.
+    """
+
+    MOST_MISSING = 32
+
+    def __init__(self, sensors: Mapping[str, Iterable[str]], *, patience: int = 2) -> None:
+        self.streams = Streams(sensors)
+        self._patience = patience
+        self._name = only(sensors)
+        self._finder = PacketFinder()
+        self._next: int | None = None
+        self._latest_ns = 0  # start of a block
+        self._missing: dict[int, int] = {}  # sequence number: how many came since
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Sequence numbers of packets that are still awaited."""
+        return tuple(self._missing)
+
+    def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take bytes of the TCP connection, cut anywhere."""
+        found: list[Block | Event] = []
+        for item in self._finder.receive(data):
+            if isinstance(item, Packet):
+                found += self._packet(item, at)
+            else:
+                found.append(
+                    Event(self._name, "resynchronised", f"skipped {several(item, 'byte')}", at)
+                )
+        return found
+
+    def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        """Take one UDP packet."""
+        text = data[:16].rstrip(b"\0") + b"\0"
+        if text == ACKNOWLEDGED:
+            return []
+        if text == NO_SERVER:
+            return [Event(self._name, "stopped", "the Scream server shuts down", at)]
+        try:
+            return list(self._packet(decode_packet(data), at))
+        except RemoteProtocolError as error:
+            return [Event(self._name, "resynchronised", cut(str(error)), at)]
+
+    def not_available(self, sequence: int) -> None:
+        """Note that the server no longer has this packet."""
+        self._missing.pop(sequence, None)
+
+    def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
+        sequence = packet.sequence
+        due = sequence if self._next is None else self._next
+        ahead = (sequence - due) % 65536
+        start_ns = packet.block.start_ns
+        known = sequence in self._missing or start_ns <= self._latest_ns
+        self._latest_ns = max(self._latest_ns, start_ns)
+        if min(ahead, 65536 - ahead) > MOST_PACKETS or (ahead >= 32768 and not known):
+            self._missing.clear()
+            self._next = (sequence + 1) % 65536
+            self.streams.lost("server restarted")
+            text = f"the server numbers anew: packet {sequence} came, {due} was due"
+            yield Event(self._name, "reset", text, at)
+        elif ahead < 32768:
+            yield from self._advance(due, ahead, at)
+            self._next = (sequence + 1) % 65536
+        self._missing.pop(sequence, None)
+        yield from self.streams.receive(packet.block, at, awaiting=bool(self._missing))
+
+    def _advance(self, due: int, ahead: int, at: HostTime) -> Iterator[Event]:
+        if ahead:
+            self.streams.lost("lost packet")
+            yield Event(self._name, "resynchronised", several(ahead, "packet", "missing"), at)
+        aged = {number: since + 1 for number, since in self._missing.items()}
+        if ahead <= self.MOST_MISSING:  # more than that is no disorder on the way
+            aged |= {(due + i) % 65536: 0 for i in range(ahead)}
+        self._missing = {n: since for n, since in aged.items() if since < self._patience}

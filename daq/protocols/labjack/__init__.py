@@ -1,0 +1,1 @@
+"""LabJack T7 and T8: stream packets and registers."""

@@ -1,0 +1,1 @@
+"""Modbus: RTU frames, readings in registers, block FIFOs."""

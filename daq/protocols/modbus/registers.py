@@ -1,0 +1,385 @@
+"""Readings in Modbus registers: where they are, what they mean, and when they were taken.
+
+Theory of operation
+-------------------
+A device is asked again and again for the registers that hold all channels and, where there are
+such, a counter and a time: in one request, so that they belong together, or in several where one
+reply would not hold them, or where a device refuses the registers that lie between. What came is
+one sample, taken at its own instant: at the device's time if it tells one, else halfway between
+first request and last reply. Rows are gathered and decoded together. Index and nominal rate only
+number the samples; the instants say when they were taken, and where two are more than ``GAP``
+periods apart samples are missing between. A reply whose counter or time is that of the one before
+is the same reading again, and dropped.
+
+Both roles are here: the simulated device encodes with the same map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from daq.protocols.block import Block, BlockFlag, CountsArray, Event
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.plural import several
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.protocols.block import HostTime
+
+DataType: TypeAlias = Literal[
+    "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"
+]
+WordOrder: TypeAlias = Literal["big", "little"]
+TimeFormat: TypeAlias = Literal["witmotion", "uint32-s", "uint32-ms", "uint32-us", "uint64-ns"]
+
+MOST_REGISTERS = 125
+"""In one Modbus reply."""
+N_ADDRESSES = 65536
+GATHER = 0.25
+"""Samples of so much host time make a block, s."""
+GAP = 2.5
+"""Periods between two readings that are a gap: polls jitter, so that one reading may slip."""
+JUMP_NS = 1_000_000_000
+"""A step of the device's time against the host's that is no latency."""
+DRIFT = 200e-6
+"""Largest relative rate error of a device's time."""
+
+_TICK_NS = {"uint32-s": 10**9, "uint32-ms": 10**6, "uint32-us": 10**3, "uint64-ns": 1}
+_TIME_WORDS = {"witmotion": 4, "uint64-ns": 4}
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "witmotion": {
+        "device_id": 0x50,
+        "function": 3,
+        "address": 0x34,
+        "data_type": "int16",
+        "time_address": 0x30,
+        "time_format": "witmotion",
+    },
+    "labjack-ain": {"device_id": 1, "function": 4, "address": 0, "data_type": "float32"},
+}
+"""What a preset's settings are; those given beside it go before."""
+
+WITMOTION_UNLOCK = (0x69, 0xB588)
+WITMOTION_RATE = 0x03
+WITMOTION_RATES = {10.0: 6, 50.0: 8, 100.0: 9, 200.0: 0x0B}
+"""Sampling rate in Hz → RRATE."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterMap:
+    """Where the readings of one sensor are.
+
+    ``word_order`` says which register of a longer value comes first: that with its most
+    significant word (``"big"``) or its least; within a register the bytes are big-endian.
+    """
+
+    function: int
+    addresses: tuple[int, ...]
+    data_type: DataType = "int16"
+    word_order: WordOrder = "big"
+    counter_address: int | None = None
+    """Of a 16-bit counter that changes with each reading."""
+    time_address: int | None = None
+    time_format: TimeFormat = "uint32-ms"
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any], n_channels: int) -> RegisterMap:
+        """Return the map that settings as in a bench file describe.
+
+        Parameters
+        ----------
+        settings
+            ``preset`` and keys of this class; ``address`` of the first channel where the channels
+            follow one another, or ``addresses``.
+        n_channels
+            Of the sensor.
+
+        Raises
+        ------
+        ValueError
+            Saying what was expected.
+        """
+        given = {key: value for key, value in settings.items() if value is not None}
+        chosen = {**PRESETS.get(given.get("preset", ""), {}), **given}
+        data_type: DataType = chosen.get("data_type", "int16")
+        words = np.dtype(data_type).itemsize // 2
+        if "addresses" in chosen:
+            addresses = tuple(chosen["addresses"])
+        elif "address" in chosen:
+            addresses = tuple(chosen["address"] + words * k for k in range(n_channels))
+        else:
+            raise ValueError("settings: address is missing; expected that of the first channel")
+        if len(addresses) != n_channels:
+            raise ValueError(
+                f"settings.addresses: {len(addresses)} given; expected {n_channels}, one a channel"
+            )
+        if "time_format" in chosen and "time_address" not in chosen:
+            raise ValueError(
+                f"settings.time_format = {chosen['time_format']!r}: expected with time_address only"
+            )
+        found = cls(
+            function=chosen.get("function", 3),
+            addresses=addresses,
+            data_type=data_type,
+            word_order=chosen.get("word_order", "big"),
+            counter_address=chosen.get("counter_address"),
+            time_address=chosen.get("time_address"),
+            time_format=chosen.get("time_format", "uint32-ms"),
+        )
+        end = max(address + words for address, words in found._extents)
+        if end > N_ADDRESSES:
+            raise ValueError(
+                f"settings: registers up to {end - 1}; expected at most {N_ADDRESSES - 1}, which is"
+                " the last there is"
+            )
+        return found
+
+    @property
+    def _extents(self) -> list[tuple[int, int]]:
+        words = self.dtype.itemsize // 2
+        extents = [(address, words) for address in self.addresses]
+        if self.counter_address is not None:
+            extents.append((self.counter_address, 1))
+        if self.time_address is not None:
+            extents.append((self.time_address, _TIME_WORDS.get(self.time_format, 2)))
+        return extents
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the counts."""
+        return np.dtype(self.data_type)
+
+    @property
+    def needed(self) -> tuple[int, ...]:
+        """Addresses of all registers that mean something, rising: the columns of a reading."""
+        return tuple(sorted({a + k for a, words in self._extents for k in range(words)}))
+
+    def reads(self, *, apart: bool = False) -> tuple[tuple[int, int], ...]:
+        """Return what to ask for: first address and number of registers of each request.
+
+        As few as can be, each of at most ``MOST_REGISTERS`` and each value in one; ``apart``
+        without any register that is not needed.
+        """
+        reads: list[tuple[int, int]] = []
+        for address, words in sorted(self._extents):
+            first, count = reads[-1] if reads else (address, 0)
+            end = max(first + count, address + words)
+            joins = address <= first + count or not apart
+            if reads and joins and end - first <= MOST_REGISTERS:
+                reads[-1] = (first, end - first)
+            else:
+                reads.append((address, words))
+        return tuple(reads)
+
+    def __str__(self) -> str:
+        """Say which registers are read."""
+        return ", ".join(f"{first} to {first + count - 1}" for first, count in self.reads())
+
+    def counts(self, registers: NDArray[np.uint16]) -> CountsArray:
+        """Decode readings: registers (n, n_needed) → counts (n, n_channels) of :attr:`dtype`."""
+        start = np.searchsorted(self.needed, self.addresses)
+        return self._values(registers, start, self.dtype)
+
+    def counters(self, registers: NDArray[np.uint16]) -> NDArray[np.int64] | None:
+        """Return the counter of each reading, (n,)."""
+        if self.counter_address is None:
+            return None
+        return registers[:, self.needed.index(self.counter_address)].astype(np.int64)
+
+    def times_ns(self, registers: NDArray[np.uint16]) -> NDArray[np.int64] | None:
+        """Return the device's time of each reading in ns since an epoch of its own, (n,)."""
+        if self.time_address is None:
+            return None
+        start = self.needed.index(self.time_address)
+        if self.time_format == "witmotion":
+            return _witmotion_ns(registers[:, start : start + 4].astype(np.int64))
+        kind = np.dtype(self.time_format.partition("-")[0])
+        ticks = self._values(registers, np.array([start]), kind)[:, 0].astype(np.int64)
+        return ticks * _TICK_NS[self.time_format]
+
+    def _values(
+        self, registers: NDArray[np.uint16], start: NDArray[np.int64], kind: np.dtype[Any]
+    ) -> CountsArray:
+        within = np.arange(kind.itemsize // 2)
+        columns = start[:, None] + (within if self.word_order == "big" else within[::-1])
+        words = np.ascontiguousarray(registers[:, columns].astype(">u2"))
+        values: CountsArray = words.view(kind.newbyteorder(">"))[:, :, 0].astype(kind)
+        return values
+
+    def encode(self, counts: NDArray[Any], *, counter: int = 0, time_ns: int = 0) -> dict[int, int]:
+        """Return the registers of one reading by address: what a device holds.
+
+        Counts beyond what the data type holds stand at its end.
+        """
+        kind = self.dtype
+        if kind.kind != "f":
+            ends = np.iinfo(kind)
+            counts = np.clip(np.rint(counts), ends.min, ends.max)
+        held: dict[int, int] = {}
+        for address, value in zip(self.addresses, counts.astype(kind), strict=True):
+            held |= self._words(address, value, kind)
+        if self.counter_address is not None:
+            held[self.counter_address] = counter & 0xFFFF
+        if self.time_address is not None and self.time_format == "witmotion":
+            held |= dict(enumerate(_witmotion_words(time_ns), self.time_address))
+        elif self.time_address is not None:
+            kind = np.dtype(self.time_format.partition("-")[0])
+            ticks = time_ns // _TICK_NS[self.time_format] % (1 << 8 * kind.itemsize)
+            held |= self._words(self.time_address, kind.type(ticks), kind)
+        return held
+
+    def _words(self, address: int, value: Any, kind: np.dtype[Any]) -> dict[int, int]:  # noqa: ANN401 -- a numpy scalar
+        words = np.array([value], kind.newbyteorder(">")).view(">u2").tolist()
+        return dict(enumerate(words if self.word_order == "big" else words[::-1], address))
+
+
+def _witmotion_ns(words: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return UTC ns of YYMM, DDHH, MMSS, ms: the first named is the low byte."""
+    low, high = words & 0xFF, words >> 8
+    months = (low[:, 0] + 30) * 12 + high[:, 0] - 1
+    days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + low[:, 1] - 1
+    seconds = ((days * 24 + high[:, 1]) * 60 + low[:, 2]) * 60 + high[:, 2]
+    nanoseconds: NDArray[np.int64] = (seconds * 1000 + words[:, 3]) * 10**6
+    return nanoseconds
+
+
+def _witmotion_words(time_ns: int) -> list[int]:
+    at = np.datetime64(time_ns // 10**6, "ms").item()
+    return [
+        at.month << 8 | at.year % 100,
+        at.hour << 8 | at.day,
+        at.second << 8 | at.minute,
+        at.microsecond // 1000,
+    ]
+
+
+class RegisterDecoder:
+    """Replies in, blocks out.
+
+    Parameters
+    ----------
+    sensor : str
+        Name for the blocks and events.
+    registers : RegisterMap
+        What is read.
+    sampling_rate : float
+        How often it is read, in Hz.
+    """
+
+    def __init__(self, sensor: str, registers: RegisterMap, *, sampling_rate: float) -> None:
+        self._sensor = sensor
+        self._map = registers
+        self._period_ns = 1e9 / sampling_rate
+        self._gather = max(1, round(GATHER * sampling_rate))
+        self._rows: list[Sequence[int]] = []
+        self._sent: list[int] = []
+        self._received: list[int] = []
+        self._at: HostTime | None = None  # when the last of them came
+        self._next = 0
+        self._last_instant: int | None = None
+        self._last_key: int | None = None
+        self._lag = 0.0  # host's time less the device's, at the least latency
+        self._lag_at = 0
+
+    def receive(
+        self, registers: Sequence[int], sent: HostTime, at: HostTime
+    ) -> list[Block | Event]:
+        """Take the registers the map needs; ``sent`` is when the first were asked for.
+
+        Raises
+        ------
+        RemoteProtocolError
+            It does not hold as many registers as were asked for.
+        """
+        n_needed = len(self._map.needed)
+        if len(registers) != n_needed:
+            raise RemoteProtocolError(f"{n_needed} registers needed, {len(registers)} came")
+        self._rows.append(registers)
+        self._sent.append(sent.monotonic_ns)
+        self._received.append(at.monotonic_ns)
+        self._at = at
+        return self.flush() if len(self._rows) >= self._gather else []
+
+    def flush(self) -> list[Block | Event]:
+        """Return what has been gathered."""
+        at = self._at
+        if not self._rows or at is None:
+            return []
+        registers = np.array(self._rows, np.uint16)
+        sent, received = np.array(self._sent, np.int64), np.array(self._received, np.int64)
+        self._rows, self._sent, self._received = [], [], []
+        times = self._map.times_ns(registers)
+        keys = self._map.counters(registers) if times is None else times
+        if keys is not None:
+            new = np.diff(keys, prepend=-1 if self._last_key is None else self._last_key) != 0
+            self._last_key = int(keys[-1])
+            registers, keys, sent, received = registers[new], keys[new], sent[new], received[new]
+            times = keys if times is not None else None
+        if not len(registers):
+            return []
+        found: list[Block | Event] = []
+        instants = sent + (received - sent) // 2
+        restarted = self._last_instant is None
+        if times is not None:
+            lags = received - times
+            lag = int(lags.min())
+            jumped = not restarted and abs(lag - self._lag) > JUMP_NS
+            if jumped or int(lags.max()) - lag > JUMP_NS:
+                restarted = True
+                found.append(Event(self._sensor, "reset", "the device's time jumped", at))
+                lag = int(lags[-1])
+            if restarted:
+                self._lag = lag
+            else:
+                leak = DRIFT * (at.monotonic_ns - self._lag_at)
+                self._lag = min(lag, self._lag + leak)
+            self._lag_at = at.monotonic_ns
+            if int(lags.max()) - lag <= JUMP_NS:
+                instants = times + round(self._lag)
+        counts = self._map.counts(registers)
+        return found + self._blocks(counts, instants, keys, restarted=restarted, at=at)
+
+    def _blocks(
+        self,
+        counts: CountsArray,
+        instants: NDArray[np.int64],
+        keys: NDArray[np.int64] | None,
+        *,
+        restarted: bool,
+        at: HostTime,
+    ) -> list[Block | Event]:
+        before = instants[0] - round(self._period_ns)
+        if self._last_instant is not None:  # instants are the host's, also where a clock restarts
+            before = np.int64(self._last_instant)
+        steps = np.diff(instants, prepend=before) / self._period_ns
+        missing = np.where(steps > GAP, np.rint(steps) - 1, 0).astype(np.int64)
+        starts = np.flatnonzero(missing)
+        edges = np.unique(np.concatenate([[0], starts, [len(instants)]]))
+        found: list[Block | Event] = []
+        for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            flags, reason = BlockFlag.NONE, ""
+            if restarted and start == 0:
+                flags |= BlockFlag.CLOCK_RESTART
+            if missing[start]:
+                flags |= BlockFlag.MISSING_ESTIMATED
+                reason = several(int(missing[start]), "poll", "without a reading")
+            part = counts[start:stop]
+            if part.dtype.kind != "f":
+                ends = np.iinfo(self._map.dtype)
+                if (part == ends.max).any() or (part == ends.min).any():
+                    flags |= BlockFlag.CLIPPED
+            first = self._next + int(missing[start])
+            counter = None if keys is None else int(keys[start])
+            found.append(
+                Block(self._sensor, first, part, at, counter, flags, reason, instants[start:stop])
+            )
+            self._next = first + stop - start
+        self._last_instant = int(instants[-1])
+        return found

@@ -1,0 +1,223 @@
+"""The rows of one sensor on their way to disk: in whole chunks, in joined blocks."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.recording import file_format
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.typing import NDArray
+
+    from daq.protocols.block import Block, HostTime
+    from daq.recording.file_format import SensorLayout
+
+_MERGED_SECONDS = 0.1
+
+
+class Table:
+    """A dataset of rows that are added in small numbers; unfiltered, so written in place."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._waiting: list[NDArray[np.void]] = []
+        self.n_rows = 0
+
+    def add(self, row: NDArray[np.void]) -> None:
+        """Take a row; it waits for the next write."""
+        self._waiting.append(row)
+
+    def write(self) -> None:
+        """Write what waits."""
+        if not self._waiting:
+            return
+        rows = np.concatenate(self._waiting)
+        self._dataset.resize(self.n_rows + len(rows), axis=0)
+        self._dataset[self.n_rows :] = rows
+        self.n_rows += len(rows)
+        self._waiting.clear()
+
+
+class Chunked:
+    """A dataset that is written in whole chunks; what does not fill one waits."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._buffer = np.empty(dataset.chunks, dataset.dtype)
+        self._filled = 0
+        self.n_written = 0
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Take rows, and write the chunks they fill."""
+        length = len(self._buffer)
+        taken = min(len(rows), length - self._filled) if self._filled else 0
+        if taken:
+            self._buffer[self._filled : self._filled + taken] = rows[:taken]
+            self._filled += taken
+            if self._filled == length:
+                self._filled = 0
+                self._write(self._buffer)
+        whole = taken + (len(rows) - taken) // length * length
+        if whole > taken:
+            self._write(rows[taken:whole])
+        rest = rows[whole:]
+        if len(rest):
+            self._buffer[: len(rest)] = rest
+            self._filled = len(rest)
+
+    def finish(self) -> None:
+        """Write what waits, as a last, partial chunk."""
+        rest, self._filled = self._filled, 0
+        if rest:
+            self._write(self._buffer[:rest])
+
+    def _write(self, rows: NDArray[Any]) -> None:
+        self._dataset.resize(self.n_written + len(rows), axis=0)
+        self._dataset[self.n_written :] = rows
+        self.n_written += len(rows)
+
+
+@dataclass(slots=True)
+class _Row:
+    """A block that may still grow."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+    received: HostTime
+    device_counter: int
+    flags: int
+
+    def array(self) -> NDArray[np.void]:
+        """Return its row, without checksum."""
+        at = self.received.monotonic_ns, self.received.utc_ns
+        begin = self.first_sample, self.first_row, self.n_samples
+        return np.array(
+            [(*begin, *at, self.device_counter, self.flags, 0)], file_format.BLOCK_DTYPE
+        )
+
+
+class SensorRows:
+    """The rows of one sensor.
+
+    Small blocks that follow each other without a gap become one row of ``blocks`` until that is a
+    tenth of a second long: at 200 Hz a serial port hands over three or four samples at a time, and
+    their rows would be larger than they.
+    """
+
+    def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
+        self.samples = Chunked(group["samples"])
+        self.instants = Chunked(group["instants"])
+        self._polled: bool | None = None
+        self.blocks = Table(group["blocks"])
+        self.gaps = Table(group["gaps"])
+        self._layout = sensor
+        self._merged_length = max(1, round(sensor.sampling_rate * _MERGED_SECONDS))
+        self._current: _Row | None = None
+        self._crc32 = 0
+        self._whole: list[NDArray[np.void]] = []
+        self._n_rows = 0
+
+    def append(self, block: Block) -> None:
+        """Take a block.
+
+        Raises
+        ------
+        RecordingError
+            If it is not of this sensor's shape or type.
+        """
+        counts = self._converted(block)
+        if self._polled is None:
+            self._polled = block.instants_ns is not None
+        elif self._polled != (block.instants_ns is not None):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: some blocks with instants of their samples, some without"
+            )
+        merged = self._merge(block)
+        self._crc32 = zlib.crc32(counts.data, self._crc32 if merged else 0)
+        self._n_rows += block.n_samples
+        self.samples.add(counts)
+        if block.instants_ns is not None:
+            self.instants.add(block.instants_ns)
+
+    def collect(self) -> None:
+        """Hand the rows of blocks whose samples are all written to their table."""
+        written = self.samples.n_written
+        if self._polled:
+            written = min(written, self.instants.n_written)
+        if self._n_rows == written:
+            self._end_current()
+        done = 0
+        for row in self._whole:
+            if row["first_row"][0] + row["n_samples"][0] > written:
+                break
+            self.blocks.add(row)
+            done += 1
+        del self._whole[:done]
+
+    def finish(self) -> None:
+        """Write everything that waits."""
+        self._end_current()
+        self.samples.finish()
+        self.instants.finish()
+
+    @property
+    def committable_rows(self) -> int:
+        """Number of rows up to the end of the last block that was collected."""
+        if self._whole:
+            return int(self._whole[0]["first_row"][0])
+        return self._n_rows if self._current is None else self._current.first_row
+
+    def _merge(self, block: Block) -> bool:
+        """Continue the current block with this one, or end it and begin another."""
+        current = self._current
+        if (
+            current is not None
+            and block.first_sample == current.first_sample + current.n_samples
+            and int(block.flags) == current.flags
+            and not block.reason
+            and current.n_samples + block.n_samples <= self._merged_length
+        ):
+            current.n_samples += block.n_samples
+            current.received = block.received
+            return True
+        self._end_current()
+        counter = file_format.NO_COUNTER if block.device_counter is None else block.device_counter
+        self._current = _Row(
+            block.first_sample,
+            self._n_rows,
+            block.n_samples,
+            block.received,
+            counter,
+            int(block.flags),
+        )
+        return False
+
+    def _end_current(self) -> None:
+        if self._current is not None:
+            row = self._current.array()
+            row["crc32"] = file_format.block_crc32(row, self._crc32)
+            self._whole.append(row)
+            self._current = None
+
+    def _converted(self, block: Block) -> NDArray[Any]:
+        expected = len(self._layout.channels)
+        if block.counts.ndim != 2 or block.counts.shape[1] != expected:
+            raise RecordingError(
+                f"sensor {block.sensor!r}: a block of shape {block.counts.shape};"
+                f" expected (n_samples, {expected})"
+            )
+        counts: NDArray[Any] = np.ascontiguousarray(block.counts, self._layout.dtype)
+        safe = np.can_cast(block.counts.dtype, self._layout.dtype, "safe")
+        if not safe and not np.array_equal(counts, block.counts):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: counts of type {block.counts.dtype} do not fit"
+                f" {self._layout.dtype}"
+            )
+        return counts

@@ -1,0 +1,160 @@
+"""Names, types and version of the recording format (documented in ``docs/recording-format.md``)."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.bench.model import Channel, PolesZeros, Sensor
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.driver_rules import DriverRules
+
+FORMAT = "huddle-recording"
+FORMAT_VERSION = 1
+
+NO_COUNTER = -1
+"""``device_counter`` of a block whose device has none."""
+
+BLOCK_DTYPE = np.dtype(
+    [
+        ("first_sample", "<i8"),
+        ("first_row", "<i8"),
+        ("n_samples", "<i8"),
+        ("monotonic_ns", "<i8"),
+        ("utc_ns", "<i8"),
+        ("device_counter", "<i8"),
+        ("flags", "<i4"),
+        ("crc32", "<u4"),
+    ]
+)
+GAP_DTYPE = np.dtype(
+    [("first_sample", "<i8"), ("missing", "<i8"), ("estimated", "<i4"), ("reason", "S100")]
+)
+EVENT_DTYPE = np.dtype(
+    [
+        ("monotonic_ns", "<i8"),
+        ("utc_ns", "<i8"),
+        ("sensor", "S64"),
+        ("kind", "S32"),
+        ("text", "S200"),
+    ]
+)
+
+# Columns of ``/committed``. Its last row counts events, and says whether the file was closed.
+ROWS, BLOCKS, GAPS = range(3)
+EVENTS, CLOSED = range(2)
+
+BLOCKS_PER_CHUNK = 256
+GAPS_PER_CHUNK = 32
+EVENTS_PER_CHUNK = 64
+
+
+@dataclass(frozen=True, slots=True)
+class SensorLayout:
+    """How one sensor stands in a recording.
+
+    Attributes
+    ----------
+    name, model, serial_number, driver, port : str
+        As in the bench file, or as the device says.
+    channels : tuple of Channel
+        Columns of ``samples``.
+    sampling_rate : float
+        In Hz; as read back from the device where it says, else nominal.
+    dtype : numpy dtype
+        Of the raw counts.
+    clock : str
+        Sensors of one clock name are sampled by one clock.
+    """
+
+    name: str
+    channels: tuple[Channel, ...]
+    sampling_rate: float
+    dtype: np.dtype[Any]
+    clock: str = ""
+    model: str = ""
+    serial_number: str = ""
+    driver: str = ""
+    port: str = ""
+
+    @classmethod
+    def of(cls, sensor: Sensor, driver: DriverRules) -> SensorLayout:
+        """Return the layout of a sensor of a bench file."""
+        return cls(
+            name=sensor.name,
+            channels=sensor.channels,
+            sampling_rate=sensor.sampling_rate,
+            dtype=np.dtype(driver.counts_dtype(sensor)),
+            clock=sensor.clock_name(shares_clock=driver.shares_clock),
+            model=sensor.model,
+            serial_number=sensor.serial_number,
+            driver=sensor.driver,
+            port=sensor.port,
+        )
+
+
+def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
+    """Return channels as attributes of the samples."""
+    return {
+        "channels": [channel.name for channel in channels],
+        "sensitivity": np.array([channel.sensitivity for channel in channels]),
+        "unit": [channel.unit for channel in channels],
+        "direction": [channel.direction or "" for channel in channels],
+        "auxiliary": np.array([channel.auxiliary for channel in channels], dtype=np.int8),
+        "response": [_response_text(channel.response) for channel in channels],
+    }
+
+
+def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py is untyped)
+    """Return the channels that :func:`channel_attributes` described."""
+    columns = zip(
+        *(attributes[key] for key in ("channels", "sensitivity", "unit", "direction")),
+        *(attributes[key] for key in ("auxiliary", "response")),
+        strict=True,
+    )
+    return tuple(
+        Channel(
+            name=name,
+            sensitivity=float(sensitivity),
+            unit=unit,
+            direction=direction or None,
+            auxiliary=bool(auxiliary),
+            response=PolesZeros.model_validate_json(response) if response else None,
+        )
+        for name, sensitivity, unit, direction, auxiliary, response in columns
+    )
+
+
+def _response_text(response: PolesZeros | None) -> str:
+    if response is None:
+        return ""
+    return json.dumps(
+        {
+            "zeros": [[z.real, z.imag] for z in response.zeros],
+            "poles": [[p.real, p.imag] for p in response.poles],
+            "normalization": response.normalization,
+            "frequency": response.frequency,
+        }
+    )
+
+
+def block_crc32(row: NDArray[np.void], counts_crc32: int) -> int:
+    """Return a block's checksum: over its counts, continued over its row up to ``crc32``.
+
+    Parameters
+    ----------
+    row : void, dtype BLOCK_DTYPE
+        The block's row; its ``crc32`` is not read.
+    counts_crc32 : int
+        CRC-32 of the block's counts as little-endian bytes in C order.
+    """
+    return zlib.crc32(row.tobytes()[: -BLOCK_DTYPE["crc32"].itemsize], counts_crc32)

@@ -1,0 +1,217 @@
+"""Checks recordings, closes those whose recorder was killed, and adds results to closed ones.
+
+Theory of operation
+-------------------
+Nothing here changes a recording in place. A copy beside it is changed, fsynced and renamed over the
+original, so that at any instant there is one good file under its name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.host_clock import SystemClock
+from daq.recording import file_format
+from daq.recording.locking import is_being_written
+from daq.recording.reader import Recording, SensorRecord
+from daq.recording.superblock import Superblock
+from daq.recording.writer import LIBVER, sync_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from daq.protocols.block import HostTime
+
+_ROWS_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReport:
+    """What a recording holds of one sensor.
+
+    ``bad_blocks`` are indices of committed blocks whose checksum is wrong or that cannot be read;
+    ``n_uncommitted`` rows were written but never acknowledged, and are not returned as samples.
+    """
+
+    name: str
+    n_samples: int
+    n_blocks: int
+    n_gaps: int
+    bad_blocks: tuple[int, ...]
+    n_uncommitted: int
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a recording holds."""
+
+    path: Path
+    closed: bool
+    being_written: bool
+    sensors: tuple[SensorReport, ...]
+    n_events: int
+
+    @property
+    def intact(self) -> bool:
+        """Whether every committed block is what was written."""
+        return not any(sensor.bad_blocks for sensor in self.sensors)
+
+
+def verify(path: str | Path) -> Report:
+    """Check every committed block against its checksum.
+
+    Raises
+    ------
+    NotARecordingError, RecordingError
+        If it is no recording, or cannot be read at all.
+    """
+    path = Path(path)
+    being_written = is_being_written(path) if path.is_file() else False
+    with Recording.open(path, alone=True) as recording:
+        sensors = tuple(_verify_sensor(sensor) for sensor in recording.sensors)
+        return Report(path, recording.closed, being_written, sensors, len(recording.events))
+
+
+def heal(path: str | Path, *, now: HostTime | None = None) -> Report:
+    """Close a recording whose recorder was killed: its uncommitted tail goes, the rest stays.
+
+    A recording that was closed is left as it is.
+
+    Raises
+    ------
+    NotARecordingError
+        If it is no recording.
+    RecordingError
+        If a recorder is writing it, or the copy cannot be written.
+    """
+    path = Path(path)
+    report = verify(path)
+    if report.closed:
+        return report
+    if report.being_written:
+        raise RecordingError(
+            f"{path}: is being written, or open in another program; stop that first"
+        )
+    now = SystemClock().now() if now is None else now
+    with _replaced(path) as copy:
+        with copy.open("r+b") as raw:
+            raw.write(Superblock.of(path).cleared())
+        with h5py.File(copy, "r+", libver=LIBVER) as file:
+            _cut_to_committed(file, report)
+            _add_last_events(file, report, now)
+    return verify(path)
+
+
+def write_results(
+    path: str | Path,
+    method: str,
+    arrays: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the result of a method to ``/results/<method>``, replacing an earlier one.
+
+    A recording whose recorder was killed is healed first.
+
+    Raises
+    ------
+    RecordingError
+        If a recorder is writing the file, or it cannot be written.
+    """
+    path = Path(path)
+    heal(path)
+    with _replaced(path) as copy, h5py.File(copy, "r+", libver=LIBVER) as file:
+        results = file.require_group("results")
+        if method in results:
+            del results[method]
+        group = results.create_group(method)
+        for name, values in arrays.items():
+            group.create_dataset(name, data=values)
+        group.attrs.update(attributes or {})
+
+
+def _verify_sensor(sensor: SensorRecord) -> SensorReport:
+    blocks = sensor.blocks
+    bad = [number for number, row in enumerate(blocks) if not _is_intact(sensor, row)]
+    return SensorReport(
+        name=sensor.name,
+        n_samples=sensor.n_samples,
+        n_blocks=len(blocks),
+        n_gaps=len(sensor.gaps),
+        bad_blocks=tuple(bad),
+        n_uncommitted=sensor.n_written - sensor.n_samples,
+    )
+
+
+def _is_intact(sensor: SensorRecord, row: NDArray[np.void]) -> bool:
+    crc32 = 0
+    first, end = int(row["first_row"]), int(row["first_row"] + row["n_samples"])
+    try:
+        for start in range(first, end, _ROWS_AT_ONCE):
+            counts = sensor.counts(start, min(start + _ROWS_AT_ONCE, end))
+            crc32 = zlib.crc32(np.ascontiguousarray(counts).data, crc32)
+    except (RecordingError, IndexError):
+        return False
+    return bool(file_format.block_crc32(row, crc32) == row["crc32"])
+
+
+def _cut_to_committed(file: h5py.File, report: Report) -> None:
+    for sensor in report.sensors:
+        group = file["sensors"][sensor.name]
+        group["samples"].resize(sensor.n_samples, axis=0)
+        instants = group["instants"]
+        instants.resize(min(sensor.n_samples, len(instants)), axis=0)
+        group["blocks"].resize(sensor.n_blocks, axis=0)
+        group["gaps"].resize(sensor.n_gaps, axis=0)
+
+
+def _add_last_events(file: h5py.File, report: Report, now: HostTime) -> None:
+    """Say in the file what happened to it, and that it is closed."""
+    lines = [("", "stopped", "the recorder was killed; closed by repair")]
+    lines += [
+        (sensor.name, "checksum", f"{len(sensor.bad_blocks)} damaged blocks, first at row {row}")
+        for sensor in report.sensors
+        for row in sensor.bad_blocks[:1]
+    ]
+    rows = [
+        (now.monotonic_ns, now.utc_ns, name.encode(), kind.encode(), text.encode())
+        for name, kind, text in lines
+    ]
+    n_events = report.n_events + len(rows)
+    events = file["events"]
+    events.resize(n_events, axis=0)
+    events[report.n_events :] = np.array(rows, file_format.EVENT_DTYPE)
+    counts = [[s.n_samples, s.n_blocks, s.n_gaps] for s in report.sensors]
+    file["committed"][...] = [*counts, [n_events, 1, 0]]
+
+
+@contextlib.contextmanager
+def _replaced(path: Path) -> Iterator[Path]:
+    """Give a copy to change; it takes the original's place when all went well."""
+    copy = path.with_name(f".{path.name}.copy")
+    try:
+        shutil.copyfile(path, copy)
+        yield copy
+        with copy.open("r+b") as written:  # Windows syncs only what may be written
+            os.fsync(written)
+        copy.replace(path)
+        sync_directory(path.parent)
+    except RecordingError:
+        raise
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise RecordingError(
+            f"{path}: cannot be rewritten ({error}); it stays as it was"
+        ) from error
+    finally:
+        copy.unlink(missing_ok=True)

@@ -1,0 +1,81 @@
+"""What is left between the sensors' clocks, what that does to the noise, and how they drift."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from daq.results.band_summary import band_of
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import FloatArray
+
+NOTHING, HARMLESS, MATTERS = 0.001, 0.01, 0.05
+"""Share of the noise that comes from the clocks: below it nothing, negligible, small."""
+
+
+def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
+    """Return which share of each channel's noise in the band is expected to come from clocks.
+
+    Shape (n_channels,); NaN where it is not known (yet).
+    """
+    share = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
+    if share is None or not snapshot.results:
+        return np.full(len(snapshot.channels), np.nan)
+    low, high = band_of(settings, snapshot)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    noise = next(iter(snapshot.results.values())).noise_psd[inside]
+    known = np.isfinite(share[inside] * noise)
+    added = np.where(known, share[inside] * np.abs(noise), 0.0)
+    total = np.where(known, noise, 0.0).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
+
+
+def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]:
+    """Return `effect` of each sensor's worst channel; NaN where it is not known (yet)."""
+    worst = dict.fromkeys((label.sensor for label in snapshot.channels), math.nan)
+    for label, share in zip(snapshot.channels, effect(snapshot, settings), strict=True):
+        worst[label.sensor] = float(np.fmax(worst[label.sensor], share))
+    return worst
+
+
+def grade(share: float) -> Literal["good", "doubtful", "bad"]:
+    """Return how bad it is that clocks make up this share of the noise."""
+    return "good" if share < HARMLESS else "doubtful" if share < MATTERS else "bad"
+
+
+def residuals(snapshot: Snapshot) -> dict[str, float]:
+    """Return what is left between the clocks in seconds rms, by sensor.
+
+    Where the motion measures it, it is against the reference sensor, which has none itself.
+    """
+    known = snapshot.diagnostics.get("synchronisation", {}).get("residual")
+    return {clock.sensor: clock.residual for clock in snapshot.clocks} if known is None else known
+
+
+def reference(snapshot: Snapshot) -> str | None:
+    """Return the sensor against which the motion measures the others' clocks, if it does."""
+    if not any(clock.refined for clock in snapshot.clocks):
+        return None
+    left = residuals(snapshot)
+    return next((clock.sensor for clock in snapshot.clocks if left[clock.sensor] == 0), None)
+
+
+def lags(snapshot: Snapshot) -> FloatArray:
+    """Return `Snapshot.drift`, with lags behind the reference where there is one.
+
+    Behind the computer's clock all lag alike by what arrival times leave open, which is far more
+    than what motion leaves between them, and harms no estimate.
+    """
+    drift = snapshot.drift
+    sensors = [clock.sensor for clock in snapshot.clocks]
+    against = reference(snapshot)
+    if against is None or not len(drift):
+        return drift
+    lag = drift[:, 1:] - drift[:, [1 + sensors.index(against)]]
+    return np.column_stack([drift[:, 0], lag])

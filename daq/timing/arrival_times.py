@@ -1,0 +1,397 @@
+"""From block arrival times to the instant of every sample.
+
+Theory of operation
+-------------------
+The last sample of a block cannot have been taken after the block had been received, and latency
+only adds. So the instants of the samples, plus a constant (the shortest latency), are the *lower
+envelope* of the arrival times: late blocks, however late and however many, do not move it. Times
+are on the host's monotonic clock, in seconds from the recording's creation; a host whose UTC is
+stepped in the middle of a run changes nothing.
+
+Arrival times are thinned to the earliest in each second, so that memory and work do not grow with
+the block rate. A line under all of them (the edge of their lower convex hull below their mean)
+takes out what is common; the earliest in each stretch of `_NODE` seconds then is one observation
+for the filter of :mod:`daq.timing.kalman`, which follows a rate that wanders; where blocks are
+polled, a stretch is as long as :mod:`daq.timing.usb_polling` says. Delays measured from the samples
+(:mod:`daq.alignment.delay_estimation`) join there.
+
+A stretch between restarts of the device's clock is an :class:`daq.timing.clock_model.Epoch`; within
+one, the sample index counts without error. A block that says ``CLOCK_RESTART`` or
+``MISSING_ESTIMATED`` begins a new one, and so does a block far earlier than possible: then the
+host's clock has been asleep.
+
+Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
+statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
+its nominal rate. Beside sensors without UTC the host's UTC must place them; where arrivals show
+that to be wrong, statements are moved to where arrivals put them. A step of one second while the
+samples are counted on is a leap second: UTC's, and not the sensor's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.protocols.block import BlockFlag
+from daq.timing.clock_model import Clock, ClockState, Epoch
+from daq.timing.kalman import Observations, smooth
+from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
+from daq.timing.usb_polling import BEATS_PER_WINDOW, Polls, shows
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int64]
+
+_NANO = 1e-9
+_NODE = 10.0  # seconds of arrival times that make one observation
+_MOST_NODES = 3000
+_FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
+_WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
+_ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
+_RATE_OFF = 0.02  # share by which a rate may be off
+_RECENT = 120.0  # seconds that a host may be held up, all its blocks late, and not have slept
+_UTC_JUMP = 0.01  # samples
+_LEAP = 1e-3  # seconds; how well a step must agree with a leap second
+_BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+_UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredDelays:
+    """When samples were taken, as measured from the motion, up to one constant.
+
+    Attributes
+    ----------
+    index : float64, shape (n,)
+        (Fractional) sample indices, increasing.
+    seconds : float64, shape (n,)
+        When they were taken.
+    std : float64, shape (n,)
+        Standard deviation of `seconds`.
+    """
+
+    index: FloatArray
+    seconds: FloatArray
+    std: FloatArray
+
+
+@dataclass(slots=True)
+class ArrivalTimes:
+    """Arrival times of a sensor's blocks, thinned; grows with the recording.
+
+    Parameters
+    ----------
+    sampling_rate : float
+        Nominal, in Hz.
+    origin_monotonic_ns, origin_utc_ns : int
+        The recording's origin on both host clocks.
+
+    Attributes
+    ----------
+    longest_block : float
+        In seconds.
+    moved : float
+        Seconds by which stated times are moved.
+    """
+
+    sampling_rate: float
+    origin_monotonic_ns: int
+    origin_utc_ns: int
+    longest_block: float = 0.0
+    moved: float = 0.0
+    _epoch_starts: list[int] = field(default_factory=list)
+    _index: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _late: FloatArray = field(default_factory=lambda: np.empty(0))
+    _epoch: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _end_sample: int = 0
+    _device_utc: bool = False
+    _polls: Polls = field(default_factory=Polls)
+    _stretch: int = -1
+    _lowest: tuple[float, float] = (np.inf, np.inf)
+    _leapt: float = 0.0
+    _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
+
+    def add(self, blocks: NDArray[Any]) -> None:
+        """Take further rows of a recording's ``blocks``.
+
+        Parameters
+        ----------
+        blocks : structured array, shape (n_blocks,)
+            With the fields first_sample, n_samples, monotonic_ns, device_counter, flags.
+        """
+        blocks = blocks[blocks["n_samples"] > 0]
+        if len(blocks) == 0:
+            return
+        flags = blocks["flags"]
+        first = blocks["first_sample"].astype(np.int64)
+        length = blocks["n_samples"].astype(np.int64)
+        begins = not self._epoch_starts
+        if begins:
+            self._device_utc = bool(flags[0] & BlockFlag.DEVICE_UTC)
+        arrived = (blocks["monotonic_ns"].astype(np.int64) - self.origin_monotonic_ns) * _NANO
+        if self._device_utc:
+            index = first
+            elapsed = (blocks["device_counter"].astype(np.int64) - self.origin_utc_ns) * _NANO
+        else:
+            index = first + length - 1
+            elapsed = arrived
+        late = elapsed - index / self.sampling_rate
+        if not self._device_utc:
+            self._polls.add(index, late)
+        if self._device_utc:
+            late -= self._leapt
+            step = np.diff(late, prepend=late[:1] if begins else self._late[-1:])
+            counted_on = first == np.append(self._end_sample, (first + length)[:-1])
+            leaps = np.where(counted_on & (np.abs(np.abs(step) - 1) < _LEAP), np.round(step), 0.0)
+            late -= np.cumsum(leaps)
+            step -= leaps
+            self._leapt += float(leaps.sum())
+            breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
+        else:
+            breaks = ((flags & int(_BREAKS)) != 0) | self._too_early(index, late)
+        breaks[0] |= begins
+        epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
+        self._epoch_starts += [int(start) for start in first[breaks]]
+        self._end_sample = int(first[-1] + length[-1])
+        self.longest_block = max(self.longest_block, float(length.max()) / self.sampling_rate)
+        if self._device_utc:
+            least = np.full(len(self._epoch_starts), np.inf)
+            least[: len(self._latency)] = self._latency
+            np.minimum.at(least, epoch, arrived - late - (first + length - 1) / self.sampling_rate)
+            self._latency = least
+        # A second that is not over yet is thinned again with what comes.
+        index = np.concatenate([self._index[-1:], index])
+        late = np.concatenate([self._late[-1:], late])
+        epoch = np.concatenate([self._epoch[-1:], epoch])
+        seconds = (index / self.sampling_rate).astype(np.int64)
+        late_by = levelled(index, late, epoch, second=self.sampling_rate)
+        kept = least_of_each(seconds, late_by, epoch)
+        self._index = np.concatenate([self._index[:-1], index[kept]])
+        self._late = np.concatenate([self._late[:-1], late[kept]])
+        self._epoch = np.concatenate([self._epoch[:-1], epoch[kept]])
+
+    @property
+    def start(self) -> float:
+        """When sample 0 arrived, by the least lateness of the first seconds; or was taken, by UTC.
+
+        In seconds from the origin.
+        """
+        first = self._index <= self._index[0] + _NODE * self.sampling_rate
+        return float(self._late[first & (self._epoch == self._epoch[0])].min()) + self.moved
+
+    @property
+    def latency(self) -> float:
+        """Seconds at least from the last sample of a block, as stated, to its arrival.
+
+        In the longest epoch: a device may state wrong times until it has found the right one.
+        """
+        lengths = [end - first for first, end in self._bounds()]
+        return float(self._latency[int(np.argmax(lengths))])
+
+    def arrives_with(self, other: ArrivalTimes) -> bool:
+        """Whether blocks of both are received together, so that both count alike."""
+        _, mine, others = np.intersect1d(self._index, other._index, return_indices=True)
+        return len(mine) > 0 and np.array_equal(self._late[mine], other._late[others])
+
+    def earliest(self) -> Iterator[tuple[int, int, FloatArray, FloatArray]]:
+        """Yield of each epoch its first sample and the one after its last, and early arrivals.
+
+        Those are indices of samples, and seconds from the origin by which they were taken.
+        """
+        for number, (first, end) in enumerate(self._bounds()):
+            index = self._index[self._epoch == number].astype(np.float64)
+            late = self._late[self._epoch == number]
+            yield first, end, index, index / self.sampling_rate + late
+
+    def rate(self) -> tuple[float, float]:
+        """Return the rate against nominal on the host's clock in ppm, and its uncertainty.
+
+        By the line under all arrivals: for sensors that share a clock, which need no more.
+        """
+        slope, anchors = self._lines()
+        above = self._late - slope * self._index - np.array(anchors)[self._epoch]
+        duration = float(self._index[-1] - self._index[0]) / self.sampling_rate
+        drift = slope * self.sampling_rate
+        std = float(np.median(above)) / duration if duration else math.nan
+        return -drift / (1 + drift) * 1e6, std * 1e6
+
+    def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:
+        """Return the clock, from everything taken so far.
+
+        Parameters
+        ----------
+        sensor : str
+            Its name.
+        measured : MeasuredDelays, optional
+            What the samples say.
+        """
+        if self._device_utc:
+            return self._stated(sensor)
+        slope, anchors = self._lines()
+        return self._filtered(sensor, slope, anchors, measured)
+
+    def _bounds(self) -> list[tuple[int, int]]:
+        """First sample of each epoch, and the one after its last."""
+        return list(itertools.pairwise([*self._epoch_starts, self._end_sample]))
+
+    def _stated(self, sensor: str) -> Clock:
+        """Follow the device's own statements; at the nominal rate, if they agree with it."""
+        epochs = []
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = self._epoch == number
+            index, late = self._index[mine].astype(float), self._late[mine]
+            if np.ptp(late) < _UTC_TOLERANCE:
+                index = np.array([first, max(end, first + 1)], dtype=float)
+                late = np.full(2, late[0])
+            seconds = index / self.sampling_rate + late + self.moved
+            epochs.append(Epoch(first, end, index, seconds))
+        ppm, wander = 0.0, 0.0
+        if any(len(epoch.index) > 2 for epoch in epochs):
+            longest = max(epochs, key=lambda epoch: epoch.end_sample - epoch.first_sample)
+            rates = np.diff(longest.index) / np.diff(longest.seconds) / self.sampling_rate
+            ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
+        state = ClockState(
+            sensor, "device UTC", epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
+        )
+        return Clock(tuple(epochs), state)
+
+    def _lines(self) -> tuple[float, list[float]]:
+        """One slope (lateness per sample) for all epochs, and the lateness at index 0 of each."""
+        slopes, weights = [0.0], [0.0]
+        for number in range(len(self._epoch_starts)):
+            mine = self._epoch == number
+            if np.count_nonzero(mine) > 1:
+                index, late = self._index[mine].astype(float), self._late[mine]
+                slopes.append(supporting_line(index, late)[1])
+                weights.append(float(index[-1] - index[0]) ** 2)
+        total = sum(weights)
+        slope = float(np.dot(slopes, weights) / total) if total else 0.0
+        late = self._late - slope * self._index
+        return slope, [
+            float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
+        ]
+
+    def _too_early(self, index: IntArray, late: FloatArray) -> BoolArray:
+        """Whether blocks come far below the lateness before: then the host's clock stood still.
+
+        Even if the rate is off; so only this stretch of `_RECENT` and the one before it are looked
+        at, and all blocks of one must have been delayed to be taken for the rule.
+        """
+        raised = late + _RATE_OFF * index / self.sampling_rate
+        stretch = index // round(_RECENT * self.sampling_rate)
+        early = np.zeros(len(index), dtype=bool)
+        for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(stretch)) + 1):
+            before, lowest = self._lowest
+            if stretch[rows[0]] != self._stretch:
+                self._stretch, before, lowest = int(stretch[rows[0]]), lowest, np.inf
+            so_far = np.minimum.accumulate(np.append(lowest, raised[rows]))
+            early[rows] = raised[rows] < np.minimum(before, so_far[:-1]) - _ASLEEP
+            self._lowest = before, float(so_far[-1])
+        return early
+
+    def _stretches(self, length: float) -> IntArray:
+        """Return which stretch of `length` samples of its epoch each arrival lies in.
+
+        What is left at the end counts as one if it is half as long, else with the one before: few
+        blocks may all be late.
+        """
+        starts = np.array(self._epoch_starts)
+        last = self._index[np.searchsorted(self._epoch, np.arange(len(starts)), side="right") - 1]
+        whole = np.maximum(np.round((last - starts) / length), 1)
+        number = (self._index - starts[self._epoch]) // length
+        return np.asarray(np.minimum(number, whole[self._epoch] - 1), dtype=np.int64)
+
+    def _filtered(
+        self,
+        sensor: str,
+        slope: float,
+        anchors: list[float],
+        measured: MeasuredDelays | None,
+    ) -> Clock:
+        left = self._late - slope * self._index - np.array(anchors)[self._epoch]
+        duration = float(self._index[-1] - self._index[0] + 1) / self.sampling_rate
+        # Within one step of polled latencies nothing is seen of a clock, for a whole beat.
+        step = self._polls.step(slope)
+        beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
+        node = max(_NODE, duration / _MOST_NODES)
+        if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
+            node, step = (
+                max(node, BEATS_PER_WINDOW * beat),
+                0.0,
+            )  # the earliest of those is early indeed
+        group = self._stretches(self.sampling_rate * node)
+        kept = least_of_each(group, left, self._epoch)
+        begins = np.diff(group, prepend=-1) != 0
+        begins |= np.diff(self._epoch, prepend=-1) != 0
+        scatter = scatter_of_least(left, left[kept], begins)
+        index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
+        variance = np.zeros(len(index))
+        if measured is not None:
+            known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
+            at = measured.index[known]
+            which = np.searchsorted(self._epoch_starts, at, side="right") - 1
+            lateness = measured.seconds[known] - at / self.sampling_rate
+            lateness -= slope * at + np.array(anchors)[which]
+            index, late = np.concatenate([index, at]), np.concatenate([late, lateness])
+            epoch = np.concatenate([epoch, which])
+            variance = np.concatenate([variance, measured.std[known] ** 2 + _FLOOR**2])
+            order = np.lexsort((index, epoch))
+            index, late, epoch = index[order], late[order], epoch[order]
+            variance = variance[order]
+        observations = Observations(
+            seconds=index / self.sampling_rate,
+            lateness=late,
+            variance=variance,
+            from_samples=variance > 0,
+            restarts=np.diff(epoch, prepend=epoch[:1]) > 0,
+        )
+        hidden = step / math.sqrt(12) * math.sqrt(max(beat / node, 1.0))
+        smoothed = smooth(observations, least_noise=max(hidden, scatter))
+        residual = smoothed.varying
+        refined = bool(observations.from_samples.any())
+        if not refined:  # nothing checks the line within the time of one observation
+            residual = math.hypot(residual, max(hidden, 2 * scatter) / len(kept))
+        known_to = float(np.sqrt(np.mean(smoothed.std**2)))
+        if refined and known_to > _WELL_KNOWN / self.sampling_rate:  # the samples hardly know
+            return self._filtered(sensor, slope, anchors, None)
+        curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
+        epochs = []
+        for number, (first, end) in enumerate(self._bounds()):
+            mine = np.flatnonzero(epoch == number)
+            nodes, late = index[mine], curve[mine]
+            # Straight on at both ends, at the rate the filter has there.
+            low, high = min(float(first), nodes[0]) - 1.0, max(float(end), nodes[-1]) + 1.0
+            nodes = np.concatenate([[low], nodes, [high]])
+            ends = smoothed.rate[mine[[0, -1]]] / self.sampling_rate
+            late = np.concatenate(
+                [
+                    [late[0] - ends[0] * (nodes[1] - low)],
+                    late,
+                    [late[-1] + ends[1] * (high - nodes[-2])],
+                ]
+            )
+            seconds = nodes / self.sampling_rate + late + slope * nodes + anchors[number]
+            increasing = np.concatenate([[True], np.diff(nodes) > 0])
+            epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
+        drift = slope * self.sampling_rate + float(smoothed.rate.mean())
+        state = ClockState(
+            sensor=sensor,
+            source="arrival times",
+            offset=epochs[0].start,
+            ppm=-drift / (1 + drift) * 1e6,
+            ppm_std=math.sqrt(12) * residual / duration * 1e6,  # as if all of it were a slope
+            wander_ppm=float(smoothed.rate.std()) * 1e6,
+            residual=residual,
+            n_epochs=len(epochs),
+            refined=refined,
+        )
+        return Clock(tuple(epochs), state)

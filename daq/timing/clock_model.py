@@ -1,0 +1,255 @@
+"""When the samples of a sensor were taken: its clock, and what is known about it.
+
+A stretch of samples between restarts of the device's clock is an :class:`Epoch`; within one, the
+sample index counts without error. Clocks come from block arrival times
+(:mod:`daq.timing.arrival_times`), from the instant of every sample where a sensor is polled, or are
+the timeline itself where all sensors share one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+_NEVER = 1 << 62  # a sample index beyond all others
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch:
+    """A stretch of samples counted without error: sample index to time, piecewise straight.
+
+    Attributes
+    ----------
+    first_sample, end_sample : int
+        Indices of the first sample and of the one after the last.
+    index : float64, shape (n_nodes,)
+        Sample indices at which `seconds` is given, increasing.
+    seconds : float64, shape (n_nodes,)
+        Time in seconds from the recording's origin; straight between nodes, and beyond them as in
+        the outermost interval.
+    """
+
+    first_sample: int
+    end_sample: int
+    index: FloatArray
+    seconds: FloatArray
+
+    def at(self, index: FloatArray) -> FloatArray:
+        """Return the time in seconds of (fractional) sample indices."""
+        return _straight(index, self.index, self.seconds)
+
+    def position(self, seconds: FloatArray) -> FloatArray:
+        """Return the (fractional) sample index at times in seconds."""
+        return _straight(seconds, self.seconds, self.index)
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample."""
+        return float(self.at(np.array([float(self.first_sample)]))[0])
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample."""
+        return float(self.at(np.array([float(self.end_sample - 1)]))[0])
+
+
+@dataclass(frozen=True, slots=True)
+class ClockState:
+    """What is known about one sensor's clock.
+
+    Attributes
+    ----------
+    sensor : str
+    source : str
+        "arrival times", "device UTC", "sample instants", "nominal rate", or "clock of …" for a
+        shared one.
+    offset : float
+        Time of the first sample in seconds from the recording's origin.
+    ppm, ppm_std : float
+        Rate against nominal, in parts per million on the host's clock, and its uncertainty.
+    wander_ppm : float
+        Standard deviation of the rate's change over the recording, in ppm.
+    residual : float
+        What is left between clock and truth, in seconds rms: predicted, or measured where the
+        common motion allows it; NaN where nobody knows.
+    n_epochs : int
+        One, plus the number of restarts.
+    refined : bool
+        Whether the common motion has been used.
+    """
+
+    sensor: str
+    source: str
+    offset: float
+    ppm: float
+    ppm_std: float
+    wander_ppm: float
+    residual: float
+    n_epochs: int
+    refined: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clock:
+    """When each sample of a sensor was taken.
+
+    Attributes
+    ----------
+    epochs : tuple of Epoch
+        In order of sample index.
+    state : ClockState
+    """
+
+    epochs: tuple[Epoch, ...]
+    state: ClockState
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample."""
+        return self.epochs[0].start
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample."""
+        return self.epochs[-1].end
+
+    def rate_known_to(self, ppm_std: float) -> Clock:
+        """Return the same clock, its rate no better known than to this besides, in ppm."""
+        total = float(np.hypot(self.state.ppm_std, ppm_std))
+        return replace(self, state=replace(self.state, ppm_std=total))
+
+    def at(self, index: FloatArray) -> FloatArray:
+        """Return the time in seconds of (fractional) sample indices."""
+        starts = [epoch.first_sample for epoch in self.epochs[1:]]
+        return self._by_epoch(np.searchsorted(starts, index, side="right"), index, Epoch.at)
+
+    def position(self, seconds: FloatArray) -> FloatArray:
+        """Return the (fractional) sample index at times in seconds."""
+        starts = [epoch.start for epoch in self.epochs[1:]]
+        return self._by_epoch(
+            np.searchsorted(starts, seconds, side="right"), seconds, Epoch.position
+        )
+
+    def extended(self, end_sample: int) -> Clock:
+        """Return the same clock for a recording that has grown to `end_sample`."""
+        last = replace(self.epochs[-1], end_sample=end_sample)
+        return replace(self, epochs=(*self.epochs[:-1], last))
+
+    def shared_by(self, sensor: str, *, end_sample: int) -> Clock:
+        """Return the same clock for a sensor whose samples it counts alike."""
+        clock = self.extended(end_sample)
+        return replace(clock, state=replace(self.state, sensor=sensor, source=self._shared))
+
+    def shifted(
+        self, sensor: str, stretches: Sequence[tuple[int, int, int]], *, by_samples: bool
+    ) -> Clock:
+        """Return the same clock for a sensor that began to count at another sample.
+
+        Parameters
+        ----------
+        sensor : str
+        stretches : sequence of (first_sample, end_sample, n)
+            In which its sample i is taken with sample i + n of this clock.
+        by_samples : bool
+            Whether n is known from the samples, rather than from arrival times.
+        """
+        ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
+        starts = [-_NEVER, *ends[:-1]]
+        epochs = tuple(
+            Epoch(max(first, start - n), min(end, stop - n), epoch.index - n, epoch.seconds)
+            for first, end, n in stretches
+            for epoch, start, stop in zip(self.epochs, starts, ends, strict=True)
+            if max(first, start - n) < min(end, stop - n)
+        )
+        how = "samples" if by_samples else "arrival times"
+        source = f"{self._shared}, whole samples apart by {how}"
+        state = replace(self.state, sensor=sensor, source=source, offset=epochs[0].start)
+        return Clock(epochs, replace(state, n_epochs=len(epochs)))
+
+    @property
+    def _shared(self) -> str:
+        source, name = self.state.source, self.state.sensor
+        return source if source.startswith("clock of") else f"clock of {name}"
+
+    def _by_epoch(
+        self,
+        which: NDArray[np.intp],
+        values: FloatArray,
+        evaluate: Callable[[Epoch, FloatArray], FloatArray],
+    ) -> FloatArray:
+        out = np.empty(len(values))
+        for number in np.unique(which):
+            mine = which == number
+            out[mine] = evaluate(self.epochs[number], values[mine])
+        return out
+
+
+def from_instants(
+    sensor: str,
+    seconds: FloatArray,
+    *,
+    sampling_rate: float,
+    runs: Sequence[tuple[int, int, int]],
+) -> Clock:
+    """Return the clock of a polled sensor, for which every sample has its instant.
+
+    Parameters
+    ----------
+    sensor : str
+    seconds : float64, shape (n_samples,)
+        From the recording's origin, in the order of the file's rows.
+    sampling_rate : float
+        Nominal, in Hz.
+    runs : sequence of (first_sample, first_row, n_samples)
+        Contiguous stretches; each becomes an epoch.
+    """
+    epochs = []
+    for first, row, n_samples in runs:
+        index = np.arange(first, first + n_samples, dtype=float)
+        epochs.append(Epoch(first, first + n_samples, index, seconds[row : row + n_samples]))
+    covered = sum(epoch.end - epoch.start for epoch in epochs)
+    intervals = len(seconds) - len(runs)
+    ppm = (intervals / covered / sampling_rate - 1) * 1e6 if covered > 0 else float("nan")
+    state = ClockState(sensor, "sample instants", epochs[0].start, ppm, 0.0, 0.0, 0.0, len(epochs))
+    return Clock(tuple(epochs), state)
+
+
+def nominal(
+    sensor: str,
+    source: str,
+    *,
+    end_sample: int,
+    sampling_rate: float,
+    first: int = 0,
+    ppm: float = 0.0,
+    ppm_std: float = 0.0,
+    residual: float = 0.0,
+) -> Clock:
+    """Return the clock that *is* the timeline: sample n is taken at (first + n) / sampling_rate."""
+    index = np.array([0.0, max(float(end_sample), 1.0)])
+    epoch = Epoch(0, end_sample, index, (first + index) / sampling_rate)
+    state = ClockState(sensor, source, epoch.start, ppm, ppm_std, 0.0, residual, 1)
+    return Clock((epoch,), state)
+
+
+def _straight(x: FloatArray, xp: FloatArray, fp: FloatArray) -> FloatArray:
+    """Interpolate, and extrapolate along the outermost intervals."""
+    if len(xp) == 2:
+        slope = (fp[1] - fp[0]) / (xp[1] - xp[0])
+        return np.asarray(fp[0] + (x - xp[0]) * slope)
+    if len(xp) == 1:
+        return np.full(np.shape(x), fp[0])
+    y = np.interp(x, xp, fp)
+    below, above = x < xp[0], x > xp[-1]
+    y[below] = fp[0] + (x[below] - xp[0]) * ((fp[1] - fp[0]) / (xp[1] - xp[0]))
+    y[above] = fp[-1] + (x[above] - xp[-1]) * ((fp[-1] - fp[-2]) / (xp[-1] - xp[-2]))
+    return y

@@ -1,0 +1,36 @@
+"""Why a port failed, in words, with what to do about it."""
+
+from __future__ import annotations
+
+import errno
+import socket
+
+from serial.tools import list_ports
+
+_REASONS = {
+    errno.EACCES: "no permission; add yourself to the group that owns the port (dialout, usually)",
+    errno.EPERM: "no permission; add yourself to the group that owns the port (dialout, usually)",
+    errno.EBUSY: "busy: another program has it open",
+    errno.EAGAIN: "busy: another program has it open",
+    errno.ECONNREFUSED: "nothing listens there; is the device on, and is the port number right?",
+    errno.ECONNRESET: "the other end reset the connection",
+    errno.EPIPE: "the other end closed the connection",
+    errno.EHOSTUNREACH: "the host cannot be reached",
+    errno.ENETUNREACH: "the network cannot be reached",
+    errno.EIO: "hang-up",
+    errno.ENXIO: "hang-up",
+    errno.ENOTTY: "not a serial port",
+}
+
+
+def why(error: BaseException) -> str:
+    """Say why a port failed, and what to do about it."""
+    if isinstance(error, socket.gaierror):
+        return f"no such host ({error.strerror})"
+    number = getattr(error, "errno", None)
+    if number in {errno.ENOENT, errno.ENODEV}:
+        present = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
+        return f"there is no such port; serial ports here: {present}"
+    if number in _REASONS:
+        return _REASONS[number]
+    return str(error) or type(error).__name__

@@ -1,0 +1,247 @@
+"""Serial ports and TCP connections, each of which feeds a ``ByteStream``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import serial
+
+from daq.transport.port_errors import why
+
+if sys.platform != "win32":
+    import termios
+
+if TYPE_CHECKING:
+    from daq.host_clock import HostClock
+    from daq.transport.byte_stream import ByteStream, Transport
+
+READ_SIZE, READS = 65536, 64
+CONNECT_TIMEOUT = 5.0
+_CLOSE_TIMEOUT = 1.0
+_POLL = 0.1  # how long a reading thread may take to see that it should end, s
+
+
+class _TcpWire(asyncio.Protocol):
+    """A TCP connection."""
+
+    most_expected = READ_SIZE
+
+    def __init__(self, stream: ByteStream) -> None:
+        self._stream = stream
+        self._transport: asyncio.Transport
+        self._closed = asyncio.get_running_loop().create_future()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._stream.feed(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stream.lost(why(exc) if exc else "the other end closed the connection")
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    async def write(self, payload: bytes) -> None:
+        self._transport.write(payload)
+
+    def expect(self, n_bytes: int) -> None:
+        connection = self._transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):  # gone: the next read says so
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, n_bytes)
+
+    def pause(self) -> None:
+        self._transport.pause_reading()
+
+    def resume(self) -> None:
+        self._transport.resume_reading()
+
+    async def close(self) -> None:
+        self._transport.close()
+        try:
+            async with asyncio.timeout(_CLOSE_TIMEOUT):
+                await asyncio.shield(self._closed)
+        except TimeoutError:  # the other end does not take what is still to be sent
+            self._transport.abort()
+            await self._closed
+
+
+async def open_tcp(host: str, number: int, stream: ByteStream) -> Transport:
+    """Connect; raises OSError."""
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            transport, wire = await loop.create_connection(lambda: _TcpWire(stream), host, number)
+    except TimeoutError as error:
+        raise OSError(errno.ETIMEDOUT, f"no connection within {CONNECT_TIMEOUT:g} s") from error
+    transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return wire
+
+
+class _DescriptorWire:
+    """Reads when the event loop says so; no thread, no polling."""
+
+    most_expected = 255
+
+    def __init__(self, port: serial.SerialBase, stream: ByteStream) -> None:
+        self._port = port
+        self._descriptor: int = port.fileno()
+        self._stream = stream
+        self._loop = asyncio.get_running_loop()
+        self.expect(1)  # pyserial leaves 0, with which nothing there would read as a hang-up
+        self.resume()
+
+    def _readable(self) -> None:
+        # a terminal gives what it holds in pieces; what is left would wait for as much again
+        pieces: list[bytes] = []
+        ended = ""
+        try:
+            while not ended and len(pieces) < READS:
+                pieces.append(os.read(self._descriptor, READ_SIZE))
+                ended = "" if pieces[-1] else "hang-up"
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            ended = why(error)
+        received = b"".join(pieces)
+        if received:
+            self._stream.feed(received)
+        if ended:
+            self._ended(ended)
+
+    def _ended(self, reason: str) -> None:
+        self.pause()
+        self._stream.lost(reason)
+
+    async def write(self, payload: bytes) -> None:
+        left = memoryview(payload)
+        while left:
+            try:
+                left = left[os.write(self._descriptor, left) :]
+            except BlockingIOError:
+                ready = self._loop.create_future()
+                self._loop.add_writer(self._descriptor, _settle, ready)
+                try:
+                    await ready
+                finally:
+                    self._loop.remove_writer(self._descriptor)
+
+    def expect(self, n_bytes: int) -> None:
+        with contextlib.suppress(termios.error):  # gone: the next read says so
+            attributes = termios.tcgetattr(self._descriptor)
+            attributes[6][termios.VMIN] = min(n_bytes, self.most_expected)
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
+
+    def pause(self) -> None:
+        self._loop.remove_reader(self._descriptor)
+
+    def resume(self) -> None:
+        self._loop.add_reader(self._descriptor, self._readable)
+
+    async def close(self) -> None:
+        self.pause()
+        self._port.close()
+
+
+def _settle(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
+
+
+class _ThreadWire:
+    """A thread reads; the event loop is told."""
+
+    most_expected = READ_SIZE
+
+    def __init__(self, port: serial.Serial, stream: ByteStream, clock: HostClock) -> None:
+        self._port = port
+        self._stream = stream
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._running = threading.Event()
+        self._running.set()
+        self._closing = False
+        self._expected = 1
+        self._thread = threading.Thread(target=self._read, name=f"reads {stream.label}")
+        self._thread.start()
+
+    def _read(self) -> None:
+        received = b""
+        while not self._closing:
+            if not self._running.wait(_POLL):
+                continue
+            wanted = self._expected - len(received)
+            try:
+                piece = self._port.read(max(1, wanted, self._port.in_waiting))
+            except OSError as error:
+                if not self._closing:
+                    self._loop.call_soon_threadsafe(self._stream.lost, why(error))
+                return
+            received += piece
+            # one that only timed out says nothing of when the last byte came
+            if received and (len(piece) >= wanted or not piece):
+                self._loop.call_soon_threadsafe(self._stream.feed, received, self._clock.now())
+                received = b""
+
+    async def write(self, payload: bytes) -> None:
+        await self._loop.run_in_executor(None, self._port.write, payload)
+
+    def expect(self, n_bytes: int) -> None:
+        self._expected = n_bytes
+
+    def pause(self) -> None:
+        self._running.clear()
+
+    def resume(self) -> None:
+        self._running.set()
+
+    async def close(self) -> None:
+        self._closing = True
+        await self._loop.run_in_executor(None, self._thread.join)
+        await self._loop.run_in_executor(None, self._port.close)
+
+
+async def open_serial(
+    port: str,
+    stream: ByteStream,
+    clock: HostClock,
+    *,
+    baud_rate: int,
+    parity: str,
+    stop_bits: float,
+) -> Transport:
+    """Open anything pyserial opens; raises OSError or ValueError."""
+
+    def opened() -> serial.SerialBase:
+        return serial.serial_for_url(
+            port,
+            baudrate=baud_rate,
+            parity=parity,
+            stopbits=stop_bits,
+            timeout=_POLL,
+            exclusive=None if "://" in port else True,
+        )
+
+    # rfc2217 negotiates for seconds, a local port opens at once
+    device = await asyncio.to_thread(opened) if "://" in port else opened()
+    if os.name == "posix" and isinstance(device, serial.Serial):
+        _set_low_latency(device)
+        return _DescriptorWire(device, stream)
+    # every kind of port has what serial.Serial has; the stubs' common base does not say so
+    return _ThreadWire(cast("serial.Serial", device), stream, clock)
+
+
+def _set_low_latency(device: serial.Serial) -> None:
+    """Shorten the latency timer where there is one: only FTDI adapters show this file."""
+    name = Path(os.path.realpath(device.name or "")).name
+    if Path(f"/sys/class/tty/{name}/device/latency_timer").exists():
+        with contextlib.suppress(OSError, ValueError):  # not ours to change: the timer stays
+            device.set_low_latency_mode(True)

@@ -1,0 +1,123 @@
+"""UDP ports: whole datagrams with the host times at which they came.
+
+The counterpart of :mod:`daq.transport.ports` for devices that send packets: ``udp://host:port`` is
+the address to listen at, or that of a server to ask, as the driver knows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from typing import TYPE_CHECKING, cast
+
+from daq.errors import NotConnectedError
+from daq.transport.address import host_and_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from daq.host_clock import HostClock
+    from daq.protocols.block import HostTime
+
+MOST_WAITING = 8192
+"""Datagrams received and not yet asked for; the oldest are dropped beyond."""
+
+_MOST_STRANGERS = 16
+
+
+class DatagramStream(asyncio.DatagramProtocol):
+    """The datagrams of one UDP port. Made by :func:`open_datagrams`."""
+
+    def __init__(self, label: str, clock: HostClock) -> None:
+        self.label = label
+        self._clock = clock
+        self._waiting: deque[tuple[bytes, HostTime]] = deque(maxlen=MOST_WAITING)
+        self._arrived = asyncio.Event()
+        self._failure: Exception | None = None
+        self._sender: str | None = None
+        self.strangers: set[str] = set()
+        """Hosts other than the first whose datagrams were left out."""
+        self._transport: asyncio.DatagramTransport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Keep the transport."""
+        self._transport = cast("asyncio.DatagramTransport", transport)
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Keep a datagram and when it came; two hosts would make one sensor of two devices."""
+        self._sender = self._sender or addr[0]
+        if addr[0] != self._sender:
+            if len(self.strangers) < _MOST_STRANGERS:
+                self.strangers.add(addr[0])
+            return
+        self._waiting.append((data, self._clock.now()))
+        self._arrived.set()
+
+    def error_received(self, exc: Exception) -> None:
+        """Note that nothing listens at the other end."""
+        self._failure = exc
+        self._arrived.set()
+
+    async def read(self) -> tuple[bytes, HostTime]:
+        """Return the next datagram and when it came.
+
+        Raises
+        ------
+        NotConnectedError
+            The other end refuses datagrams.
+        """
+        while not self._waiting:
+            if self._failure is not None:
+                raise NotConnectedError(
+                    f"{self.label}: nothing listens there ({self._failure});"
+                    " is the server on, and is the port number right?"
+                )
+            self._arrived.clear()
+            await self._arrived.wait()
+        return self._waiting.popleft()
+
+    def discard(self) -> None:
+        """Forget what has come and was not read."""
+        self._waiting.clear()
+
+    def send(self, payload: bytes) -> None:
+        """Send a datagram to the server."""
+        if not self._transport.is_closing():
+            self._transport.sendto(payload)
+
+
+@contextlib.asynccontextmanager
+async def open_datagrams(
+    address: str, clock: HostClock, *, listen: bool, label: str
+) -> AsyncIterator[DatagramStream]:
+    """Open a UDP port and close it on exit.
+
+    Parameters
+    ----------
+    address
+        ``udp://host:port``: where to listen (``0.0.0.0`` for any interface), or a server.
+    listen
+        Which of the two.
+    label
+        Begins every error message; names sensor and port.
+
+    Raises
+    ------
+    NotConnectedError
+        The address cannot be listened at or reached.
+    """
+    try:
+        where = host_and_port(address)
+        transport, stream = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: DatagramStream(label, clock),
+            local_addr=where if listen else None,
+            remote_addr=None if listen else where,
+        )
+    except (OSError, ValueError) as error:
+        raise NotConnectedError(f"{label}: {error}") from error
+    try:
+        yield stream
+    finally:
+        transport.close()
+        await asyncio.sleep(0)  # the loop closes the socket on its next turn

@@ -1,0 +1,1 @@
+"""What the averages say about the test itself: bands, orientation, advice."""

@@ -1,0 +1,306 @@
+"""What the averages say about the test itself, in numbers and in words.
+
+Coherences, conditioning, the dimension and strength of the motion, whether one motion explains
+all sensors, how these stand to each other; and section 5's recommendations of the paper where
+they apply.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from estimator.diagnostics.advice import Advice, advise
+from estimator.diagnostics.band import BandDiagnosis
+from estimator.diagnostics.relative_response import (
+    RelativeResponse,
+    canonical_coherence,
+    matched_coherence,
+    relative_response,
+)
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.likelihood import fisher
+from estimator.likelihood.dimension import bands
+from estimator.likelihood.factor_analysis import Maximum, maximise
+from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool
+from estimator.likelihood.maximum_likelihood import standard_error
+from estimator.self_noise.coherency import (
+    check_averages,
+    check_dims,
+    check_frequency,
+    coherency,
+    testable,
+)
+from estimator.self_noise.live_channels import Presence, presence
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+DIMENSION_LEVEL = 0.01
+"""Of the test that further dimensions have no coherence, all pairs of sensors together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """The test as its own averages see it.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    pairs : tuple of (int, int)
+        Pairs of sensors, from 0.
+    coherence : float64, shape (n_freqs, n_pairs)
+        The least between like channels.
+    condition : float64, shape (n_freqs, n_pairs)
+        Condition number of ``S_jk`` in units of its channels' amplitudes: near-singular where
+        it exceeds the square root of the averages, say. Infinite where singular.
+    dimension : float64, shape (n_freqs,)
+        Dimensions of the motion that the averages show (canonical coherences between two
+        sensors, tested at 1 %).
+    snr : float64, shape (n_freqs, n_channels)
+        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for channels that are
+        dead or copies of others, of which the model and its test know nothing, and where psi is
+        within its standard error of zero.
+    model : ModelTest
+        At every frequency.
+    n_factors : int
+        Dimensions of the motion in that model.
+    bands : tuple of BandDiagnosis
+    responses : tuple of RelativeResponse
+        Of the pairs that can be compared: of sensors with all their channels.
+    advice : tuple of Advice
+        Worst first.
+    """
+
+    frequency: FloatArray
+    pairs: tuple[tuple[int, int], ...]
+    coherence: FloatArray
+    condition: FloatArray
+    dimension: FloatArray
+    snr: FloatArray
+    model: ModelTest
+    n_factors: int
+    bands: tuple[BandDiagnosis, ...]
+    responses: tuple[RelativeResponse, ...]
+    advice: tuple[Advice, ...]
+
+
+def diagnose(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    n_factors: int | None = None,
+    neighbours: FloatArray | None = None,
+    names: tuple[str, ...] | None = None,
+    channels: tuple[str, ...] | None = None,
+    vertical: int | None = None,
+) -> Diagnostics:
+    """Diagnose a huddle test.
+
+    Channels that are dead, or copies of earlier ones, are named and left aside.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+        Channels of each sensor, three or more.
+    n_effective : float
+        Independent averages. With no more than channels everything that needs the likelihood
+        (SNR and model test) is NaN, and so with fewer than three sensors that have signal.
+    n_factors : int, optional
+        Dimensions of the motion in the model that is tested: those of the estimate that the
+        diagnosis goes with; ``max(dims)`` by default.
+    neighbours : float64, shape (n_lags,), optional
+        From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
+    names : tuple of str, optional
+        Of the sensors; "1", "2", … by default.
+    channels : tuple of str, optional
+        Names of all channels, each within its sensor; "1", "2", … by default.
+    vertical : int, optional
+        Which channel of every sensor is vertical, for the horizontal angles.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InvalidMatrixError
+        As `estimator.self_noise.coherency.coherency` says, or if `frequency` does not fit.
+    InsufficientDataError
+        With fewer than three sensors, or if averages are not a finite number above zero.
+    EstimatorError
+        If there are not as many `names` as sensors, or `channels` as channels.
+    """
+    check_dims(dims)
+    check_averages(n_effective)
+    csm = np.asarray(csm, dtype=np.complex128)
+    given = coherency(csm, dims)
+    frequency = check_frequency(frequency, len(csm))
+    names = names or tuple(str(i + 1) for i in range(len(dims)))
+    channels = channels or tuple(str(r + 1) for d in dims for r in range(d))
+    if (len(names), len(channels)) != (len(dims), sum(dims)):
+        raise EstimatorError(
+            f"{len(names)} names and {len(channels)} channels: expected {len(dims)} and {sum(dims)}"
+        )
+    pairs = tuple(combinations(range(len(dims)), 2))
+    coherence = np.stack(
+        [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
+    )
+    there = presence(given, dims)
+    part = given.part(list(there.channels))
+    matrix = testable(part, frequency)
+    condition = np.full((len(csm), len(pairs)), np.nan)
+    for one, two in combinations(range(len(there.sensors)), 2):
+        pair = pairs.index((there.sensors[one], there.sensors[two]))
+        condition[:, pair] = _condition(part.matrix, there.dims, one, two)
+    d = max(there.dims, default=max(dims))
+    q = d if n_factors is None else n_factors
+    fit = _fit(matrix, there, d, n_effective)
+    model = _test(
+        fit if q == d else _fit(matrix, there, q, n_effective), there, n_effective, len(csm)
+    )
+    snr = np.full((len(csm), sum(dims)), np.nan)
+    if fit is not None:
+        known = standard_error(fit, n_effective=n_effective) < fit.psi
+        snr = there.spread(np.where(known, 1 / fit.psi - 1, np.nan), sum(dims))
+    dimension = _dimension(matrix, there.dims, n_effective)
+    number = bands(frequency)
+    found = tuple(
+        BandDiagnosis(
+            low=float(frequency[inside][0]),
+            high=float(frequency[inside][-1]),
+            coherence=_median(_least(coherence[inside])),
+            condition=_median(-_least(-condition[inside])),
+            dimension=_median(dimension[inside]),
+            snr=np.array([_median(channel) for channel in snr[inside].T]),
+            test=pool(model, inside, neighbours=neighbours),
+        )
+        for inside in (number == b for b in np.unique(number))
+    )
+    alive = np.ix_(range(len(csm)), there.channels, there.channels)
+    responses = _responses(csm[alive], frequency, there, vertical)
+    return Diagnostics(
+        frequency=frequency,
+        pairs=pairs,
+        coherence=coherence,
+        condition=condition,
+        dimension=dimension,
+        snr=snr,
+        model=model,
+        n_factors=q,
+        bands=found,
+        responses=responses,
+        advice=advise(
+            found,
+            responses,
+            given,
+            dims=dims,
+            names=names,
+            channels=channels,
+            n_factors=q,
+            n_effective=n_effective,
+            nyquist=float(frequency[-1]),
+        ),
+    )
+
+
+def _least(values: FloatArray) -> FloatArray:
+    """Least of the numbers of each row, shape (n_freqs,); NaN where there is none."""
+    least = np.where(np.isnan(values), np.inf, values).min(axis=1)
+    return np.where(np.isnan(values).all(axis=1), np.nan, least)
+
+
+def _median(values: FloatArray) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
+    """Condition number of the coherency between two sensors, shape (n_freqs,)."""
+    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
+    singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
+    least = singular[:, -1]
+    return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+
+
+def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | None:
+    """Fit motion of q dimensions; None with too few averages, sensors or channels for it."""
+    if n_effective <= matrix.shape[1] or len(there.sensors) < 3:
+        return None
+    try:
+        return maximise(matrix, q)
+    except InsufficientDataError:
+        return None
+
+
+def _test(maximum: Maximum | None, there: Presence, n_effective: float, n_freqs: int) -> ModelTest:
+    """Model test at every frequency, NaN where there is none.
+
+    Where two channels alone feel a dimension their noise can be divided between them anyhow. Such
+    a direction of ln psi, known to no better than a factor e, is a parameter that does not help
+    the fit. With equal sensors there is none, but for further dimensions.
+    """
+    unknown = np.full(n_freqs, np.nan)
+    if maximum is None:
+        return ModelTest(unknown, unknown, unknown)
+    try:
+        test = model_test(maximum, n_effective=n_effective)
+    except InsufficientDataError:  # as many parameters as the matrix has
+        return ModelTest(unknown, unknown, unknown)
+    if len(set(there.dims)) == 1 and maximum.n_factors <= there.dims[0]:
+        return test
+    information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
+    idle = (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
+    degrees = test.degrees + idle
+    return ModelTest(test.statistic, degrees, np.asarray(special.chdtrc(degrees, test.statistic)))
+
+
+def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:
+    """Canonical coherences between sensors that are not zero by their sampling noise.
+
+    Bartlett's test that all but the r largest are zero, for complex averages:
+    ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
+    """
+    pairs = list(combinations(range(len(dims)), 2))
+    found = np.zeros(len(matrix))
+    usable = np.isfinite(matrix).all(axis=(1, 2))
+    if not pairs or n_effective <= 2 * max(dims):
+        return np.full(len(matrix), np.nan)
+    for j, k in pairs:
+        coherence = np.minimum(canonical_coherence(matrix, dims, j, k), 1 - 1e-15)
+        scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
+        statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
+        r = np.arange(coherence.shape[1])
+        limit = special.chdtri(2 * (dims[j] - r) * (dims[k] - r), DIMENSION_LEVEL / len(pairs))
+        found = np.maximum(found, (statistic > limit).sum(axis=1))
+    return np.where(usable, found, np.nan)
+
+
+def _responses(
+    csm: ComplexArray, frequency: FloatArray, there: Presence, vertical: int | None
+) -> tuple[RelativeResponse, ...]:
+    found = []
+    for first, second in combinations(range(len(there.sensors)), 2):
+        pair = there.sensors[first], there.sensors[second]
+        if not set(pair) <= set(there.whole):  # a like channel's motion might be missing
+            continue
+        try:
+            response = relative_response(
+                csm, frequency, dims=there.dims, first=first, second=second, vertical=vertical
+            )
+        except InsufficientDataError:  # nothing to compare them by
+            continue
+        found.append(replace(response, first=pair[0], second=pair[1]))
+    return tuple(found)

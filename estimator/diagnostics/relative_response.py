@@ -1,0 +1,349 @@
+"""How two sensors answer the same motion: the rotation, gain and delay between them.
+
+With motion common to all, ``S_jk S_ik^-1 = H_j H_i^-1`` for any third sensor k: the noise of the
+three drops out, however strong it is. Averaged over a band it is real but for a delay, and its
+rows are the channels of sensor j in terms of those of sensor i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.self_noise.coherency import check_dims, check_frequency, coherency
+
+if TYPE_CHECKING:
+    from estimator.types import BoolArray, ComplexArray, FloatArray
+
+LEAST_COHERENCE = 0.5
+"""Below it a frequency says nothing of the response, and its phase could mislead the delay."""
+_STEPS = 4  # of least squares from the coarse delay
+_PARTS = 8  # of the band, for the scatter of the angles
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeResponse:
+    """Sensor `second` as seen by sensor `first`.
+
+    Attributes
+    ----------
+    first, second : int
+        The sensors, from 0.
+    low, high : float
+        Band averaged, Hz.
+    matrix : float64, shape (d, d)
+        Channels of `second` in terms of those of `first`, delay removed: gain and direction.
+    rotation : float64, shape (d, d)
+        Orthogonal matrix nearest to `matrix` once rows are normalised (polar decomposition).
+    rotation_deg : float
+        Its angle, reversed channels put right; 0 for one channel.
+    horizontal_deg : float
+        Angle in the horizontal plane between the first horizontal channels of the two,
+        positive where that of `second` turns away from the second horizontal channel of
+        `first`: counterclockwise seen from above for north and east. NaN without two
+        horizontal channels.
+    angle_error_deg : float
+        Standard error of both angles, from their scatter over parts of the band.
+    gains : float64, shape (d,)
+        Of the channels of `second` over those of `first`.
+    nonorthogonality_deg : float
+        Largest deviation from a right angle between channels of `second`, if those of `first`
+        are orthogonal.
+    reversed_channels : tuple of int
+        Channels of `second` with opposite polarity.
+    delay : float
+        Seconds by which `second` lags behind `first`.
+    coherence : float
+        Mean over the band of the coherence in the direction in which it is least.
+    """
+
+    first: int
+    second: int
+    low: float
+    high: float
+    matrix: FloatArray
+    rotation: FloatArray
+    rotation_deg: float
+    horizontal_deg: float
+    angle_error_deg: float
+    gains: FloatArray
+    nonorthogonality_deg: float
+    reversed_channels: tuple[int, ...]
+    delay: float
+    coherence: float
+
+
+def matched_coherence(
+    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
+) -> FloatArray:
+    """Magnitude squared coherence of like channels of two sensors.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Cross-spectral or coherency matrix, channels grouped by sensor.
+    dims : tuple of int
+    first, second : int
+
+    Returns
+    -------
+    float64, shape (n_freqs, min(dims[first], dims[second]))
+        NaN where a channel has no power.
+    """
+    common = np.arange(min(dims[first], dims[second]))
+    a, b = (sum(dims[:sensor]) + common for sensor in (first, second))
+    power = csm[:, a, a].real * csm[:, b, b].real
+    cross = np.abs(csm[:, a, b]) ** 2
+    return np.where(power > 0, cross / np.where(power > 0, power, 1.0), np.nan)
+
+
+def canonical_coherence(
+    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
+) -> FloatArray:
+    """Magnitude squared coherence of two sensors' motion, direction by direction.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Coherency or cross-spectral matrix, channels grouped by sensor.
+    dims : tuple of int
+    first, second : int
+
+    Returns
+    -------
+    float64, shape (n_freqs, min(dims[first], dims[second]))
+        Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``. Whatever
+        way the sensors point, the same. Zero where the matrix is not finite.
+    """
+    usable = np.isfinite(csm).all(axis=(1, 2))
+    found = np.zeros((len(csm), min(dims[first], dims[second])))
+    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (first, second))
+    left, right = (_inverse_root(csm[usable, own, own]) for own in (a, b))
+    found[usable] = np.linalg.svd(left @ csm[usable, a, b] @ right, compute_uv=False) ** 2
+    return np.clip(found, 0.0, 1.0)
+
+
+def _inverse_root(matrix: ComplexArray) -> ComplexArray:
+    """Inverse root of Hermitian matrices; a direction without power stays without."""
+    w, u = np.linalg.eigh(matrix)
+    alive = w > 1e-12 * w[:, -1:]
+    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
+
+
+def relative_response(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    first: int,
+    second: int,
+    band: tuple[float, float] | None = None,
+    vertical: int | None = None,
+) -> RelativeResponse:
+    """Rotation, gains, non-orthogonality and delay of one sensor against another.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor; at least three sensors, both with d channels and the others
+        with no fewer together.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+        Channels of each sensor.
+    first, second : int
+        The sensors, from 0.
+    band : (low, high), optional
+        Hz; every frequency above zero by default.
+    vertical : int, optional
+        The channel of every sensor that is vertical. By default none of two channels is, and of
+        three nothing is known.
+
+    Returns
+    -------
+    RelativeResponse
+
+    Raises
+    ------
+    InsufficientDataError
+        If the two have different numbers of channels, there is no third sensor to compare by,
+        or the band holds no frequency at which they are coherent.
+    InvalidMatrixError
+        As `estimator.self_noise.coherency.coherency` says, or if `frequency` does not fit.
+    EstimatorError
+        If there are no two such sensors.
+
+    Notes
+    -----
+    ``T = [sum_f w S_jk exp(2 pi i f tau)] [sum_f w S_ik]^-1`` with all the other sensors as k
+    (least squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P the mean
+    PSD of sensor i and g their coherence in the direction in which it is least, so that every
+    frequency counts by its signal-to-noise ratio and incoherent ones do not count. The delay tau
+    is sought on a grid, where ``Re sum_f w T(f) exp(2 pi i f tau)`` is largest: as far as half a
+    segment either way, however many periods of the band that is. From there the phase that is
+    left, weighted alike, has a slope through the origin: least squares.
+    """
+    check_dims(dims)
+    csm = np.asarray(csm, dtype=np.complex128)
+    given = coherency(csm, dims)
+    frequency = check_frequency(frequency, len(csm))
+    if first == second or not {first, second} <= set(range(len(dims))):
+        raise EstimatorError(
+            f"sensors {first} and {second}: expected two different ones of 0 to {len(dims) - 1}"
+        )
+    d = dims[first]
+    if dims[second] != d:
+        raise InsufficientDataError(
+            f"sensors {first} and {second} have {d} and {dims[second]} channels: only sensors "
+            "with as many channels can be compared"
+        )
+    low, high = band or (0.0, np.inf)
+    usable = (frequency > 0) & (frequency >= low) & (frequency <= high)
+    usable &= ~(given.flags != 0).any(axis=1)
+    own = [np.arange(d) + sum(dims[:sensor]) for sensor in (first, second)]
+    rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
+    if len(rest) < d:
+        raise InsufficientDataError(
+            f"sensors {first} and {second}: the others have {len(rest)} channels, {d} are needed"
+        )
+    g = canonical_coherence(given.matrix, dims, first, second)[:, -1]
+    among = np.concatenate([own[0], rest])
+    with_rest = given.matrix[:, among[:, None], among]
+    seen = canonical_coherence(with_rest, (d, len(rest)), 0, 1)[:, -1]
+    weight = g / np.maximum(1 - g, 1e-9)
+    weight[~usable | (np.minimum(g, seen) < LEAST_COHERENCE)] = 0.0
+    if not weight.any():
+        raise InsufficientDataError(
+            f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
+            f"alive and coherent, with each other and with the others, in all {d} directions by "
+            f"more than {LEAST_COHERENCE}"
+        )
+    inside = np.flatnonzero(weight)
+    f, weight = frequency[inside], weight[inside]
+    csm = csm[inside] / _power(csm[inside], dims, first)[:, None, None]
+    S_ik, S_jk = (csm[:, channels[:, None], rest] for channels in own)
+    delay = _delay(f, weight, S_ik, S_jk)
+    S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
+    matrix = _transfer(weight, S_ik, S_jk)
+    horizontal = _horizontal_channels(d, vertical)
+    parts = [
+        _angles(_transfer(weight[part], S_ik[part], S_jk[part]), horizontal)
+        for part in _parts(weight)
+    ]
+    rotation, reversed_channels = _rotation(matrix)
+    gains = np.linalg.norm(matrix, axis=1)
+    directions = matrix / gains[:, None]
+    between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
+    rotation_deg, horizontal_deg = _angles(matrix, horizontal)
+    error = np.array(parts).std(axis=0, ddof=1).max() / np.sqrt(len(parts)) if parts else np.nan
+    return RelativeResponse(
+        first=first,
+        second=second,
+        low=float(f[0]),
+        high=float(f[-1]),
+        matrix=matrix,
+        rotation=rotation,
+        rotation_deg=rotation_deg,
+        horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
+        angle_error_deg=float(error),
+        gains=gains,
+        nonorthogonality_deg=float(np.abs(between).max()),
+        reversed_channels=reversed_channels,
+        delay=delay,
+        coherence=float(g[inside].mean()),
+    )
+
+
+def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:
+    """Mean PSD of a sensor's channels."""
+    channels = np.arange(dims[sensor]) + sum(dims[:sensor])
+    return np.asarray(csm[:, channels, channels].real.mean(axis=1))
+
+
+def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> FloatArray:
+    """Band average of ``S_jk S_ik^-1``, real part, shape (d, d)."""
+    left = np.einsum("f,fab->ab", weight, S_jk)
+    right = np.einsum("f,fab->ab", weight, S_ik)
+    return np.asarray((left @ np.linalg.pinv(right)).real)
+
+
+def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> float:
+    """Seconds by which the second sensor lags: where its answers add up, then by their phase."""
+    transfer = S_jk @ np.linalg.pinv(S_ik)
+    known = np.isfinite(transfer).all(axis=(1, 2))
+    f, weight, transfer = f[known], weight[known], transfer[known]
+    delay = _coarse_delay(f, np.asarray(weight[:, None, None] * transfer, np.complex128))
+    for _ in range(_STEPS):
+        aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
+        mean = np.einsum("f,fab->ab", weight, aligned).real
+        phase = np.angle(np.einsum("ab,fab->f", mean, aligned))
+        delay -= float((weight * f) @ phase / ((weight * f) @ f) / (2 * np.pi))
+    return delay
+
+
+def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
+    """Delay at which the real part of the sum over frequencies is largest, on a grid.
+
+    The sum at all delays is a Fourier transform over frequency; frequencies are taken to the
+    nearest multiple of their least distance.
+    """
+    step = float(np.diff(f).min()) if len(f) > 1 else float(f[0])
+    place = np.rint((f - f[0]) / step).astype(np.int64)
+    # eight delays to the period of the highest frequency, so that no peak lies between them
+    n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
+    spectrum = np.zeros((n, *transfer.shape[1:]), np.complex128)
+    np.add.at(spectrum, place, transfer)
+    delays = np.fft.fftfreq(n, step)
+    total = np.fft.ifft(spectrum, axis=0) * np.exp(2j * np.pi * f[0] * delays)[:, None, None]
+    return float(delays[np.argmax((total.real**2).sum(axis=(1, 2)))])
+
+
+def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None:
+    channels = [channel for channel in range(d) if channel != vertical]
+    return (channels[0], channels[1]) if len(channels) == 2 else None
+
+
+def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
+    """Nearest rotation, and which channels had to be turned round for it to be one.
+
+    Of the reversals that leave a proper rotation the one that turns least is taken; channels
+    of sensors meant to stand alike are rarely turned by more than a right angle.
+    """
+    d = len(matrix)
+    directions = matrix / np.linalg.norm(matrix, axis=1)[:, None]
+    candidates = []
+    for code in range(2**d):
+        signs = 1.0 - 2.0 * ((code >> np.arange(d)) & 1)
+        u, _, v = np.linalg.svd(signs[:, None] * directions)
+        nearest = u @ v
+        if np.linalg.det(nearest) > 0:
+            candidates.append((float(np.trace(nearest)), signs, nearest))
+    plain = [entry for entry in candidates if entry[1].min() > 0]
+    _, signs, nearest = plain[0] if plain else max(candidates, key=lambda entry: entry[0])
+    return nearest, tuple(int(channel) for channel in np.flatnonzero(signs < 0))
+
+
+def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[float, float]:
+    """Angle of the rotation, and of the first horizontal channel, degrees."""
+    rotation, turned_round = _rotation(matrix)
+    d = len(matrix)
+    sine = np.linalg.norm(rotation - rotation.T) / (2 * np.sqrt(2)) if d > 1 else 0.0
+    cosine = (np.trace(rotation) - (d - 2)) / 2 if d > 1 else 1.0
+    whole = float(np.rad2deg(np.arctan2(sine, cosine)))
+    if horizontal is None:
+        return whole, 0.0
+    one, two = horizontal
+    sign = -1.0 if one in turned_round else 1.0
+    return whole, float(np.rad2deg(np.arctan2(-sign * matrix[one, two], sign * matrix[one, one])))
+
+
+def _parts(weight: FloatArray) -> list[BoolArray]:
+    """Stretches of the band of like total weight, each of a few frequencies at least."""
+    share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
+    parts = [share == number for number in range(_PARTS)]
+    return parts if len(weight) >= 4 * _PARTS and all(part.sum() for part in parts) else []

@@ -1,0 +1,1 @@
+"""Maximum likelihood as factor analysis, its precision, dimension and model test."""

@@ -1,0 +1,412 @@
+"""Maximum likelihood of complex factor analysis, ``S = A A* + diag(psi)``, at all frequencies.
+
+For given psi the best A is known: with ``w`` the eigenvalues (descending) and ``U`` the
+eigenvectors of ``psi^(-1/2) S psi^(-1/2)``, it takes up the q largest eigenvalues, as far as
+they exceed one, and what is left of -2/n times the log likelihood ratio is twice
+
+    f(psi) = sum over the other eigenvalues of (w - ln w - 1)           (Lawley and Maxwell)
+
+which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
+eigendecomposition, steps kept in a trust region, every frequency at its own pace, and those that
+have arrived left out. Where the Hessian is not convex its expectation is taken as long as that
+promises much, and near the end negative curvature is turned round. A channel that falls towards
+zero noise, where Newton's steps in ln psi become one each, is put there at once if that is better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
+from estimator.self_noise.coherency import TOLERANCE
+
+if TYPE_CHECKING:
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+MAX_ITERATIONS = 200
+DECREMENT = 1e-7
+"""Newton decrement at which a frequency has arrived: ln psi is then within 3e-4 standard errors
+of a single average, and the step still taken, if short, squares that."""
+BOUNDARY = 1e-6
+"""psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
+_MAX_STEP = 2.0  # in ln psi, the first trust region
+_LAST_STEP = 0.01  # in ln psi: longer ones, of a likelihood that is nearly flat, may lead downhill
+_MIN_RADIUS = 1e-9
+_MIN_CURVATURE = 1e-9
+_CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
+_FAR = 0.1  # part of the discrepancy that a step by the Hessian's expectation has to promise
+_FALLING = np.log(0.1 / BOUNDARY)
+"""A channel that falls further from less than this above its boundary is tried there at once: on
+its way the likelihood grows ever less, and ln psi by one a step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Maximum:
+    """Where the likelihood is largest, and how it was reached.
+
+    Attributes
+    ----------
+    psi : float64, shape (n_freqs, n_channels)
+        Noise PSD at the maximum (one short Newton step beyond the rest below), unit**2/Hz, not
+        corrected for small samples; NaN where the matrix is singular.
+    discrepancy : float64, shape (n_freqs,)
+        ``sum(w - ln w - 1)`` over the eigenvalues no factor explains.
+    eigenvalues : float64, shape (n_freqs, n_channels)
+        Of the whitened matrix, descending; the first ``n_factors`` belong to the motion. Those
+        of the unit matrix where the matrix is singular.
+    eigenvectors : complex128, shape (n_freqs, n_channels, n_channels)
+        Theirs, as columns.
+    n_factors : int
+    iterations : int64, shape (n_freqs,)
+        Evaluations of the likelihood and its derivatives.
+    gradient_norm : float64, shape (n_freqs,)
+        Largest derivative of the discrepancy by ln psi, boundary channels aside.
+    converged : bool, shape (n_freqs,)
+    boundary : bool, shape (n_freqs, n_channels)
+        Where the likelihood grows towards psi = 0 (Heywood's case); psi is then at the small
+        positive number at which the search stopped.
+    singular : bool, shape (n_freqs,)
+        Where the matrix is not Hermitian and positive definite, so that there is no maximum.
+    penalty : float64, shape (n_channels, n_channels)
+        What was added to the Fisher information of ln psi per average, zero if nothing.
+    """
+
+    psi: FloatArray
+    discrepancy: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: ComplexArray
+    n_factors: int
+    iterations: IntArray
+    gradient_norm: FloatArray
+    converged: BoolArray
+    boundary: BoolArray
+    singular: BoolArray
+    penalty: FloatArray
+
+    def take(self, index: IntArray | BoolArray) -> Maximum:
+        """Return the same for some frequencies only."""
+        return Maximum(
+            psi=self.psi[index],
+            discrepancy=self.discrepancy[index],
+            eigenvalues=self.eigenvalues[index],
+            eigenvectors=self.eigenvectors[index],
+            n_factors=self.n_factors,
+            iterations=self.iterations[index],
+            gradient_norm=self.gradient_norm[index],
+            converged=self.converged[index],
+            boundary=self.boundary[index],
+            singular=self.singular[index],
+            penalty=self.penalty,
+        )
+
+
+@dataclass(slots=True)
+class _Point:
+    """The likelihood at one psi per frequency."""
+
+    x: FloatArray
+    discrepancy: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: ComplexArray
+
+    def take(self, index: IntArray | BoolArray) -> _Point:
+        return _Point(
+            self.x[index],
+            self.discrepancy[index],
+            self.eigenvalues[index],
+            self.eigenvectors[index],
+        )
+
+    def put(self, index: IntArray | BoolArray, other: _Point) -> None:
+        self.x[index] = other.x
+        self.discrepancy[index] = other.discrepancy
+        self.eigenvalues[index] = other.eigenvalues
+        self.eigenvectors[index] = other.eigenvectors
+
+
+def max_factors(n_channels: int | IntArray) -> IntArray:
+    """Largest number of factors the model can identify, ``(p - q)**2 >= p``."""
+    return np.floor(n_channels - np.sqrt(n_channels) + 1e-12).astype(np.int64)
+
+
+def check_factors(n_factors: int | IntArray, n_channels: int) -> None:
+    """Raise unless so many factors can be told from the noise of so many channels."""
+    factors, most = np.asarray(n_factors), max_factors(n_channels)
+    if factors.dtype.kind not in "iu":
+        raise EstimatorError(f"{n_factors} factors of motion: expected a whole number")
+    wrong = factors[(factors < 0) | (factors > most)]
+    if wrong.size:
+        raise InsufficientDataError(
+            f"{wrong[0]} factors of motion cannot be told from the noise of {n_channels} "
+            f"channels: at most {most} can"
+        )
+
+
+def maximise(
+    csm: ComplexArray,
+    n_factors: int,
+    *,
+    penalty: FloatArray | None = None,
+) -> Maximum:
+    """Maximum likelihood noise PSD of every channel, at all frequencies at once.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``.
+    n_factors : int
+        Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= p``.
+    penalty : float64, shape (n_channels, n_channels), optional
+        Adds ``x' penalty x / 2``, x = ln psi, to the discrepancy: the precision of a Gaussian
+        prior of x over the number of averages. Positive semidefinite, rows summing to zero.
+
+    Returns
+    -------
+    Maximum
+
+    Raises
+    ------
+    InvalidMatrixError
+        If the shape is not that of square matrices.
+    InsufficientDataError
+        If so many factors cannot be identified from so many channels.
+
+    Notes
+    -----
+    The search starts from the best multiple of ``1 / (S^-1)_ii``; a frequency that has not arrived
+    after `MAX_ITERATIONS` is reported as such. Gradient ``sum_m (1 - w_m) |u_im|**2`` over the
+    residual eigenvalues; Hessian after Clarke (1970) carried over to complex matrices. Its
+    expectation ``|P_ij|**2``, P the projector on the residual eigenvectors, is the Fisher
+    information of ln psi with A eliminated.
+    """
+    if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
+        raise InvalidMatrixError(
+            f"cross-spectral matrix of shape {csm.shape}: expected (n_freqs, p, p)"
+        )
+    p = csm.shape[-1]
+    check_factors(n_factors, p)
+    usable, precision, rounding = _precision(csm)
+    n_freqs = len(csm)
+    found = Maximum(
+        psi=np.full((n_freqs, p), np.nan),
+        discrepancy=np.full(n_freqs, np.nan),
+        eigenvalues=np.ones((n_freqs, p)),
+        eigenvectors=np.broadcast_to(np.eye(p, dtype=np.complex128), csm.shape).copy(),
+        n_factors=n_factors,
+        iterations=np.zeros(n_freqs, np.int64),
+        gradient_norm=np.full(n_freqs, np.nan),
+        converged=np.zeros(n_freqs, np.bool_),
+        boundary=np.zeros((n_freqs, p), np.bool_),
+        singular=~usable,
+        penalty=np.zeros((p, p)) if penalty is None else penalty,
+    )
+    if usable.any():
+        partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
+        lowest = np.log(partial * BOUNDARY)
+        start = partial
+        if n_factors == 0 and penalty is None:  # then that is the maximum
+            start = np.real(np.einsum("fii->fi", csm[usable]))
+        _search(
+            precision[usable],
+            np.log(start),
+            lowest=lowest,
+            rounding=rounding[usable],
+            found=found,
+            where=np.flatnonzero(usable),
+        )
+    return found
+
+
+def _precision(csm: ComplexArray) -> tuple[BoolArray, ComplexArray, FloatArray]:
+    """Where matrices are Hermitian, positive definite; their inverses, and these' rounding."""
+    p = csm.shape[-1]
+    power = np.real(np.einsum("fii->fi", csm))
+    usable = np.isfinite(csm).all(axis=(1, 2)) & (power > 0).all(axis=1)
+    scale = 1 / np.sqrt(np.where(usable[:, None], power, 1.0))
+    outer = scale[:, :, None] * scale[:, None, :]
+    identity = np.eye(p)
+    coherency = np.where(usable[:, None, None], csm, identity) * outer
+    least = np.linalg.eigvalsh(coherency)[:, 0]
+    usable &= least > 4 * p * np.finfo(np.float64).eps
+    usable &= np.abs(coherency - coherency.conj().swapaxes(1, 2)).max(axis=(1, 2)) <= TOLERANCE
+    inverse = np.linalg.inv(np.where(usable[:, None, None], coherency, identity))
+    inverse = (inverse + inverse.conj().swapaxes(1, 2)) / 2
+    rounding = 1e-15 * p / np.where(usable, least, 1.0)
+    return usable, np.asarray(inverse * outer, np.complex128), np.asarray(rounding, np.float64)
+
+
+def _search(
+    precision: ComplexArray,
+    x0: FloatArray,
+    *,
+    lowest: FloatArray,
+    rounding: FloatArray,
+    found: Maximum,
+    where: IntArray,
+) -> None:
+    """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
+    q = found.n_factors
+    n = len(precision)
+    penalty = found.penalty
+    best = _scaled(_evaluate(precision, x0, q), q)
+    gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
+    falling = _falling(best.x, step, lowest)
+    radius = np.full(n, _MAX_STEP)
+    iterations = np.ones(n, np.int64)
+    converged = decrement < DECREMENT
+    going = np.flatnonzero(~converged)
+    for _ in range(MAX_ITERATIONS):
+        if not len(going):
+            break
+        size = np.abs(np.where(falling[going], 0.0, step[going])).max(axis=1)
+        shrink = np.minimum(1.0, radius[going] / np.maximum(size, _MIN_RADIUS))
+        goal = best.x[going] + step[going] * shrink[:, None]
+        goal = np.where(falling[going], lowest[going], np.maximum(goal, lowest[going]))
+        trial = _evaluate(precision[going], goal, q)
+        iterations[going] += 1
+        expected = decrement[going] * shrink * (1 - shrink / 2)
+        gain = best.discrepancy[going] - trial.discrepancy
+        gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
+        accept = gain >= 1e-4 * expected - rounding[going]
+        poor = gain < 0.25 * expected - rounding[going]
+        poor &= ~falling[going].any(axis=1)  # then the fall was too far, not the step
+        falling[going] = False
+        radius[going] = np.where(
+            poor,
+            0.25 * np.minimum(size, radius[going]),
+            np.where(shrink < 1, 2.0, 1.0) * radius[going],
+        )
+        moved = going[accept]
+        point = trial.take(accept)
+        best.put(moved, point)
+        gradient[moved], step[moved], decrement[moved], at_boundary[moved] = _newton(
+            point, lowest[moved], q, penalty
+        )
+        falling[moved] = _falling(point.x, step[moved], lowest[moved])
+        converged[moved] = decrement[moved] < DECREMENT
+        stuck = radius < _MIN_RADIUS
+        going = np.flatnonzero(~converged & ~stuck)
+    sure = converged & (np.abs(step).max(axis=1) < _LAST_STEP)
+    last = np.where(sure[:, None], step, 0.0)
+    found.psi[where] = np.exp(np.maximum(best.x + last, lowest))
+    found.discrepancy[where] = best.discrepancy
+    found.eigenvalues[where] = best.eigenvalues
+    found.eigenvectors[where] = best.eigenvectors
+    found.iterations[where] = iterations
+    found.gradient_norm[where] = np.abs(np.where(at_boundary, 0.0, gradient)).max(axis=1)
+    found.converged[where] = converged
+    found.boundary[where] = at_boundary
+
+
+def _falling(x: FloatArray, step: FloatArray, lowest: FloatArray) -> BoolArray:
+    """Channels on their way to zero noise, near it already and still at a full step."""
+    return np.asarray((x > lowest) & (x < lowest + _FALLING) & (step < -0.5))
+
+
+def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
+    """Whiten by psi and diagonalise, on the inverse matrix.
+
+    There the residual eigenvalues are the large ones, and keep their digits however strong the
+    motion is and however small one psi becomes.
+    """
+    scale = np.exp(0.5 * x)
+    inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])
+    w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
+    return _Point(x.copy(), _discrepancy(w, q), w, u)
+
+
+def _scaled(at: _Point, q: int) -> _Point:
+    """Go to the best multiple of all psi, where the residual eigenvalues have a mean of one."""
+    mean = at.eigenvalues[:, q:].mean(axis=1, keepdims=True)
+    w = at.eigenvalues / mean
+    return _Point(at.x + np.log(mean), _discrepancy(w, q), w, at.eigenvectors)
+
+
+def _discrepancy(w: FloatArray, q: int) -> FloatArray:
+    return np.asarray(np.where(_residual(w, q), w - np.log(w) - 1, 0.0).sum(axis=1))
+
+
+def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * np.einsum("fi,ij,fj->f", x, penalty, x))
+
+
+def _residual(w: FloatArray, q: int) -> BoolArray:
+    """Eigenvalues no factor takes up: all but the first q, and those below one (A would vanish)."""
+    return (np.arange(w.shape[1]) >= q) | (w <= 1)
+
+
+def _newton(
+    at: _Point, lowest: FloatArray, q: int, penalty: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
+    w, u = at.eigenvalues, at.eigenvectors
+    residual = _residual(w, q)
+    conj = u.conj().swapaxes(1, 2)
+    projector = (u * residual[:, None, :]) @ conj
+    weighted = (u * np.where(residual, w, 0.0)[:, None, :]) @ conj
+    gradient = np.einsum("fii->fi", projector - weighted).real + at.x @ penalty
+    hessian = weighted.real * projector.real + weighted.imag * projector.imag + penalty
+    if q:
+        hessian += _turning(w, u, residual, q)
+    at_boundary = (at.x <= lowest) & (gradient > 0)
+    free = ~at_boundary
+    among = free[:, :, None] & free[:, None, :]
+    hessian *= among
+    i = np.arange(w.shape[1])
+    hessian[:, i, i] += at_boundary
+    downhill = np.where(free, gradient, 0.0)
+    step = np.zeros_like(downhill)
+    convex = _least_pivot(hessian) > _CONVEX
+    step[convex] = _solved(hessian[convex], downhill[convex])
+    bent = np.flatnonzero(~convex)
+    if len(bent):
+        expected = (projector.real[bent] ** 2 + projector.imag[bent] ** 2 + penalty) * among[bent]
+        expected[:, i, i] += at_boundary[bent] + _MIN_CURVATURE
+        step[bent] = _solved(expected, downhill[bent])
+        gain = -(step[bent] * downhill[bent]).sum(axis=1)
+        size = np.abs(step[bent]).max(axis=1)
+        bent = bent[(gain < _FAR * at.discrepancy[bent]) | (size > _MAX_STEP)]
+        step[bent] = _turned(hessian[bent], downhill[bent])
+    return gradient, step, -(step * downhill).sum(axis=1), at_boundary
+
+
+def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    return np.asarray(-np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
+
+
+def _least_pivot(matrices: FloatArray) -> FloatArray:
+    """Least pivot of Gaussian elimination, shape (n,): positive if all eigenvalues are.
+
+    All matrices at once, none beyond a pivot under `_CONVEX`: a tenth of the time of eigenvalues.
+    """
+    left = np.moveaxis(matrices, 0, 2).copy()  # the matrices' own axis last: contiguous
+    least = left[0, 0].copy()
+    for k in range(1, len(left)):
+        pivot = np.where(least > _CONVEX, left[k - 1, k - 1], np.inf)
+        left[k:, k:] -= left[k:, k - 1, None] * (left[k - 1, k:] / pivot)
+        least = np.minimum(least, left[k, k])
+    return np.asarray(least, np.float64)
+
+
+def _turned(hessian: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Newton step with negative curvature turned round."""
+    curvature, axes = np.linalg.eigh(hessian)
+    floor = _MIN_CURVATURE * np.maximum(curvature[:, -1:], 1.0)
+    curvature = np.maximum(np.abs(curvature), floor)
+    along = np.einsum("fik,fi->fk", axes, downhill)
+    return np.asarray(-np.einsum("fik,fk->fi", axes, along / curvature))
+
+
+def _turning(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:
+    """Second derivatives by ln psi that come of the factors' turning, shape (n_freqs, p, p)."""
+    n, p = w.shape
+    factor, rest = w[:, None, :q], w[:, q:, None]
+    distance = np.maximum(factor - rest, 1e-6 * factor)
+    weight = np.where(residual[:, None, :q], 0.0, (1 - rest) * (factor + rest) / distance)
+    pairs = (u[:, :, q:, None].conj() * u[:, :, None, :q]).reshape(n, p, q * (p - q))
+    weighted = pairs * weight.reshape(n, 1, q * (p - q))
+    # the real part of a product of complex numbers is one of twice as many real numbers
+    return np.asarray(weighted.view(np.float64) @ pairs.view(np.float64).swapaxes(1, 2))

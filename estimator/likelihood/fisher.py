@@ -1,0 +1,248 @@
+"""What the averages can tell about the noise: Fisher information, bounds, small-sample bias.
+
+In channels whitened by their own noise the model is ``I + A A*``. With P the projector on what
+the motion leaves free (the eigenvectors of the p - q smallest eigenvalues) the information on
+``ln psi`` that is left when A is unknown is, per average,
+
+    J_ij = |P_ij|**2
+
+which is ``Re tr(S^-1 dS S^-1 dS)`` after projecting out all directions ``dA A* + A dA*``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from estimator.errors import InvalidMatrixError
+from estimator.self_noise.coherency import check_averages
+
+if TYPE_CHECKING:
+    from estimator.likelihood.factor_analysis import Maximum
+    from estimator.types import ComplexArray, FloatArray
+
+_LEAST_INFORMATION = 1e-12
+
+
+def information(residual_vectors: ComplexArray) -> FloatArray:
+    """Fisher information of ln psi per average, A unknown.
+
+    Parameters
+    ----------
+    residual_vectors : complex128, shape (n_freqs, n_channels, n_channels - n_factors)
+        Orthonormal basis of the whitened space without motion.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_channels, n_channels)
+        ``|P_ij|**2``.
+    """
+    projector = residual_vectors @ residual_vectors.conj().swapaxes(-1, -2)
+    return np.asarray(np.abs(projector) ** 2)
+
+
+def covariance(per_average: FloatArray) -> FloatArray:
+    """Inverse of the information, NaN where it is singular.
+
+    Parameters
+    ----------
+    per_average : float64, shape (n_freqs, n_channels, n_channels)
+        From `information`.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_channels, n_channels)
+        Covariance of ln psi times the number of averages.
+
+    Notes
+    -----
+    Inverted after scaling to a unit diagonal: as a channel's psi goes to zero its information
+    goes as psi**2, which takes nothing from what is known of the others.
+    """
+    n_channels = per_average.shape[-1]
+    root = np.sqrt(np.einsum("fii->fi", per_average))
+    known = (root > np.finfo(np.float64).tiny).all(axis=1)
+    scale = 1 / np.where(known[:, None], root, 1.0)
+    scaled = np.where(known[:, None, None], per_average, np.eye(n_channels))
+    w, u = np.linalg.eigh(scaled * scale[:, :, None] * scale[:, None, :])
+    known &= w[:, 0] > _LEAST_INFORMATION
+    w = np.where(known[:, None], w, np.nan)
+    vectors = u * scale[:, :, None]
+    return np.asarray((vectors / w[:, None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: float) -> FloatArray:
+    """Least coefficient of variation any unbiased estimate of the noise can have.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        True cross-spectral matrix, ``A A* + diag(noise_psd)``.
+    noise_psd : float64, shape (n_freqs, n_channels)
+        True noise, positive; the rest of `csm` must have low rank.
+    n_effective : float
+        Averages.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_channels)
+        Infinite where the model cannot be identified.
+
+    Raises
+    ------
+    InvalidMatrixError
+        If shapes do not fit, something is not finite, or a noise PSD is not positive.
+    InsufficientDataError
+        If `n_effective` is not a finite number above zero.
+
+    Notes
+    -----
+    Root of the diagonal of the inverse information divided by `n_effective`. The number of
+    factors is the rank of ``csm - diag(noise_psd)``, whitened, above its rounding.
+    """
+    check_averages(n_effective)
+    if noise_psd.ndim != 2 or csm.shape != (*noise_psd.shape, noise_psd.shape[1]):
+        raise InvalidMatrixError(
+            f"cross-spectral matrix of shape {csm.shape} and noise of shape {noise_psd.shape}: "
+            "expected (n_freqs, p, p) and (n_freqs, p)"
+        )
+    if not (np.isfinite(csm).all() and np.isfinite(noise_psd).all() and np.all(noise_psd > 0)):
+        raise InvalidMatrixError(
+            "the Cramér-Rao bound needs finite matrices, and a positive noise PSD in every channel"
+        )
+    scale = 1 / np.sqrt(noise_psd)
+    w, u = np.linalg.eigh(csm * scale[:, :, None] * scale[:, None, :])
+    free = w < 1 + 1e-9 * np.maximum(w[:, -1:], 1.0)
+    per_average = information(u * free[:, None, :])
+    bound = np.sqrt(np.einsum("fii->fi", covariance(per_average)) / n_effective)
+    return np.where(np.isnan(bound), np.inf, bound)
+
+
+def efficiency(cov: FloatArray, bound: FloatArray) -> FloatArray:
+    """Statistical efficiency: recording time the best estimate would need, over this one's.
+
+    Parameters
+    ----------
+    cov : float64, shape (n_freqs, n_channels)
+        Coefficient of variation of an estimate.
+    bound : float64, shape (n_freqs, n_channels)
+        From `cramer_rao_cov`, with the same averages.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_channels)
+        ``(bound / cov)**2``, at most 1 for an unbiased estimate.
+    """
+    return np.asarray((bound / cov) ** 2)
+
+
+def interval(
+    noise_psd: FloatArray, standard_error: FloatArray, *, level: float = 0.95
+) -> tuple[FloatArray, FloatArray]:
+    """Confidence interval of a noise PSD, symmetric in its logarithm.
+
+    Parameters
+    ----------
+    noise_psd : float64
+        Unbiased estimate, not negative, unit**2/Hz.
+    standard_error : float64, same shape
+        unit**2/Hz.
+    level : float
+        Probability that the true value lies inside.
+
+    Returns
+    -------
+    low, high : float64, same shape
+        ``noise_psd * exp(-/+ z c)`` with ``c = standard_error / noise_psd``. Above c = 1 the
+        upper end grows with c and no longer with its exponential, so that it stays finite
+        when the estimate stands at zero.
+    """
+    z = float(special.ndtri((1 + level) / 2))
+    positive = np.where(noise_psd > 0, noise_psd, 1.0)
+    c = np.where(noise_psd > 0, standard_error / positive, np.inf)
+    low = np.where(noise_psd > 0, noise_psd * np.exp(-z * c), 0.0)
+    high = np.maximum(noise_psd, standard_error) * np.exp(z * np.minimum(c, 1.0))
+    unknown = ~np.isfinite(standard_error)
+    return np.where(unknown, np.nan, low), np.where(unknown, np.nan, high)
+
+
+def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) -> FloatArray:
+    """Eigenvalues of the motion, freed from what the scatter of the noise added to them.
+
+    Parameters
+    ----------
+    sample : float64, shape (n_freqs, n_factors)
+        Sample eigenvalues in units of the noise.
+    n_residual : int
+        Number of eigenvalues without motion.
+    n_effective : float
+        Averages.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_factors)
+        At least ``1 + sqrt(n_residual / n_effective)``, below which a factor cannot be told
+        from scatter.
+
+    Notes
+    -----
+    Solves ``sample = w + (m / n) w / (w - 1)`` (Baik and Silverstein 2006; Lawley 1956 to
+    first order in 1/n).
+    """
+    ratio = n_residual / n_effective
+    half = (sample + 1 - ratio) / 2
+    root = np.sqrt(np.maximum(half**2 - sample, 0.0))
+    edge = 1 + np.sqrt(ratio)
+    return np.asarray(np.maximum(half + root, edge))
+
+
+def bias(maximum: Maximum, *, n_effective: float) -> FloatArray:
+    """Fractional bias of the maximum likelihood estimate, to first order in 1 / n.
+
+    Parameters
+    ----------
+    maximum : Maximum
+        From `estimator.likelihood.factor_analysis.maximise`.
+    n_effective : float
+        Averages.
+
+    Returns
+    -------
+    float64, shape (n_freqs, n_channels)
+        Negative; ``-q / n`` at high SNR. Only this leading part is returned where the noise
+        cannot be identified.
+
+    Notes
+    -----
+    Cox and Snell's (1968) formula. The model is linear in psi, so only its curvature in A
+    counts: the bias is minus the regression of ``P E[dA dA*] P`` on the information,
+
+        -(1/n) [ sum_k w_k / (w_k - 1) + J^-1 diag(P (J^-1 o K) P) ],
+        K = sum_k u_k u_k* / (w_k - 1).
+
+    The first term is what factors take away from the noise whatever psi is (q at high SNR:
+    exactly so, because what remains there is a Wishart matrix with n - q degrees of freedom
+    and a covariance linear in psi, whose maximum likelihood estimate has no bias of first
+    order); the second the turning of the factors by the error of psi itself.
+    """
+    eigenvalues, n_factors = maximum.eigenvalues, maximum.n_factors
+    n_channels = eigenvalues.shape[1]
+    if n_factors == 0:
+        return np.zeros_like(eigenvalues)
+    n_residual = n_channels - n_factors
+    taken = np.full(len(eigenvalues), float(n_factors))
+    for _ in range(3):  # the whitening noise is itself low by what is taken away
+        lower = np.clip(1 - taken / n_effective, 0.1, 1.0)
+        w = spiked_eigenvalues(eigenvalues[:, :n_factors] * lower[:, None], n_residual, n_effective)
+        taken = (w / (w - 1)).sum(axis=1)
+    motion = maximum.eigenvectors[:, :, :n_factors]
+    free = maximum.eigenvectors[:, :, n_factors:]
+    projector = free @ free.conj().swapaxes(1, 2)
+    inverse = covariance(np.abs(projector) ** 2 + maximum.penalty)
+    kernel = (motion / (w - 1)[:, None, :]) @ motion.conj().swapaxes(1, 2)
+    turned = projector @ (inverse * kernel) @ projector
+    second = np.einsum("fij,fjj->fi", inverse, np.real(turned))
+    total = taken[:, None] + np.where(np.isfinite(second), second, 0.0)
+    return np.asarray(-total / n_effective)

@@ -1,0 +1,1 @@
+"""The self-noise methods in closed form, their bias and uncertainty."""

@@ -1,0 +1,193 @@
+"""What misalignment and spatial incoherence do to the estimates: the theory of the paper.
+
+Everything follows from the motion's part of the cross-spectral matrix, ``c[p, q]``: the cross-PSD
+of what channels p and q have of the motion. `motion_csm` makes it from the channels' directions
+and the motion; `incoherent_motion` from one motion felt less than perfectly alike.
+
+References
+----------
+.. [1] Z. Zhu, S.-K. Au, X. Wang, "Instrument noise calibration with arbitrary sensor orientations".
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError
+from estimator.self_noise.coherency import check_dims
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+SINGULAR = 1e-12  # of the largest singular value: what rounding leaves of zero
+
+
+def motion_csm(
+    response: ComplexArray | FloatArray, motion: ComplexArray | FloatArray
+) -> ComplexArray:
+    """Cross-spectral matrix of what the sensors have of the motion.
+
+    Parameters
+    ----------
+    response : complex128 or float64, shape (..., n_sensors, n_rows, d)
+        ``H_i = G_i R_i`` of Eq. (18): each channel's gain times its direction cosines.
+    motion : complex128 or float64, shape (..., d, d) or (..., n_sensors, n_sensors, d, d)
+        One-sided PSD matrix ``S_Z`` of the motion common to all sensors, or the cross-PSD
+        matrices ``S_ZiZj = E[Z_i Z_j^*]`` of the motions at the sensors.
+
+    Returns
+    -------
+    complex128, shape (..., n_sensors * n_rows, n_sensors * n_rows)
+        ``c[p, q]``, Eqs. (10), (14), (20), (28).
+    """
+    H = np.asarray(response, dtype=np.complex128)
+    Z = np.asarray(motion, dtype=np.complex128)
+    n_sensors, n_rows, d = H.shape[-3:]
+    if Z.shape[-2:] != (d, d):
+        raise EstimatorError(f"motion of shape {Z.shape}, expected (..., {d}, {d})")
+    if Z.shape[-4:-2] != (n_sensors, n_sensors):
+        Z = Z[..., None, None, :, :]
+    blocks = H[..., :, None, :, :] @ Z @ H.conj().swapaxes(-1, -2)[..., None, :, :, :]
+    p = n_sensors * n_rows
+    return np.asarray(blocks.swapaxes(-3, -2).reshape(*blocks.shape[:-4], p, p))
+
+
+def incoherent_motion(
+    motion: ComplexArray | FloatArray, coherency: ComplexArray | FloatArray
+) -> ComplexArray:
+    """Cross-PSD matrices of motions that are alike but not the same.
+
+    Parameters
+    ----------
+    motion : complex128 or float64, shape (..., d, d)
+        PSD matrix of the motion at each sensor.
+    coherency : complex128 or float64, shape (..., n_sensors, n_sensors)
+        Hermitian, ones on its diagonal: ``S_ZiZj = coherency[i, j] S_Z``. (The *coherence* that
+        instruments display is its squared magnitude.)
+
+    Returns
+    -------
+    complex128, shape (..., n_sensors, n_sensors, d, d)
+    """
+    factors = np.asarray(coherency, dtype=np.complex128)[..., None, None]
+    return np.asarray(factors * np.asarray(motion)[..., None, None, :, :])
+
+
+def snr(motion: ComplexArray, noise_psd: FloatArray) -> FloatArray:
+    """Signal-to-noise ratio of each channel.
+
+    Parameters
+    ----------
+    motion : complex128, shape (..., p, p)
+        As `motion_csm` returns it.
+    noise_psd : float64, shape (..., p)
+
+    Returns
+    -------
+    float64, shape (..., p)
+        ``gamma_i`` of Eq. (12); the diagonal of Eq. (31).
+    """
+    return np.asarray(np.einsum("...pp->...p", motion).real / noise_psd)
+
+
+def three_channel_bias(
+    motion: ComplexArray, noise_psd: FloatArray, *, dims: tuple[int, ...]
+) -> FloatArray:
+    """Fractional bias of the three-channel estimate; 0 where it is unbiased.
+
+    Parameters
+    ----------
+    motion : complex128, shape (..., p, p)
+        As `motion_csm` returns it, for common or for incoherent motion.
+    noise_psd : float64, shape (..., p)
+        True noise.
+    dims : tuple of int
+        Channels of each sensor, all the same; channel r is compared with channels r.
+
+    Returns
+    -------
+    float64, shape (..., p)
+        Real part of Eq. (13), the mean over all pairs of other sensors; (27) where the motion
+        is incoherent. Not finite where two others share none of the motion that the channel feels.
+
+    Raises
+    ------
+    EstimatorError
+        If sensors are not equal, shapes do not fit, motion is not finite or noise not positive.
+    """
+    d = _equal_dims(motion, noise_psd, dims)
+    bias = snr(motion, noise_psd)
+    factor = np.zeros_like(bias)
+    for i, r in itertools.product(range(len(dims)), range(d)):
+        pairs = list(itertools.combinations([n for n in range(len(dims)) if n != i], 2))
+        p = d * i + r
+        for j, k in pairs:
+            q, s = d * j + r, d * k + r
+            product = motion[..., q, p] * motion[..., p, s]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                quotient = product / (motion[..., p, p] * motion[..., q, s])
+            factor[..., p] += (1 - quotient.real) / len(pairs)
+    return np.where(bias == 0, 0.0, bias * factor)
+
+
+def three_sensor_bias(
+    motion: ComplexArray, noise_psd: FloatArray, *, dims: tuple[int, ...]
+) -> FloatArray:
+    """Fractional bias of the three-sensor estimate; 0 while the sensors feel one motion.
+
+    Parameters
+    ----------
+    motion : complex128, shape (..., p, p)
+        As `motion_csm` returns it, for incoherent motion.
+    noise_psd : float64, shape (..., p)
+        True noise.
+    dims : tuple of int
+        Channels of each sensor, all the same.
+
+    Returns
+    -------
+    float64, shape (..., p)
+        Diagonal of Eq. (30), real part (the mean with j and k swapped), and mean over all pairs
+        of other sensors.
+
+    Raises
+    ------
+    EstimatorError
+        If sensors are not equal, shapes do not fit, motion is not finite or noise not positive.
+
+    Notes
+    -----
+    Evaluated as Eq. (29) over the noise; in terms of ``c``, ``H_i S_ZiZk S_ZjZk^-1 S_ZjZi H_i^*``
+    is ``c_ik inv(c_jk) c_ji``; the generalised inverse where the motion lacks a dimension.
+    """
+    d = _equal_dims(motion, noise_psd, dims)
+    n = len(dims)
+    blocks = motion.reshape(*motion.shape[:-2], n, d, n, d).swapaxes(-3, -2)
+    bias = np.zeros((*motion.shape[:-2], n, d))
+    for i in range(n):
+        pairs = list(itertools.combinations([j for j in range(n) if j != i], 2))
+        for j, k in pairs:
+            inverse = np.linalg.pinv(blocks[..., j, k, :, :], rcond=SINGULAR)
+            explained = blocks[..., i, k, :, :] @ inverse @ blocks[..., j, i, :, :]
+            left = blocks[..., i, i, :, :] - explained
+            bias[..., i, :] += np.einsum("...rr->...r", left).real / len(pairs)
+    return np.asarray(bias.reshape(*motion.shape[:-2], n * d) / noise_psd)
+
+
+def _equal_dims(motion: ComplexArray, noise_psd: FloatArray, dims: tuple[int, ...]) -> int:
+    """Return the channels of each sensor; raise unless motion and noise are of such sensors."""
+    check_dims(dims)
+    if len(set(dims)) != 1:
+        raise EstimatorError(f"sensors of {dims} channels: the theory takes equal sensors")
+    p = sum(dims)
+    if motion.shape[-2:] != (p, p) or noise_psd.shape[-1:] != (p,):
+        raise EstimatorError(
+            f"motion of shape {motion.shape} and noise of shape {noise_psd.shape}: "
+            f"expected (..., {p}, {p}) and (..., {p})"
+        )
+    if not (np.isfinite(motion).all() and np.all(noise_psd > 0)):
+        raise EstimatorError("motion and noise: expected finite numbers, noise above zero")
+    return dims[0]

@@ -1,0 +1,227 @@
+"""What every method checks and normalises first.
+
+Methods work on the coherency matrix, ``csm`` divided by the root of its two channels' PSDs, so
+that units and gains neither over- nor underflow nor hide a singular matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.self_noise.result import Flag, SelfNoise
+
+if TYPE_CHECKING:
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+TOLERANCE = 1e-8  # of a coherency matrix that is not quite Hermitian, and of coherence above 1
+DEAD = 1e-28  # of a channel's largest PSD: what rounding leaves of a constant
+DUPLICATE = 1e-13  # one less the coherence of a channel and its copy
+SINGULAR = 1e12  # elements of an inverse coherency from which on they are rounding only
+
+
+@dataclass(frozen=True, slots=True)
+class Coherency:
+    """A checked, normalised cross-spectral matrix.
+
+    Attributes
+    ----------
+    matrix : complex128, shape (n_freqs, n_channels, n_channels)
+        Ones on its diagonal; zero for a dead channel, a unit matrix at frequencies that are not
+        `valid`.
+    psd : float64, shape (n_freqs, n_channels)
+        PSD of every channel in unit**2/Hz; 1 where it is zero or the frequency is not valid.
+    flags : int64, shape (n_freqs, n_channels)
+        DEAD_CHANNEL, DUPLICATE, NOT_FINITE and INVALID of `estimator.self_noise.result.Flag`.
+    duplicates : bool, shape (n_freqs, n_channels, n_channels)
+        True where two different channels are the same.
+    """
+
+    matrix: ComplexArray
+    psd: FloatArray
+    flags: IntArray
+    duplicates: BoolArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Where the cross-spectral matrix is finite, and one, shape (n_freqs,)."""
+        return np.asarray((self.flags & (Flag.NOT_FINITE | Flag.INVALID) == 0).all(axis=1))
+
+    @property
+    def absent(self) -> BoolArray:
+        """Channels that are dead or repeat an earlier one, shape (n_freqs, n_channels)."""
+        p = self.psd.shape[1]
+        copies = self.duplicates & np.tri(p, k=-1, dtype=np.bool_)
+        return np.asarray(((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2))
+
+    def block(self, some: slice) -> Coherency:
+        """Return the same for some frequencies only."""
+        return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])
+
+    def part(self, channels: list[int]) -> Coherency:
+        """Return the same for some channels only."""
+        square = np.ix_(range(len(self.psd)), channels, channels)
+        return Coherency(
+            self.matrix[square],
+            self.psd[:, channels],
+            self.flags[:, channels],
+            self.duplicates[square],
+        )
+
+
+def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
+    """Raise unless `dims` describes at least `n_sensors` sensors of one channel or more."""
+    if any(d < 1 for d in dims) or (dims and np.asarray(dims).dtype.kind not in "iu"):
+        raise InvalidMatrixError(
+            f"dims {dims}: expected a whole number of channels for every sensor, at least one"
+        )
+    if len(dims) < n_sensors:
+        raise InsufficientDataError(f"{len(dims)} sensors: at least {n_sensors} are needed")
+
+
+def check_averages(n_effective: float, d: int = 0) -> None:
+    """Raise unless averages are a number, and more than the motion has dimensions."""
+    if not (np.isfinite(n_effective) and n_effective > 0):
+        raise InsufficientDataError(
+            f"{n_effective:g} effective averages: expected a finite number above zero"
+        )
+    if n_effective <= d:
+        raise InsufficientDataError(
+            f"{n_effective:g} effective averages: more than {d} are needed to tell the noise from "
+            f"a motion of {d} dimensions; record longer or use shorter segments"
+        )
+
+
+def check_frequency(frequency: FloatArray, n_freqs: int) -> FloatArray:
+    """Return frequencies as an array; raise unless they are one a matrix, finite and rising."""
+    frequency = np.asarray(frequency, dtype=np.float64)
+    if frequency.shape != (n_freqs,):
+        raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({n_freqs},)")
+    if not (np.isfinite(frequency).all() and np.all(np.diff(frequency) > 0)):
+        raise InvalidMatrixError("frequency: expected finite numbers of Hz, rising")
+    return frequency
+
+
+def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
+    """Check a cross-spectral matrix and divide it by its channels' PSDs.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz.
+    dims : tuple of int
+        Channels of each sensor.
+
+    Raises
+    ------
+    InvalidMatrixError
+        If `csm` is mis-shaped, or at no frequency finite, Hermitian, and free of negative PSDs
+        and of coherence above 1. Single such frequencies, and dead or duplicated channels, are
+        flagged instead.
+    """
+    csm = np.asarray(csm, dtype=np.complex128)
+    n_channels = sum(dims)
+    if csm.ndim != 3 or csm.shape[1:] != (n_channels, n_channels) or len(csm) == 0:
+        raise InvalidMatrixError(
+            f"cross-spectral matrix of shape {csm.shape}, expected "
+            f"(n_freqs, {n_channels}, {n_channels}) for sensors of {dims} channels"
+        )
+    finite: BoolArray = np.asarray(np.isfinite(csm).all(axis=(1, 2)))
+    diagonal = np.einsum("fpp->fp", csm).real
+    negative: BoolArray = finite & (diagonal < 0).any(axis=1)
+    usable = finite & ~negative
+    psd: FloatArray = np.where(usable[:, None], diagonal, 0.0)
+    dead = psd <= np.maximum(DEAD * psd.max(axis=0), np.finfo(np.float64).tiny)
+    dead &= usable[:, None]
+    psd = np.where(dead | ~usable[:, None], 1.0, psd)
+    scale = np.where(dead, 0.0, 1 / np.sqrt(psd))
+    with np.errstate(over="ignore", invalid="ignore"):  # what comes of this is no coherency
+        matrix: ComplexArray = csm * scale[:, :, None]
+        matrix *= scale[:, None, :]
+        matrix[~usable] = np.eye(n_channels)
+        p, q = np.tril_indices(n_channels)
+        deviation = np.abs(matrix[:, p, q] - matrix[:, q, p].conj()).max(axis=1)
+        coherence = matrix.real**2 + matrix.imag**2
+    skew: BoolArray = ~(deviation <= TOLERANCE)  # NaN included
+    impossible: BoolArray = ~skew & (coherence > 1 + TOLERANCE).any(axis=(1, 2))
+    invalid = negative | skew | impossible
+    if not (finite & ~invalid).any():
+        faults = {
+            "NaN or infinite": ~finite,
+            "negative PSD": negative,
+            "not Hermitian": skew,
+            "coherence above 1": impossible,
+        }
+        counts = [f"{fault} at {where.sum()}" for fault, where in faults.items() if where.any()]
+        raise InvalidMatrixError(
+            f"cross-spectral matrix: none of {len(csm)} frequencies can be used "
+            f"({', '.join(counts)}); expected csm[f, p, q] = E[X_p conj(X_q)]"
+        )
+    matrix[invalid] = np.eye(n_channels)
+    duplicates = coherence >= 1 - DUPLICATE
+    duplicates[:, np.arange(n_channels), np.arange(n_channels)] = False
+    duplicates[invalid] = False
+    flags = np.zeros(psd.shape, dtype=np.int64)
+    flags[dead] |= Flag.DEAD_CHANNEL
+    flags[duplicates.any(axis=2)] |= Flag.DUPLICATE
+    flags[~finite] = Flag.NOT_FINITE
+    flags[invalid] = Flag.INVALID
+    return Coherency(matrix, np.where(invalid[:, None], 1.0, psd), flags, duplicates)
+
+
+def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
+    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not valid."""
+    known = given.valid & (frequency > 0)
+    return np.where(known[:, None, None], given.matrix, np.nan)
+
+
+def from_parts(
+    method: str, given: Coherency, parts: tuple[FloatArray, ...], flags: IntArray
+) -> SelfNoise:
+    """Return to units what a method found for the coherency matrix.
+
+    Parameters
+    ----------
+    method : str
+    given : Coherency
+    parts : tuple of float64, shape (n_freqs, n_channels)
+        Noise, its standard deviation, and both ends of its interval, as parts of the PSD.
+    flags : int64, shape (n_freqs, n_channels)
+        All but NEGATIVE. What is flagged becomes NaN.
+    """
+    unknown = flags != 0
+    noise, deviation, low, high = (np.where(unknown, np.nan, given.psd * part) for part in parts)
+    with np.errstate(divide="ignore", invalid="ignore"):  # noise of zero, even known exactly
+        cov = deviation / np.abs(noise)
+    negative = np.where(noise <= 0, int(Flag.NEGATIVE), 0)
+    return SelfNoise(method, noise, cov, low, high, flags | negative)
+
+
+def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
+    """Invert what can be inverted.
+
+    Parameters
+    ----------
+    matrices : complex128, shape (n, d, d)
+        Coherencies, so that their rounding is that of one.
+
+    Returns
+    -------
+    inverses : complex128, shape (n, d, d)
+        Zero where the matrix is singular.
+    regular : bool, shape (n,)
+    """
+    regular = np.ones(len(matrices), dtype=bool)
+    inverses: ComplexArray
+    try:
+        inverses = np.asarray(np.linalg.inv(matrices), dtype=np.complex128)
+    except np.linalg.LinAlgError:  # raised for the whole batch when one of it is singular
+        regular = np.linalg.det(matrices) != 0
+        identity = np.eye(matrices.shape[1], dtype=np.complex128)
+        invertible = np.where(regular[:, None, None], matrices, identity)
+        inverses = np.asarray(np.linalg.inv(invertible), dtype=np.complex128)
+    regular &= np.abs(inverses).max(axis=(1, 2)) < SINGULAR
+    return np.where(regular[:, None, None], inverses, 0j), regular

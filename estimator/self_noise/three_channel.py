@@ -1,0 +1,73 @@
+"""The three-channel method of Sleeman and co-workers: the baseline of the field."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import InsufficientDataError
+from estimator.self_noise.coherency import check_dims, coherency
+from estimator.self_noise.result import Flag, SelfNoise
+from estimator.self_noise.three_sensor import estimate
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray
+
+
+def three_channel(
+    csm: ComplexArray, *, dims: tuple[int, ...], n_effective: float, correct: bool = True
+) -> SelfNoise:
+    """Self-noise PSD from three or more channels that point the same way.
+
+    Channel r of a sensor is compared with channels r of all other sensors, and nothing else.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    dims : tuple of int
+        Channels of each sensor. Where fewer than two other sensors have a channel r, channel r
+        is flagged NO_COUNTERPART.
+    n_effective : float
+        Independent averages in `csm`.
+    correct : bool
+        Divide by ``1 - 1 / n_effective``, which removes the small-sample bias.
+
+    Returns
+    -------
+    SelfNoise
+
+    Raises
+    ------
+    InvalidMatrixError
+        If `csm` is not a cross-spectral matrix of these sensors.
+    InsufficientDataError
+        With fewer than three sensors, or ``n_effective <= 1``.
+
+    Notes
+    -----
+    The real part of Eq. (6) of Zhu, Au and Wang; the mean over all pairs of other channels.
+    Biased when the channels do not point the same way: see `estimator.self_noise.bias`.
+    """
+    check_dims(dims)
+    given = coherency(csm, dims)
+    first = np.cumsum([0, *dims[:-1]])
+    parts = [
+        [int(start) + r for start, n in zip(first, dims, strict=True) if n > r]
+        for r in range(max(dims))
+    ]
+    compared = [part for part in parts if len(part) >= 3]
+    if not compared:
+        raise InsufficientDataError(f"sensors of {dims} channels: no three of them share a channel")
+    values = np.full((4, *given.psd.shape), np.nan)
+    flags = given.flags | Flag.NO_COUNTERPART
+    for part in compared:
+        result = estimate(
+            given.part(part), dims=(1,) * len(part), n_effective=n_effective, correct=correct
+        )
+        values[:, :, part] = result.noise_psd, result.cov, result.low, result.high
+        flags[:, part] = result.flags
+    noise_psd, cov, low, high = values
+    return SelfNoise("three-channel", noise_psd, cov, low, high, flags)

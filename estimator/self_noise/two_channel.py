@@ -1,0 +1,106 @@
+"""The two-channel method: the baseline users know, when the channels' responses are known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError
+from estimator.self_noise.coherency import check_averages, check_dims, coherency, from_parts
+from estimator.self_noise.result import Flag
+from estimator.self_noise.uncertainty import moments, score_interval
+
+if TYPE_CHECKING:
+    from estimator.self_noise.result import SelfNoise
+    from estimator.types import ComplexArray
+
+
+def two_channel(
+    csm: ComplexArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    correct: bool = True,  # noqa: ARG001 - linear in the matrix: there is no bias to remove
+    response: ComplexArray | None = None,
+) -> SelfNoise:
+    """Self-noise PSD from two or more channels that point the same way and whose gains are known.
+
+    Channel r of a sensor is compared with channels r of all other sensors, and nothing else.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    dims : tuple of int
+        Channels of each sensor. Where no other sensor has a channel r, channel r is flagged
+        NO_COUNTERPART.
+    n_effective : float
+        Independent averages in `csm`.
+    correct : bool
+        As for the other methods; this one has no small-sample bias.
+    response : complex128, shape (n_channels,) or (n_freqs, n_channels), optional
+        What each channel makes of one unit of motion, relative to any reference they share; by
+        default all are the same. An error of one part in a hundred of it leaves one part in a
+        hundred of the *motion* in the noise.
+
+    Returns
+    -------
+    SelfNoise
+
+    Raises
+    ------
+    InvalidMatrixError
+        If `csm` is not a cross-spectral matrix of these sensors.
+    InsufficientDataError
+        With fewer than two sensors, or ``n_effective <= 1``.
+    EstimatorError
+        If `response` has another shape, is not finite or is zero somewhere.
+
+    Notes
+    -----
+    ``S_ii - Re(S_ij conj(h_i / h_j))`` [1]_, the mean over all j: the spectrum between the channel
+    and what is left of it when the mean of the others is taken off.
+
+    References
+    ----------
+    .. [1] L. G. Holcomb, "A direct method for calculating instrument noise levels in side-by-side
+       seismometer evaluations", U.S. Geological Survey Open-File Report 89-214 (1989).
+    """
+    check_dims(dims, 2)
+    check_averages(n_effective, 1)
+    given = coherency(csm, dims)
+    gain = _gain(response, given.psd.shape) / np.sqrt(given.psd)
+    shape = n_freqs, n_channels = given.psd.shape
+    noise, deviation, low, high = (np.full(shape, np.nan) for _ in range(4))
+    flags = given.flags.copy()
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    row = np.concatenate([np.arange(d) for d in dims])
+    omega = np.array([[0, 0.5], [0.5, 0]])
+    for p in range(n_channels):
+        others = np.flatnonzero((row == row[p]) & (sensor != sensor[p]))
+        weights = (given.flags[:, others] & Flag.DEAD_CHANNEL == 0).astype(np.float64)
+        n_others = weights.sum(axis=1)
+        flags[n_others == 0, p] |= Flag.NO_COUNTERPART
+        weights /= np.maximum(n_others, 1)[:, None]
+        W = np.zeros((n_freqs, 2, n_channels), dtype=np.complex128)
+        W[:, :, p] = 1
+        W[:, 1, others] -= weights * gain[:, p, None] / gain[:, others]
+        G = W @ given.matrix @ W.conj().swapaxes(1, 2)
+        traces = moments(G, omega)
+        noise[:, p] = G[:, 0, 1].real
+        deviation[:, p] = np.sqrt(np.maximum(traces[0], 0) / n_effective)
+        low[:, p], high[:, p] = score_interval(noise[:, p], traces, averages=n_effective)
+    return from_parts("two-channel", given, (noise, deviation, low, high), flags)
+
+
+def _gain(response: ComplexArray | None, shape: tuple[int, ...]) -> ComplexArray:
+    if response is None:
+        return np.ones(shape, dtype=np.complex128)
+    gain = np.asarray(response, dtype=np.complex128)
+    if gain.shape not in {shape, shape[1:]}:
+        raise EstimatorError(f"response of shape {gain.shape}, expected {shape} or {shape[1:]}")
+    if not np.isfinite(gain).all() or not gain.all():
+        raise EstimatorError("response: must be finite, and zero nowhere")
+    return np.broadcast_to(gain, shape)

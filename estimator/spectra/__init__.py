@@ -1,0 +1,1 @@
+"""Cross-spectral matrices by Welch averages: windows, octaves, rejected segments."""

@@ -1,0 +1,347 @@
+"""Spectra from those segments that nothing has disturbed.
+
+A segment is left out when samples of it are missing, when it is clipped, or when the power of any
+channel in any octave lies far from what it was in the segments accepted before, or its largest step
+from one sample to the next does (a spike that the window all but hides still stands far above noise
+that is far below the motion), or when a channel stands still in part of it for far longer than it
+used to: one that was dead for a moment lacks too little power to show by that, while one whose
+noise is below a count, or that has always been dead, stands still all the time.
+The decision on a segment looks at earlier ones only, so that it is the same while the recording
+grows and afterwards.
+
+The first segments have none before them: a start-up set is held back and judged by its own median.
+Should the level change for good, so that a whole start-up set in a row is left out, judging starts
+afresh with the segments that follow.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.errors import EstimatorError
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from estimator.types import BoolArray, FloatArray, IntArray
+
+FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
+STILL = 32  # samples alike in a row: a channel that was dead
+LONGER = 2.0  # than usual: how long a channel that often stands still must do so, at threshold 6
+FEWEST = 5  # segments that have a median worth the name
+SEGMENTS_PER_BLOCK = 32
+REPORTED = 1000  # segments left out that are remembered one by one
+
+
+class Reason(enum.StrEnum):
+    """Why a segment was left out."""
+
+    GAP = "gap"
+    CLIPPED = "clipped"
+    TRANSIENT = "transient"
+
+
+@dataclass(frozen=True, slots=True)
+class RejectionSettings:
+    """When to leave a segment out.
+
+    Attributes
+    ----------
+    threshold : float
+        Deviations of the logarithmic power of a band, or of the largest squared step from sample to
+        sample, above its running median, in standard deviations (1.4826 times the median absolute
+        deviation, or the scatter of stationary noise where that is more). Twice as many below:
+        logarithms of powers have a long lower tail. So many also of the logarithm of the longest
+        time that a channel stands still, above its running median. Infinite: transients, and
+        channels that stand still, stay in.
+    start_up : int
+        Segments that are judged by each other before there are earlier ones.
+    memory : int
+        Accepted segments that the running median reaches back.
+    renewal : int
+        Accepted segments after which the median is taken anew.
+    """
+
+    threshold: float = 6.0
+    start_up: int = 16
+    memory: int = 64
+    renewal: int = 16
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0:
+            raise EstimatorError(f"rejection threshold {self.threshold}: expected above 0")
+        if self.start_up < FEWEST or self.memory < self.start_up or self.renewal < 1:
+            raise EstimatorError(
+                f"rejection start_up {self.start_up}, memory {self.memory}, renewal "
+                f"{self.renewal}: expected {FEWEST} or more, no less than that, and 1 or more"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """One segment that was left out.
+
+    Attributes
+    ----------
+    segment : int
+        Its number, from 0, in the order of adding.
+    reason : Reason
+    channel : int or None
+        The channel that shows it most; None for a gap.
+    deviation : float
+        Standard deviations from the median, for a transient; NaN otherwise.
+    """
+
+    segment: int
+    reason: Reason
+    channel: int | None
+    deviation: float
+
+
+class SelectedSpectra:
+    """A `CrossSpectra` of undisturbed segments.
+
+    Parameters
+    ----------
+    settings : WelchSettings
+    n_channels : int
+    rejection : RejectionSettings, optional
+    full_scale : float64, shape (n_channels,), optional
+        A segment with a sample as far from zero as this is clipped.
+
+    Attributes
+    ----------
+    n_segments : int
+        Segments judged, those still held back included.
+    counts : Counter of Reason
+        How many were left out, and why.
+    rejected : deque of Rejected
+        The latest of them, one by one.
+    """
+
+    def __init__(
+        self,
+        settings: WelchSettings,
+        n_channels: int,
+        *,
+        rejection: RejectionSettings | None = None,
+        full_scale: FloatArray | None = None,
+    ) -> None:
+        self.settings = settings
+        self.rejection = RejectionSettings() if rejection is None else rejection
+        self.n_segments = 0
+        self.counts: Counter[Reason] = Counter()
+        self.rejected: deque[Rejected] = deque(maxlen=REPORTED)
+        self._full_scale = np.full(n_channels, np.inf) if full_scale is None else full_scale
+        if self._full_scale.shape != (n_channels,):
+            raise EstimatorError(f"full scale of {self._full_scale.shape}, expected {n_channels}")
+        self._limited = bool(np.isfinite(self._full_scale).any())
+        self._accepted = CrossSpectra(settings, n_channels)
+        self._window = get_window(settings.window, settings.segment_length)[:, None]
+        n_freqs = settings.segment_length // 2 + 1
+        octaves = int(np.log2(max(1, n_freqs // FIRST_BAND)))
+        self._bands = np.array([0, *FIRST_BAND * 2 ** np.arange(octaves)])
+        self._least = np.array(
+            [
+                *_stationary_scatter(self._window[:, 0], np.diff([*self._bands, n_freqs])),
+                _scatter_of_largest(settings.segment_length - 1),
+                np.log(LONGER) / 6,
+            ]
+        )
+        self._held: list[_Held] = []
+        self._before: deque[FloatArray] = deque(maxlen=self.rejection.memory)
+        self._normal: tuple[FloatArray, FloatArray] | None = None  # median, scatter
+        self._since_renewal = 0
+        self._in_a_row = 0
+
+    def add(self, samples: FloatArray, starts: IntArray, complete: BoolArray | None = None) -> None:
+        """Judge the segments of `samples` that begin at `starts`, and add those that pass.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+            NaN counts as a gap.
+        starts : int64, shape (n_segments,)
+            In the order of time.
+        complete : bool, shape (n_samples,), optional
+            False where any sensor has a gap.
+
+        Raises
+        ------
+        EstimatorError
+            As `CrossSpectra.add`; nothing has been judged then.
+        """
+        starts = np.asarray(starts, dtype=np.int64)
+        self._accepted.check(samples, starts)
+        passed = []
+        for first in range(0, len(starts), SEGMENTS_PER_BLOCK):
+            rows = starts[first : first + SEGMENTS_PER_BLOCK]
+            for row, levels in zip(rows, self._levels(samples, rows), strict=True):
+                stretch = slice(row, row + self.settings.segment_length)
+                whole = bool(np.isfinite(levels).all())
+                whole &= complete is None or bool(complete[stretch].all())
+                if self._passes(samples[stretch], levels, whole=whole):
+                    passed.append(row)
+        self._accepted.add(samples, np.array(passed, dtype=np.int64))
+
+    def spectra(self) -> CrossSpectra:
+        """Return the spectra of all segments accepted so far.
+
+        Those still held back count as far as they agree with each other.
+        """
+        total = CrossSpectra(self.settings, self._accepted.n_channels)
+        total.merge(self._accepted)
+        for held in self._agreeing(self._held)[0]:
+            total.add(held.samples, np.zeros(1, dtype=np.int64))
+        return total
+
+    def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
+        """Logarithm of the power in each band, of the largest squared step, and of the time still.
+
+        Returns
+        -------
+        float64, shape (n_segments, n_bands + 2, n_channels)
+        """
+        shape = (self.settings.segment_length, samples.shape[1])
+        frames = np.lib.stride_tricks.sliding_window_view(samples, shape)[rows, 0]
+        step = np.abs(np.diff(frames, axis=1)).max(axis=1, keepdims=True)
+        frames -= frames.mean(axis=1, keepdims=True)
+        spectra = np.fft.rfft(frames * self._window, axis=1)
+        power = np.add.reduceat(spectra.real**2 + spectra.imag**2, self._bands, axis=1)
+        still = np.stack([_longest_still(samples[row : row + shape[0]]) for row in rows])
+        levels = np.concatenate([power, step**2, still[:, None]], axis=1)
+        return np.asarray(np.log(np.maximum(levels, np.finfo(np.float64).tiny)))
+
+    def _passes(self, segment: FloatArray, levels: FloatArray, *, whole: bool) -> bool:
+        number, self.n_segments = self.n_segments, self.n_segments + 1
+        if not whole:
+            self._leave_out(Rejected(number, Reason.GAP, None, np.nan))
+            return False
+        if self._limited:
+            clipped = (np.abs(segment) >= self._full_scale).any(axis=0)
+            if clipped.any():
+                self._leave_out(Rejected(number, Reason.CLIPPED, int(np.argmax(clipped)), np.nan))
+                return False
+        if self._normal is None:
+            self._held.append(_Held(number, segment.copy(), levels))
+            if len(self._held) == self.rejection.start_up:
+                self._end_start_up()
+            return False
+        off = _deviation(levels, *self._normal)
+        if off.max() > self.rejection.threshold:
+            self._leave_out(_transient(number, off))
+            self._in_a_row += 1
+            if self._in_a_row == self.rejection.start_up:
+                self._normal, self._in_a_row = None, 0
+                self._before.clear()
+            return False
+        self._in_a_row = 0
+        self._before.append(levels)
+        self._since_renewal += 1
+        if self._since_renewal == self.rejection.renewal:
+            self._renew()
+        return True
+
+    def _end_start_up(self) -> None:
+        agreeing, others = self._agreeing(self._held)
+        for held in agreeing:
+            self._accepted.add(held.samples, np.zeros(1, dtype=np.int64))
+            self._before.append(held.levels)
+        for rejected in others:
+            self._leave_out(rejected)
+        self._held.clear()
+        self._renew()
+
+    def _agreeing(self, held: list[_Held]) -> tuple[list[_Held], list[Rejected]]:
+        """Those that lie near the median of all, and the others."""
+        if len(held) < FEWEST:
+            return held, []
+        normal = self._median([segment.levels for segment in held])
+        off = [_deviation(segment.levels, *normal) for segment in held]
+        passes = [bool(o.max() <= self.rejection.threshold) for o in off]
+        return (
+            [segment for segment, good in zip(held, passes, strict=True) if good],
+            [
+                _transient(segment.number, o)
+                for segment, o, good in zip(held, off, passes, strict=True)
+                if not good
+            ],
+        )
+
+    def _renew(self) -> None:
+        self._normal = self._median(self._before) if self._before else None
+        self._since_renewal = 0
+
+    def _median(self, levels: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        stack = np.stack(list(levels))
+        median = np.median(stack, axis=0)
+        scatter = 1.4826 * np.median(np.abs(stack - median), axis=0)
+        return median, np.maximum(scatter, self._least[:, None])
+
+    def _leave_out(self, rejected: Rejected) -> None:
+        self.counts[rejected.reason] += 1
+        self.rejected.append(rejected)
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A segment of the start-up set."""
+
+    number: int
+    samples: FloatArray
+    levels: FloatArray
+
+
+def _longest_still(segment: FloatArray) -> FloatArray:
+    """Return for how many samples each channel hardly moves, half of `STILL` at least.
+
+    Returns
+    -------
+    float64, shape (n_channels,)
+        A segment's length for a channel that does not move in it; NaN for one with a NaN.
+    """
+    steps = np.abs(np.diff(segment, axis=0))
+    limit = 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
+    place = np.arange(1, len(steps) + 1, dtype=np.int32)[:, None]
+    last_moved = np.maximum.accumulate(np.where(steps > limit, place, 0), axis=0)
+    longest = (place - last_moved).max(axis=0) + 1.0
+    return np.where(np.isnan(limit), np.nan, np.maximum(longest, (STILL - 1) / LONGER))
+
+
+def _deviation(levels: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:
+    """Largest deviation of each channel, shape (n_channels,); nothing is wrong with moving more."""
+    above = (levels - median) / scatter
+    below = -above[:-1] / 2
+    return np.asarray(np.maximum(above.max(axis=0), below.max(axis=0)))
+
+
+def _stationary_scatter(window: FloatArray, widths: IntArray) -> FloatArray:
+    """Return the scatter of the logarithmic power of bands that are so many frequencies wide."""
+    correlation = np.abs(np.fft.fft(window**2)) ** 2
+    correlation /= correlation[0]
+    lags = [np.arange(1, min(width, len(window) // 2)) for width in widths]
+    return np.sqrt(
+        [
+            (1 + 2 * np.sum((1 - lag / width) * correlation[lag])) / width
+            for lag, width in zip(lags, widths, strict=True)
+        ]
+    )
+
+
+def _scatter_of_largest(n_samples: int) -> float:
+    """Return the scatter of the logarithm of the largest square of normal, independent samples.
+
+    That square is near 2 ln n, with Gumbel's distribution of scale 2 about it.
+    """
+    return float(np.pi / np.sqrt(6) / np.log(max(n_samples, 3)))
+
+
+def _transient(number: int, off: FloatArray) -> Rejected:
+    return Rejected(number, Reason.TRANSIENT, int(np.argmax(off)), float(off.max()))

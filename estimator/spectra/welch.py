@@ -1,0 +1,328 @@
+"""Cross-spectral matrices by Welch's method, in one pass over the samples.
+
+Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
+in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
+
+Segments are taken a block at a time, so that the work stays in the cache. Several threads take
+equal shares of them; their sums are added in order, so that the result does not depend on their
+timing.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
+
+from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.spectra.windows import effective_averages, get_window
+
+if TYPE_CHECKING:
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+SEGMENTS_PER_BLOCK = 32
+BLOCK_VALUES = 2**21  # samples of all channels in a block, at most: 16 MB
+FREQUENCIES_PER_BLOCK = 512
+THREADS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class WelchSettings:
+    """How samples become spectra.
+
+    Attributes
+    ----------
+    sampling_rate : float
+        In Hz.
+    segment_length : int
+        Samples per segment.
+    overlap : float
+        Fraction of a segment that the next one repeats, from 0 to below 1.
+    window : str or tuple
+        As `estimator.spectra.windows.get_window` takes it.
+    detrend : {"none", "constant", "linear"}
+        What is removed from every segment of every channel before the window.
+    """
+
+    sampling_rate: float
+    segment_length: int
+    overlap: float = 0.5
+    window: str | tuple[str | float, ...] = "hann"
+    detrend: Literal["none", "constant", "linear"] = "constant"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sampling_rate) and self.sampling_rate > 0):
+            raise EstimatorError(f"sampling rate {self.sampling_rate}: expected Hz above 0")
+        if self.segment_length < 2 or np.asarray(self.segment_length).dtype.kind not in "iu":
+            raise EstimatorError(
+                f"segment length {self.segment_length}: expected 2 samples or more, a whole number"
+            )
+        if not 0 <= self.overlap < 1:
+            raise EstimatorError(f"overlap {self.overlap}: expected a fraction from 0 to below 1")
+        if self.detrend not in {"none", "constant", "linear"}:
+            raise EstimatorError(
+                f"detrend {self.detrend!r}: expected 'none', 'constant' or 'linear'"
+            )
+        get_window(self.window, self.segment_length)
+
+    @property
+    def hop(self) -> int:
+        """Samples from the start of one segment to the start of the next."""
+        return max(1, self.segment_length - round(self.overlap * self.segment_length))
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Frequencies in Hz, shape (n_freqs,), from 0 to half the sampling rate."""
+        return np.arange(self.segment_length // 2 + 1) * self.sampling_rate / self.segment_length
+
+    def real(self, frequencies: FloatArray) -> BoolArray:
+        """Where spectra are real-valued: at 0 Hz and half the sampling rate."""
+        highest = np.isclose(frequencies, self.sampling_rate / 2, rtol=1e-9, atol=0)
+        return np.asarray((frequencies == 0) | highest)
+
+
+class CrossSpectra:
+    """Sum of the segments' spectral matrices; its size does not depend on their number.
+
+    Parameters
+    ----------
+    settings : WelchSettings
+    n_channels : int
+    threads : int
+        How many `add` may use: 1 where other threads of the caller's have the processors already.
+    """
+
+    def __init__(self, settings: WelchSettings, n_channels: int, *, threads: int = THREADS) -> None:
+        if n_channels < 1:
+            raise EstimatorError(f"{n_channels} channels: at least one is needed")
+        self.settings = settings
+        self.n_channels = n_channels
+        self._threads = threads
+        self.n_segments = 0
+        length = settings.segment_length
+        self._window = get_window(settings.window, length)
+        n_freqs = settings.segment_length // 2 + 1
+        self._sum = np.zeros((n_freqs, n_channels, n_channels), dtype=np.complex128)
+        self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
+        # One value a sample and channel: numpy multiplies contiguous arrays several times faster.
+        self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
+        self._tapers = bool(np.any(self._window != 1))
+        # Trends are fitted to the samples and taken off their spectra, where they fill few bins.
+        trends = _trends(settings.detrend, length)
+        self._fit = trends / np.sum(trends**2, axis=1, keepdims=True)
+        spectra = np.fft.rfft(trends * self._window, axis=1).T
+        self._trend_bins = slice(0, _last_bin(spectra))
+        self._trend_spectra = spectra[self._trend_bins]
+
+    def add(self, samples: FloatArray, starts: IntArray) -> None:
+        """Add the segments of `samples` that begin at `starts`.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+            In physical units. What no segment covers is not looked at.
+        starts : int64, shape (n_segments,)
+            Row of `samples` at which each segment begins.
+
+        Raises
+        ------
+        EstimatorError
+            If a segment does not lie within `samples`, or the number of channels differs.
+        """
+        samples = np.asarray(samples, dtype=np.float64)
+        starts = np.asarray(starts, dtype=np.int64)
+        self.check(samples, starts)
+        if starts.size == 0:
+            return
+        workers = min(self._threads, -(-len(starts) // self._block))
+        if workers == 1:
+            self._sum += self._total(samples, starts)
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                for total in pool.map(
+                    functools.partial(self._total, samples), np.array_split(starts, workers)
+                ):
+                    self._sum += total
+        self.n_segments += len(starts)
+
+    def check(self, samples: FloatArray, starts: IntArray) -> None:
+        """Raise what `add` would raise, and add nothing."""
+        if samples.ndim != 2 or samples.shape[1] != self.n_channels:
+            raise EstimatorError(
+                f"samples of shape {samples.shape}, expected (n_samples, {self.n_channels})"
+            )
+        last = len(samples) - self.settings.segment_length
+        if starts.ndim != 1:
+            raise EstimatorError(f"starts of shape {starts.shape}, expected one row a segment")
+        if starts.size and (starts.min() < 0 or starts.max() > last):
+            raise EstimatorError(
+                f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
+            )
+
+    def _total(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
+        """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels)."""
+        length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
+        block = min(self._block, len(starts))
+        frames = np.empty((block, length, n_channels))
+        spectra = np.empty((block, n_freqs, n_channels), dtype=np.complex128)
+        trend = np.empty((block, len(self._fit), n_channels))
+        # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
+        # so that BLAS does half the work.
+        gram = np.zeros((n_freqs, 2 * n_channels, 2 * n_channels))
+        for first in range(0, len(starts), block):
+            rows = starts[first : first + block]
+            n = len(rows)
+            segments = _segments(samples, rows, length)
+            np.matmul(self._fit, segments, out=trend[:n])
+            if self._tapers:
+                segments = np.multiply(segments, self._taper, out=frames[:n])
+            np.fft.rfft(segments, axis=1, out=spectra[:n])
+            spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
+            if len(starts) == 1:  # to sum it and take it apart again would cost more
+                return spectra[0, :, :, None] * spectra[0, :, None, :].conj()
+            parts = spectra[:n].view(np.float64)
+            for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
+                some = slice(low, low + FREQUENCIES_PER_BLOCK)
+                gram[some] += np.matmul(
+                    parts[:, some].transpose(1, 2, 0), parts[:, some].swapaxes(0, 1)
+                )
+        total = np.empty_like(self._sum)
+        total.real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
+        total.imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
+        return total
+
+    @property
+    def n_effective(self) -> float:
+        """Independent averages the segments are worth, were they one run without gaps."""
+        return effective_averages(self._window, self.settings.hop, self.n_segments)
+
+    def csm(self) -> ComplexArray:
+        """Return the cross-spectral matrix.
+
+        Returns
+        -------
+        complex128, shape (n_freqs, n_channels, n_channels)
+            One-sided, in unit**2/Hz.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no segment has been added.
+        """
+        if self.n_segments == 0:
+            raise InsufficientDataError("no segment yet: a spectrum needs at least one")
+        energy = self.settings.sampling_rate * float(self._window @ self._window)
+        density = np.full(len(self._sum), 2 / (energy * self.n_segments))
+        density[0] /= 2
+        if self.settings.segment_length % 2 == 0:
+            density[-1] /= 2
+        csm: ComplexArray = self._sum * density[:, None, None]
+        return csm
+
+    def merge(self, other: CrossSpectra) -> None:
+        """Add the segments of another accumulator with the same settings to this one."""
+        if other.settings != self.settings or other.n_channels != self.n_channels:
+            raise EstimatorError(
+                f"spectra of {other.n_channels} channels with {other.settings} cannot be added to "
+                f"{self.n_channels} channels with {self.settings}"
+            )
+        self._sum += other._sum
+        self.n_segments += other.n_segments
+
+    def __add__(self, other: CrossSpectra) -> CrossSpectra:
+        total = CrossSpectra(self.settings, self.n_channels)
+        total.merge(self)
+        total.merge(other)
+        return total
+
+    def to_bytes(self) -> bytes:
+        """Return everything as a NumPy ``.npz`` archive, for another process or machine."""
+        content = io.BytesIO()
+        np.savez(
+            content,
+            settings=np.array(json.dumps(asdict(self.settings))),
+            n_segments=np.array(self.n_segments),
+            sum=self._sum,
+        )
+        return content.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Return the accumulator that `to_bytes` wrote.
+
+        Raises
+        ------
+        EstimatorError
+            If `content` is something else.
+        """
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                fields = json.loads(str(archive["settings"]))
+                if isinstance(fields["window"], list):  # JSON has no tuples
+                    fields["window"] = tuple(fields["window"])
+                settings = WelchSettings(**fields)
+                total = archive["sum"]
+                n_segments = int(archive["n_segments"])
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise EstimatorError(f"not a serialised cross-spectral matrix: {error}") from error
+        spectra = cls(settings, total.shape[-1])
+        if total.shape != spectra._sum.shape or n_segments < 0:
+            raise EstimatorError(f"not a serialised cross-spectral matrix: shape {total.shape}")
+        spectra._sum = total.astype(np.complex128)
+        spectra.n_segments = n_segments
+        return spectra
+
+
+def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
+    """Segments that begin at `rows`, shape (n, length, n_channels): no copy if evenly spaced."""
+    windows = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0).swapaxes(1, 2)
+    steps = np.diff(rows)
+    if len(steps) == 0 or (steps[0] > 0 and np.all(steps == steps[0])):
+        return windows[rows[0] : rows[-1] + 1 : steps[0] if len(steps) else 1]
+    return windows[rows]
+
+
+def _trends(detrend: str, length: int) -> FloatArray:
+    """Orthogonal trends that `detrend` removes, shape (n_trends, length)."""
+    line = np.arange(length) - (length - 1) / 2
+    return np.stack([np.ones(length), line])[: {"none": 0, "constant": 1, "linear": 2}[detrend]]
+
+
+def _last_bin(spectra: ComplexArray) -> int:
+    """Bins, from 0, beyond which spectra of shape (n_freqs, n_trends) are rounding only."""
+    size = np.abs(spectra)
+    above = np.any(size > len(size) * np.finfo(np.float64).eps * size.max(axis=0), axis=1)
+    return int(np.max(np.nonzero(above), initial=-1)) + 1
+
+
+def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
+    """Divide by the response of every channel: from digitised to physical units.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+    response : complex128, shape (n_freqs, n_channels)
+        What each channel makes of one unit, at each frequency.
+
+    Returns
+    -------
+    complex128, shape (n_freqs, n_channels, n_channels)
+        ``csm[f, p, q] / (h[f, p] conj(h[f, q]))``; NaN where a response is zero, as at 0 Hz.
+
+    Raises
+    ------
+    EstimatorError
+        If `response` is not one number a frequency and channel.
+    """
+    response = np.asarray(response, dtype=np.complex128)
+    if response.shape != csm.shape[:2]:
+        raise EstimatorError(f"response of shape {response.shape}, expected {csm.shape[:2]}")
+    known = np.isfinite(response) & (response != 0)
+    inverse = np.where(known, 1 / np.where(known, response, 1), np.nan)
+    return csm * inverse[:, :, None] * inverse[:, None, :].conj()

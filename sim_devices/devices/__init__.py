@@ -1,0 +1,1 @@
+"""Simulated devices: each answers as its real counterpart would."""

@@ -1,0 +1,157 @@
+"""A simulated vibration unit: samples into a FIFO, read in blocks over Modbus RTU.
+
+What the real device is said to do and this one too: slave 1, function 6 on register 1 for the
+sampling rate, function 4 on register 2 for the level and the words behind it, at most 123, in whole
+samples of all channels; new samples dropped when the FIFO is full. ``header`` says what the first
+register means, ``capacity`` (words) how much the FIFO holds. A reply leaves when its last byte
+would have, at the line's rate, after a turnaround of 1 ms.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.modbus import rtu
+from daq.protocols.modbus.fifo import FIFO_REGISTER, MAX_WORDS, RATE_REGISTER
+from daq.protocols.modbus.rtu import RequestFinder
+from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.sampling import Samples, whole
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.protocols.modbus.rtu import Request
+    from sim_devices.devices.interface import DeviceSpec, Source
+
+TURNAROUND = 0.001
+CAPACITY = 24_576
+LOWEST_RATE, HIGHEST_RATE = 1, 20_000
+
+
+class FifoDevice:
+    """One unit on a serial line; an :class:`~sim_devices.devices.interface.Endpoint`."""
+
+    def __init__(self, device: DeviceSpec, source: Source) -> None:
+        settings = device.settings
+        self._source = source
+        self._sensors = device.sensors
+        self._unit = int(settings.get("unit", 1))
+        self._left = settings.get("header", "size") == "left"
+        self._byte_time = 10 / float(settings.get("baud_rate", 3_000_000))
+        self._requests = RequestFinder(self._unit)
+        self._rate = round(device.sampling_rate)
+        self._samples = Samples(source, device.sensors)
+        self._n_channels = self._samples.n_channels
+        self._capacity = int(settings.get("capacity") or CAPACITY) // self._n_channels
+        self._next = self._samples.first_after(0.0)
+        self._first = self._end = self._next  # what is in the FIFO: from there to there, but for
+        self._holes: deque[tuple[int, int]] = deque()  # samples that had found no room
+        self._to_send: deque[tuple[float, bytes]] = deque()
+
+    # --- Endpoint ----------------------------------------------------------------------------
+
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Nothing happens: a serial line has no connections."""
+        return ()
+
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+        """Forget what was to be sent."""
+        self._to_send.clear()
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Answer requests to this unit."""
+        for request in self._requests.receive(received):
+            self._advance(now)
+            reply = self._answer(request)
+            ready = max(now, self._to_send[-1][0] if self._to_send else now)
+            self._to_send.append((ready + TURNAROUND + len(reply) * self._byte_time, reply))
+        return self.due(now)
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: the FIFO is lost."""
+        if kind == "reset":
+            self._advance(now)
+            self._first = self._end = self._next
+            self._holes.clear()
+        return ()
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return the replies whose last byte has left."""
+        sent: list[bytes] = []
+        while self._to_send and self._to_send[0][0] <= now:
+            sent.append(self._to_send.popleft()[1])
+        return sent
+
+    def next_due(self) -> float:
+        """World time at which the next reply has left."""
+        return self._to_send[0][0] if self._to_send else NEVER
+
+    # --- registers ---------------------------------------------------------------------------
+
+    def _answer(self, request: Request) -> bytes:
+        function = request.function
+        if function == rtu.WRITE_SINGLE and request.address == RATE_REGISTER:
+            if not LOWEST_RATE <= request.value <= HIGHEST_RATE:
+                return rtu.encode_exception(self._unit, function, 3)
+            self._set_rate(request.value)
+            return rtu.write_request(self._unit, request.address, request.value)
+        if function not in (rtu.READ_HOLDING, rtu.READ_INPUT):
+            return rtu.encode_exception(self._unit, function, 1)
+        if request.address == RATE_REGISTER and request.value == 1:
+            return rtu.encode_registers(self._unit, function, np.array([self._rate], np.uint16))
+        n_samples, odd = divmod(request.value - 1, self._n_channels)
+        if request.address != FIFO_REGISTER or odd or not 0 <= request.value - 1 <= MAX_WORDS:
+            return rtu.encode_exception(self._unit, function, 2)
+        return self._read(function, n_samples)
+
+    def _set_rate(self, rate: int) -> None:
+        if rate != self._rate:
+            self._rate = rate
+            self._samples = Samples(self._source.at_rate(float(rate)), self._sensors)
+            self._next = 0  # found anew by the clock
+            self._holes.clear()
+            self._first = self._end = -1
+
+    def _advance(self, now: float) -> None:
+        """Take the samples of the time up to ``now``; those that find no room are dropped."""
+        if self._end < 0:
+            self._first = self._end = self._next = self._samples.first_after(now)
+        end = self._samples.end_before(now, self._next)
+        room = max(0, self._capacity - self._waiting)
+        taken = min(room, end - self._next)
+        if taken and self._next > self._end:  # samples were dropped before these
+            self._holes.append((self._end, self._next))
+        if taken:
+            self._end = self._next + taken
+        self._next = end
+
+    @property
+    def _waiting(self) -> int:
+        """Samples in the FIFO."""
+        return self._end - self._first - sum(stop - start for start, stop in self._holes)
+
+    def _read(self, function: int, n_samples: int) -> bytes:
+        waiting = self._waiting
+        rows = []
+        left = min(n_samples, waiting)
+        while left:
+            stop = self._holes[0][0] if self._holes else self._end
+            n = min(left, stop - self._first)
+            rows.append(whole(self._samples.counts(self._first, n), -32768, 32767))
+            self._first += n
+            left -= n
+            if self._holes and self._first == self._holes[0][0]:
+                self._first = self._holes.popleft()[1]
+        words = np.concatenate(rows).ravel() if rows else np.empty(0, np.int64)
+        words = np.concatenate((words, np.zeros(n_samples * self._n_channels - len(words), int)))
+        level = (self._waiting if self._left else waiting) * self._n_channels
+        registers = np.concatenate(([min(level, 65535)], words)).astype(np.int64)
+        return rtu.encode_registers(self._unit, function, (registers & 0xFFFF).astype(np.uint16))
+
+
+def create(device: DeviceSpec, source: Source) -> list[Line]:
+    """Return the unit's one line."""
+    return [Line(FifoDevice(device, source), device.port)]

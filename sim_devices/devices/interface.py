@@ -1,0 +1,188 @@
+"""The seam between a simulated device and the wire it is served on.
+
+A family module (``sim_devices/<family>.py``) offers ``create(spec, source) -> list[Line]``: the
+device's wire ends, all sans-IO and speaking world time in seconds. :mod:`sim_devices.server.serve`
+puts each on a pseudo-terminal or a port, calls it when bytes come and when time passes, and writes
+what it returns. Bytes are returned in units as the device sends them (a frame, a packet, a
+datagram), so that a fault can strike exactly one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sim_devices.arrays import FloatArray
+    from sim_devices.faults import SampleFaults
+
+Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
+"""What a line is served on; "udp" sends, "udp-server" answers whoever spoke last."""
+
+NEVER = math.inf
+
+
+class Endpoint(Protocol):
+    """One end of a wire: bytes in, bytes out; ``now`` is world time in seconds."""
+
+    def connected(self, now: float) -> Sequence[bytes]:
+        """Somebody opened the line."""
+        ...
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Answer what came."""
+        ...
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return what the device has sent by itself up to ``now`` and not returned before."""
+        ...
+
+    def next_due(self) -> float:
+        """World time at which :meth:`due` will have something; ``NEVER`` until spoken to."""
+        ...
+
+    def disconnected(self, now: float) -> None:
+        """Nobody has the line open any more."""
+        ...
+
+
+@runtime_checkable
+class Faulty(Protocol):
+    """An endpoint whose device can suffer faults of its own."""
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Suffer "reset" or "overflow"; return what it sends of it at once."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """An endpoint and the kind of wire it is to be served on.
+
+    ``scheme`` begins the address printed for a TCP or UDP line. The first line of a device is its
+    port; of a further one, ``setting`` names the driver's setting that is to hold its port number.
+    """
+
+    endpoint: Endpoint
+    kind: Kind
+    scheme: str = "socket"
+    setting: str = ""
+    carries_samples: bool = True
+    """Whether the faults of the script strike here; a pulled cable takes every line of a device."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSpec:
+    """One channel of a sensor, as in the bench file; ``sensitivity`` in counts per unit."""
+
+    name: str
+    sensitivity: float
+    auxiliary: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSpec:
+    """One device of a specification (see :mod:`sim_devices.server.serve`)."""
+
+    sensors: tuple[str, ...]
+    driver: str
+    port: Kind
+    sampling_rate: float
+    channels: Mapping[str, tuple[ChannelSpec, ...]]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    sensor_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Where the sensors of one port differ in their settings (slaves on one bus)."""
+    utc_ns: int = 0
+    """UTC at world time 0, for devices that know it."""
+    model: str = ""
+    serial_number: str = ""
+
+
+class Source:
+    """What the sensors of a device read, in counts, and when.
+
+    Parameters
+    ----------
+    scenario
+        The world, as handed over in the specification.
+    device
+        The device whose sensors are read.
+    sampling_rate
+        In Hz; the device's own when not given. The world stays the same at any rate.
+    faults
+        What goes wrong with the samples.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        device: DeviceSpec,
+        sampling_rate: float | None = None,
+        *,
+        faults: SampleFaults | None = None,
+    ) -> None:
+        self._faults = faults
+        self.sampling_rate = sampling_rate or device.sampling_rate
+        self.device = device
+        self._scenario = scenario
+        table = scenario.to_dict()
+        table["motion"]["bandwidth"] = scenario.bandwidth
+        for sensor in device.sensors:
+            table["sensors"][sensor]["sampling_rate"] = self.sampling_rate
+        self._world = World(Scenario.from_dict(table))
+
+    def at_rate(self, sampling_rate: float) -> Source:
+        """Return the same world read at another rate."""
+        return Source(self._scenario, self.device, sampling_rate, faults=self._faults)
+
+    def disciplined(self, offset: float) -> Source:
+        """Return the same sensors, sampled ``offset`` s after world time 0 and without drift."""
+        table = self._scenario.to_dict()
+        for sensor in self.device.sensors:
+            table["sensors"][sensor]["clock"] = {"offset": offset}
+        scenario = Scenario.from_dict(table)
+        return Source(scenario, self.device, self.sampling_rate, faults=self._faults)
+
+    def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
+        """Return the main channels in counts, not yet rounded or clipped: (n, n_channels)."""
+        counts = self._world.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+        if self._faults is None:
+            return counts
+        return self._faults.apply(sensor, counts, self.times(sensor, first_sample, n))
+
+    def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
+        """World time of each sample in s, shape (n,)."""
+        return self._world.sample_times(sensor, first_sample, n)
+
+    def is_silent(self, sensor: str, now: float) -> bool:
+        """Whether the fault script has this one of several on a line off at world time ``now``."""
+        return self._faults is not None and self._faults.is_silent(sensor, now)
+
+    def first_sample_after(self, sensor: str, now: float) -> int:
+        """Index of the first sample taken at or after world time ``now``."""
+        guess = max(0, math.floor((now - float(self.times(sensor, 0, 1)[0])) * self.sampling_rate))
+        while guess > 0 and float(self.times(sensor, guess, 1)[0]) >= now:
+            guess = max(0, guess - max(1, round(guess * 1e-4)))
+        while True:
+            later = np.flatnonzero(self.times(sensor, guess, 256) >= now)
+            if later.size:
+                return guess + int(later[0])
+            guess += 256
+
+    @cached_property
+    def _sensitivities(self) -> dict[str, FloatArray]:
+        return {
+            sensor: np.array([c.sensitivity for c in channels if not c.auxiliary])
+            for sensor, channels in self.device.channels.items()
+        }

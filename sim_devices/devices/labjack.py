@@ -1,0 +1,406 @@
+"""A simulated LabJack T7 or T8: registers over Modbus TCP, streams over port 702 or by command.
+
+What the real device does and this one too: functions 3, 4, 6, 16 and 76, exceptions with their
+reason in register 55000; scan lists of analog inputs, CORE_TIMER, SYSTEM_TIMER_20HZ, the upper
+half of a 32-bit channel, and the channel's own position; a scan interval of whole 100 ns; packets
+of the wanted size; a buffer that overflows when nobody takes the samples (2940, then 2941 and one
+scan of 0xFFFF), 2943 when it lasts, 2942 when the rate is too high, bursts (2944); calibration in
+flash; temperature; CORE_TIMER, which stood at 0 at world time 0 and after each power failure (the
+fault ``reset``), and SYSTEM_TIMER_20HZ, which begins anew with the process, too.
+
+An analog input reads its channel's counts above the centre of the converter. Of ``settings`` it
+takes beyond the driver's: ``ends_with``, a fatal status with which the first stream breaks off
+after ``ends_after`` scans.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.labjack import registers as reg
+from daq.protocols.labjack.registers import Adu, AduFinder, Read
+from daq.protocols.labjack.stream import (
+    MAX_SAMPLES,
+    SCAN_OVERLAP,
+    Packet,
+    encode_packet,
+    encode_response,
+)
+from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.labjack_stream import CENTER, Columns, Stream
+from sim_devices.devices.sampling import Samples, whole
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sim_devices.devices.interface import DeviceSpec, Source
+
+MAX_SAMPLE_RATE = 100_000
+_READ, _WRITE_ONE, _WRITE_MANY = (3, 4), 6, 16
+_FLOATS = {reg.STREAM_SCANRATE_HZ: 1000.0, reg.STREAM_SETTLING_US: 0.0}
+_WORDS = {
+    reg.STREAM_NUM_ADDRESSES: 0,
+    reg.STREAM_SAMPLES_PER_PACKET: MAX_SAMPLES,
+    reg.STREAM_RESOLUTION_INDEX: 0,
+    reg.STREAM_BUFFER_SIZE_BYTES: 4096,
+    reg.STREAM_CLOCK_SOURCE: 0,
+    reg.STREAM_AUTO_TARGET: 1,
+    reg.STREAM_DATATYPE: 0,
+    reg.STREAM_NUM_SCANS: 0,
+    reg.STREAM_EXTERNAL_CLOCK_DIVISOR: 1,
+    reg.STREAM_TRIGGER_INDEX: 0,
+    reg.STREAM_START_TIME_STAMP: 0,
+    reg.STREAM_ENABLE: 0,
+    reg.TEST: reg.TEST_VALUE,
+    reg.FLASH_READ_POINTER: 0,
+    43903: 0,
+}
+_READ_ONLY = range(55000, 61810)
+
+
+class RefusedError(Exception):
+    """The device answers with an exception; the reason goes to register 55000."""
+
+    def __init__(self, exception: int, reason: int = 0) -> None:
+        super().__init__(exception, reason)
+        self.exception = exception
+        self.reason = reason
+
+
+class LabJack:
+    """Registers and stream of one device, shared by its two ports."""
+
+    def __init__(self, device: DeviceSpec, source: Source) -> None:
+        self._source = source
+        self._sensors = device.sensors
+        self._inputs: dict[int, int] = {}
+        for sensor in device.sensors:
+            settings = {**device.settings, **device.sensor_settings.get(sensor, {})}
+            n_channels = sum(not channel.auxiliary for channel in device.channels[sensor])
+            usual = range(len(self._inputs), len(self._inputs) + n_channels)
+            for number in settings.get("inputs") or usual:
+                text = str(number).upper().removeprefix("AIN")
+                self._inputs[reg.ain(int(text))] = len(self._inputs)
+        self._ends_with = device.settings.get("ends_with")
+        self._ends_after = int(device.settings.get("ends_after", 0))
+        self._memory: dict[int, int] = {}
+        self._flash = reg.encode_calibrations(reg.nominal_calibrations())
+        serial = device.serial_number or str(
+            470_000_000 + zlib.crc32(device.sensors[0].encode()) % 10**6
+        )
+        self._store(reg.SERIAL_NUMBER, struct.pack(">I", int(serial)))
+        product = 8.0 if "T8" in device.model.upper() else 7.0
+        for address, value in {
+            reg.PRODUCT_ID: product,
+            reg.FIRMWARE_VERSION: 1.0292,
+            reg.TEMPERATURE_DEVICE_K: 298.15,
+            **_FLOATS,
+        }.items():
+            self._store(address, struct.pack(">f", value))
+        for address, value in _WORDS.items():
+            self._store(address, struct.pack(">I", value))
+        self._store(reg.LAST_ERROR_DETAIL, bytes(2))
+        for k in range(128):
+            self._store(reg.STREAM_SCANLIST + 2 * k, bytes(4))
+        for n in range(14):
+            self._store(reg.AIN_RANGE + 2 * n, struct.pack(">f", 10.0))
+            self._store(reg.AIN_NEGATIVE_CHANNEL + n, struct.pack(">H", reg.SINGLE_ENDED))
+            self._store(41500 + n, bytes(2))  # AINn_RESOLUTION_INDEX
+        self.stream: Stream | None = None
+        self.stream_started = 0  # how many times
+        self._core_began = 0  # CORE_TIMER at world time 0, below 0, in ticks
+        self._system_began: float | None = None  # world time; the first time it is spoken to
+
+    # --- registers ---------------------------------------------------------------------------
+
+    def answer(self, adu: Adu, now: float) -> bytes:
+        """Answer a request."""
+        if self._system_began is None:
+            self._system_began = now
+        function = adu.pdu[0] if adu.pdu else 0
+        try:
+            pdu = bytes((function,)) + self._function(function, adu.pdu, now)
+        except RefusedError as refused:
+            self._store(reg.LAST_ERROR_DETAIL, struct.pack(">H", refused.reason))
+            pdu = bytes((function | 0x80, refused.exception))
+        except (RemoteProtocolError, struct.error):
+            pdu = bytes((function | 0x80, 3))
+        return reg.encode_adu(Adu(adu.transaction, adu.unit, pdu))
+
+    def _function(self, function: int, pdu: bytes, now: float) -> bytes:
+        if function in _READ:
+            address, n_registers = struct.unpack(">HH", pdu[1:5])
+            if not 1 <= n_registers <= 125:
+                raise RefusedError(3)
+            values = self._read(address, n_registers, now)
+            return bytes((len(values),)) + values
+        if function == _WRITE_ONE:
+            self._write(struct.unpack_from(">H", pdu, 1)[0], pdu[3:5], now)
+            return pdu[1:5]
+        if function == _WRITE_MANY:
+            address, n_registers, size = struct.unpack_from(">HHB", pdu, 1)
+            if size != 2 * n_registers or len(pdu) != 6 + size:
+                raise RefusedError(3)
+            self._write(address, pdu[6:], now)
+            return pdu[1:5]
+        if function == reg.FEEDBACK:
+            values = b""
+            for command in reg.decode_feedback(pdu):
+                if isinstance(command, Read):
+                    values += self._read(command.address, command.n_registers, now)
+                else:
+                    self._write(command.address, command.values, now)
+            return values
+        raise RefusedError(1)
+
+    def _store(self, address: int, values: bytes) -> None:
+        for k, word in enumerate(np.frombuffer(values, ">u2").tolist()):
+            self._memory[address + k] = word
+
+    def _value(self, address: int) -> int:
+        return self._memory[address] << 16 | self._memory[address + 1]
+
+    def _real(self, address: int) -> float:
+        return float(struct.unpack(">f", self._value(address).to_bytes(4, "big"))[0])
+
+    def _read(self, address: int, n_registers: int, now: float) -> bytes:
+        if address == reg.STREAM_DATA_CR:
+            return self._read_stream(n_registers, now)
+        if address == reg.FLASH_READ:
+            start = self._value(reg.FLASH_READ_POINTER) - reg.CALIBRATION_ADDRESS
+            values = self._flash[max(0, start) : max(0, start) + 2 * n_registers]
+            return values.ljust(2 * n_registers, b"\xff")
+        if address < 28:
+            return b"".join(self._volts(a, now) for a in range(address, address + n_registers, 2))
+        if address == reg.CORE_TIMER:
+            ticks = (int(now * reg.CORE_HZ) - self._core_began) % (1 << 32)
+            return ticks.to_bytes(4, "big")[: 2 * n_registers]
+        if address == reg.SYSTEM_TIMER_20HZ:
+            seconds = now - (self._system_began or 0.0)
+            return int(seconds * reg.SYSTEM_HZ).to_bytes(4, "big")[: 2 * n_registers]
+        words = [self._memory.get(a) for a in range(address, address + n_registers)]
+        if None in words:
+            raise RefusedError(reg.ILLEGAL_ADDRESS)
+        return np.array(words, ">u2").tobytes()
+
+    def _volts(self, address: int, now: float) -> bytes:
+        samples = Samples(self._source, self._sensors)
+        counts = CENTER
+        if address in self._inputs:
+            row = samples.counts(samples.first_after(now), 1) + CENTER
+            counts = int(whole(row, 0, 65535)[0, self._inputs[address]])
+        calibration = reg.decode_calibrations(self._flash)[0]
+        return struct.pack(">f", float(calibration.volts(counts)))
+
+    def _write(self, address: int, values: bytes, now: float) -> None:
+        if len(values) % 2 or address in _READ_ONLY:
+            raise RefusedError(reg.ILLEGAL_ADDRESS)
+        if any(address + k not in self._memory for k in range(len(values) // 2)):
+            raise RefusedError(reg.ILLEGAL_ADDRESS)
+        if address == reg.STREAM_ENABLE:
+            self._enable(int.from_bytes(values, "big"), now)
+            return
+        self._store(address, values)
+        if address == reg.STREAM_SCANRATE_HZ:
+            wanted = self._real(address)
+            if not 0.01 <= wanted <= MAX_SAMPLE_RATE:
+                raise RefusedError(3, 2608)
+            self._store(address, struct.pack(">f", reg.actual_scan_rate(wanted)))
+
+    # --- stream ------------------------------------------------------------------------------
+
+    @property
+    def targets(self) -> int:
+        """Where stream samples go."""
+        return self._value(reg.STREAM_AUTO_TARGET)
+
+    @property
+    def packet_size(self) -> int:
+        """Samples in a packet."""
+        return min(max(1, self._value(reg.STREAM_SAMPLES_PER_PACKET)), MAX_SAMPLES)
+
+    def _enable(self, value: int, now: float) -> None:
+        if not value:
+            if self.stream is None:
+                raise RefusedError(4, reg.STREAM_NOT_RUNNING)
+            self.stop()
+            return
+        n_columns = self._value(reg.STREAM_NUM_ADDRESSES)
+        if not 1 <= n_columns <= 128 or self.stream is not None:
+            raise RefusedError(4, 2605)
+        addresses = [self._value(reg.STREAM_SCANLIST + 2 * k) for k in range(n_columns)]
+        rate = reg.actual_scan_rate(self._real(reg.STREAM_SCANRATE_HZ))
+        overlap = rate * n_columns > MAX_SAMPLE_RATE
+        as_is = overlap or rate == self._source.sampling_rate
+        source = self._source if as_is else self._source.at_rate(rate)
+        columns = Columns(
+            addresses,
+            self._inputs,
+            rate,
+            core_began=self._core_began,
+            system_began=self._system_began or 0.0,
+        )
+        capacity = (self._value(reg.STREAM_BUFFER_SIZE_BYTES) or 4096) // 2
+        stream = Stream(
+            Samples(source, self._sensors),
+            columns,
+            capacity=capacity,
+            packet_size=self.packet_size if self.targets & reg.TARGET_ETHERNET else 1,
+            now=now,
+        )
+        stream.wanted = self._value(reg.STREAM_NUM_SCANS) or None
+        if overlap:
+            stream.breaks_off = (1, SCAN_OVERLAP)
+        elif self._ends_with and not self.stream_started:
+            stream.breaks_off = (self._ends_after, int(self._ends_with))
+        # a trigger is waited for, and never comes
+        self.stream = None if self._value(reg.STREAM_TRIGGER_INDEX) else stream
+        self.stream_started += 1
+        self._store(reg.STREAM_ENABLE, struct.pack(">I", 1))
+        started = int(columns.timer(np.array([stream.first]))[0])
+        self._store(reg.STREAM_START_TIME_STAMP, started.to_bytes(4, "big"))
+
+    def fault(self, kind: str, now: float, duration: float) -> None:
+        """Suffer a power failure, or an overflow that lasts."""
+        if kind == "reset":
+            self.stop()
+            first = self._source.first_sample_after(self._sensors[0], now)
+            self._core_began = first * round(reg.CORE_HZ / self._source.sampling_rate)
+            self._system_began = now
+        elif self.stream is not None:
+            self.stream.advance(now)
+            self.stream.overflow(now + duration)
+
+    def stop(self) -> None:
+        """End the stream."""
+        self.stream = None
+        self._store(reg.STREAM_ENABLE, bytes(4))
+
+    def _read_stream(self, n_registers: int, now: float) -> bytes:
+        if self.stream is None:
+            raise RefusedError(4, reg.STREAM_NOT_RUNNING)
+        if n_registers < 4:
+            raise RefusedError(3)
+        self.stream.advance(now)
+        packet = self.stream.take_out(n_registers - 4)
+        return encode_response(packet, n_registers=n_registers)
+
+
+class ControlPort:
+    """Port 502; an :class:`~sim_devices.devices.interface.Endpoint`."""
+
+    def __init__(self, labjack: LabJack) -> None:
+        self._labjack = labjack
+        self._finder = AduFinder()
+
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Wait for requests."""
+        self._finder = AduFinder()
+        return ()
+
+    def disconnected(self, now: float) -> None:
+        """Nothing happens: a stream goes on."""
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Answer requests."""
+        try:
+            requests = self._finder.receive(received)
+        except RemoteProtocolError:
+            return ()
+        return [self._labjack.answer(adu, now) for adu in requests]
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Pass a fault of its own on to the device."""
+        self._labjack.fault(kind, now, duration)
+        return ()
+
+    def due(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Return nothing: it answers only."""
+        return ()
+
+    def next_due(self) -> float:
+        """Return never: it answers only."""
+        return NEVER
+
+
+class StreamPort:
+    """Port 702; an :class:`~sim_devices.devices.interface.Endpoint`."""
+
+    LOOK_INTERVAL = 0.05
+    """How often a stream that another port may have started is looked for, s of world time."""
+
+    def __init__(self, labjack: LabJack) -> None:
+        self._labjack = labjack
+        self._connected = False
+        self._transaction = 0
+        self._looked = 0.0
+
+    def connected(self, now: float) -> Sequence[bytes]:
+        """Send what waits."""
+        self._connected = True
+        return self.due(now)
+
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+        """Keep the samples: the buffer may overflow."""
+        self._connected = False
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Ignore what comes: the port sends only."""
+        return self.due(now)
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
+        """Pass a fault of its own on to the device."""
+        self._labjack.fault(kind, now, duration)
+        return ()
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return the packets that are full."""
+        self._looked = now
+        stream = self._labjack.stream
+        if stream is None or not self._connected or not self._labjack.targets & reg.TARGET_ETHERNET:
+            return ()
+        stream.advance(now)
+        size, sent = self._labjack.packet_size, []
+        while stream.n_waiting >= size or stream.is_due or stream.ended:
+            packet = stream.take_out(size)
+            sent.append(
+                encode_packet(
+                    Packet(
+                        packet.samples,
+                        packet.backlog,
+                        packet.status,
+                        packet.information,
+                        self._transaction,
+                    )
+                )
+            )
+            self._transaction = (self._transaction + 1) % 65536
+            if stream.ended and not stream.n_waiting:
+                self._labjack.stop()
+                break
+        return sent
+
+    def next_due(self) -> float:
+        """World time at which the next packet is full, or at which to look for a stream."""
+        stream = self._labjack.stream
+        if not self._connected:
+            return NEVER
+        if stream is None or not self._labjack.targets & reg.TARGET_ETHERNET:
+            return self._looked + self.LOOK_INTERVAL
+        return max(self._looked, stream.next_full())
+
+
+def create(device: DeviceSpec, source: Source) -> list[Line]:
+    """Return the device's control port and its stream port."""
+    labjack = LabJack(device, source)
+    by_command = device.settings.get("mode") == "command-response"
+    control, stream = ControlPort(labjack), StreamPort(labjack)
+    return [
+        Line(control, "tcp", scheme="modbus-tcp", carries_samples=by_command),
+        Line(stream, "tcp", setting="stream_port", carries_samples=not by_command),
+    ]

@@ -1,0 +1,153 @@
+"""A simulated device that sends delimited text: rows on a line, or datacast packets over UDP.
+
+What it does: writes the samples of its sensor in the format its settings describe, as the driver
+reads it (:mod:`daq.protocols.text.decoder`): a row a sample with time, counter, tag and checksum
+where the format has them, or packets of 25 samples of a channel with the time of the first, as a
+Raspberry Shake casts them. With ``start`` and ``stop`` in the settings a line is quiet until told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+from daq.protocols.text.format import (
+    LILY,
+    RASPBERRY_SHAKE,
+    TextFormat,
+    encode_fields,
+    encode_time,
+)
+from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.sampling import Samples, whole
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sim_devices.devices.interface import DeviceSpec, Source
+
+PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat()}
+PACKET_SAMPLES = 25
+LILY_TAIL = ("194.25", " 26.01", "11.96", "N9655")
+_NS = 1_000_000_000
+
+
+def format_of(device: DeviceSpec) -> TextFormat:
+    """Return the format that the device's settings describe."""
+    settings = device.settings
+    given = {
+        f.name: settings[f.name] for f in fields(TextFormat) if settings.get(f.name) is not None
+    }
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+    format_ = replace(PRESETS[settings.get("preset", "none")], **given)
+    (sensor,) = device.sensors
+    names = tuple(c.name for c in device.channels[sensor] if not c.auxiliary)
+    if format_.layout == "channel":
+        return replace(format_, channel_names=tuple(settings.get("channel_names") or names))
+    return format_ if format_.columns else replace(format_, columns=tuple(range(len(names))))
+
+
+class TextDevice:
+    """One device; an :class:`~sim_devices.devices.interface.Endpoint`."""
+
+    def __init__(self, device: DeviceSpec, source: Source) -> None:
+        self._format = format_of(device)
+        self._utc_ns = device.utc_ns
+        self._start = str(device.settings.get("start", "")).encode()
+        self._stop = str(device.settings.get("stop", "")).encode()
+        self._tail = LILY_TAIL if device.settings.get("preset") == "lily" else ()
+        self._samples = Samples(source, device.sensors)
+        self._received = b""
+        self._sends = False
+        self._next = self._counted_from = 0
+        self._n_rows = PACKET_SAMPLES if self._format.layout == "channel" else 1
+
+    def connected(self, now: float) -> Sequence[bytes]:
+        """Begin to send, unless it is to be told."""
+        self._received = b""
+        if not self._start:
+            self._begin(now)
+        return ()
+
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+        """Stop."""
+        self._sends = False
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Begin and end as told."""
+        self._received = (self._received + received)[-200:]
+        stop = self._received.rfind(self._stop) if self._stop else -1
+        start = self._received.rfind(self._start) if self._start else -1
+        if max(stop, start) >= 0:
+            self._received = b""
+            self._sends = self._sends and stop < start
+            if stop < start:
+                self._begin(now)
+        return self.due(now)
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Suffer a power failure: the counter begins anew; it has no buffer to overflow."""
+        if kind == "reset" and self._sends:
+            self._next = self._counted_from = self._samples.first_after(now)
+        return ()
+
+    def _begin(self, now: float) -> None:
+        if not self._sends:
+            self._next = self._samples.first_after(now)
+        self._sends = True
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return the messages whose samples have been taken."""
+        messages: list[bytes] = []
+        while self._sends and self.next_due() <= now:
+            messages += self._packets() if self._format.layout == "channel" else [self._row()]
+            self._next += self._n_rows
+        return messages
+
+    def next_due(self) -> float:
+        """World time of the last sample of the next message."""
+        return self._samples.time(self._next + self._n_rows - 1) if self._sends else NEVER
+
+    def _time(self, index: int) -> str:
+        utc_ns = self._utc_ns + round(self._samples.time(index) * _NS)
+        return encode_time(utc_ns, self._format)
+
+    def _written(self, values: Sequence[float]) -> list[str]:
+        if self._format.whole:
+            return [str(int(value)) for value in values]
+        return [f"{value:.9g}" for value in values]
+
+    def _packets(self) -> list[bytes]:
+        format_ = self._format
+        counts = self._samples.counts(self._next, self._n_rows)
+        if format_.whole:
+            counts = whole(counts, -(1 << 31), (1 << 31) - 1).astype(float)
+        spaced = replace(format_, delimiter=format_.delimiter + " ")
+        time = self._time(self._next)
+        return [
+            encode_fields([f"'{name}'", time, *self._written(column)], spaced)
+            for name, column in zip(format_.channel_names, counts.T.tolist(), strict=True)
+        ]
+
+    def _row(self) -> bytes:
+        format_ = self._format
+        counts = self._samples.counts(self._next, 1)
+        if format_.whole:
+            counts = whole(counts, -(1 << 31), (1 << 31) - 1).astype(float)
+        filled = dict(zip(format_.columns, self._written(counts[0].tolist()), strict=True))
+        if format_.tag:
+            filled[0] = format_.tag
+        if format_.time_column is not None:
+            filled[format_.time_column] = self._time(self._next)
+        if format_.counter_column is not None:
+            filled[format_.counter_column] = str(
+                (self._next - self._counted_from) % format_.counter_modulus
+            )
+        fields_ = [filled.get(i, "0") for i in range(max(filled) + 1)]
+        return encode_fields([*fields_, *self._tail], format_)
+
+
+def create(device: DeviceSpec, source: Source) -> list[Line]:
+    """Return the device's one line."""
+    scheme = "udp" if device.port == "udp" else "socket"
+    return [Line(TextDevice(device, source), device.port, scheme=scheme)]

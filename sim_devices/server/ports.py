@@ -1,0 +1,347 @@
+"""Pseudo-terminals, TCP and UDP ports on which simulated devices are served.
+
+A line says when somebody opens it, hands over what comes, takes what is to be sent, and can hang
+up as a pulled cable does. Like a real cable it does not store: what is sent while nobody has the
+line open is lost, and so is what a reader leaves lying beyond ``MOST_WAITING``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import shutil
+import socket
+import tempfile
+import tty
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from sim_devices.errors import ServeError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sim_devices.devices.interface import Kind
+
+MOST_WAITING = 1 << 20
+"""Bytes waiting to be read at which further units are lost."""
+LOOK_INTERVAL = 0.02
+"""How often a pseudo-terminal nobody has open is looked at, s."""
+
+
+class Listener(Protocol):
+    """Who is told what happens on a line."""
+
+    def connected(self) -> None:
+        """Somebody opened the line."""
+
+    def received(self, received: bytes) -> None:
+        """Bytes came."""
+
+    def disconnected(self) -> None:
+        """Nobody has the line open any more."""
+
+
+class Wire(Protocol):
+    """A line as its server sees it."""
+
+    address: str
+
+    async def open(self) -> None:
+        """Make the line; it can be opened from elsewhere after this."""
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit, or lose it whole."""
+
+    def hang_up(self) -> None:
+        """Close on whoever has the line open; nobody can open it until :meth:`restore`."""
+
+    def restore(self) -> None:
+        """Plug the cable in again."""
+
+    async def close(self) -> None:
+        """Take the line away."""
+
+
+class PseudoTerminal:
+    """A serial port. Its address stays the same when it is hung up and comes back."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self._folder = tempfile.mkdtemp(prefix="huddle-")
+        self.address = str(Path(self._folder) / "tty")
+        self._master = -1
+        self._open = False
+        self._waiting = bytearray()
+        self._loop = asyncio.get_running_loop()
+        self._look: asyncio.TimerHandle | None = None
+
+    async def open(self) -> None:
+        """Make the pseudo-terminal and look out for somebody to open it."""
+        self._make()
+
+    def _make(self) -> None:
+        self._master, slave = os.openpty()
+        tty.setraw(slave)  # else the terminal would echo the device's own bytes back to it
+        os.set_blocking(self._master, False)
+        link = Path(self.address)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(slave))
+        os.close(slave)
+        self._poll = select.poll()
+        self._poll.register(self._master, select.POLLIN)
+        self._look_for_somebody()
+
+    def _look_for_somebody(self) -> None:
+        # While nobody has the slave open the master reports a hang-up, and a reader on it would
+        # spin: look now and then instead.
+        events = self._poll.poll(0)
+        if events and events[0][1] & select.POLLHUP and not events[0][1] & select.POLLIN:
+            self._look = self._loop.call_later(LOOK_INTERVAL, self._look_for_somebody)
+            return
+        self._look = None
+        self._open = True
+        self._loop.add_reader(self._master, self._readable)
+        self._listener.connected()
+
+    def _readable(self) -> None:
+        try:
+            received = os.read(self._master, 65536)
+        except BlockingIOError:
+            return
+        except OSError:  # EIO: the last one who had it open closed it
+            received = b""
+        if received:
+            self._listener.received(received)
+        else:
+            self._nobody()
+            self._look_for_somebody()
+
+    def _nobody(self) -> None:
+        self._open = False
+        self._waiting.clear()
+        self._loop.remove_reader(self._master)
+        self._loop.remove_writer(self._master)
+        self._listener.disconnected()
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit, or lose it whole."""
+        if not self._open:
+            return
+        was_waiting = bool(self._waiting)
+        for unit in units:
+            if len(self._waiting) + len(unit) <= MOST_WAITING:
+                self._waiting += unit
+        if self._waiting and not was_waiting:
+            self._write()
+
+    def _write(self) -> None:
+        try:
+            del self._waiting[: os.write(self._master, self._waiting)]
+        except BlockingIOError:
+            pass
+        except OSError:  # nobody there: the reader will say so
+            self._waiting.clear()
+        if self._waiting:
+            self._loop.add_writer(self._master, self._write)
+        else:
+            self._loop.remove_writer(self._master)
+
+    def hang_up(self) -> None:
+        """Pull the cable of a USB adapter: the port goes away."""
+        self._destroy()
+
+    def restore(self) -> None:
+        """Plug it in again: whoever had the port open must open it anew."""
+        self._make()
+
+    def _destroy(self) -> None:
+        if self._master < 0:
+            return
+        if self._look is not None:
+            self._look.cancel()
+        if self._open:
+            self._nobody()
+        # First: the system gives the terminal's number to the next one that is made anywhere, and
+        # the address would lead whoever tries it again to a device of somebody else's.
+        Path(self.address).unlink()
+        os.close(self._master)
+        self._master = -1
+
+    async def close(self) -> None:
+        """Take the port away."""
+        self._destroy()
+        shutil.rmtree(self._folder)
+
+
+class TcpPort:
+    """A TCP port that serves one connection at a time, as serial servers do.
+
+    ``number`` is the port's; any that is free, if 0.
+    """
+
+    def __init__(self, listener: Listener, scheme: str, number: int = 0) -> None:
+        self._listener = listener
+        self._scheme = scheme
+        self._number = number
+        self._server: asyncio.Server | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._down = False
+        self.address = ""
+
+    async def open(self) -> None:
+        """Listen on a port of this machine."""
+        try:
+            self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
+        except OSError as error:
+            raise ServeError(
+                f"port {self._number} of this machine cannot be listened on: {error.strerror};"
+                " give the bench file's port another number, or a host that is not this machine"
+            ) from error
+        self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._writer is not None or self._down:
+            writer.transport.abort()
+            return
+        writer.transport.get_extra_info("socket").setsockopt(
+            socket.IPPROTO_TCP, socket.TCP_NODELAY, 1
+        )
+        self._writer = writer
+        self._listener.connected()
+        try:
+            while received := await reader.read(65536):
+                self._listener.received(received)
+        except ConnectionError:
+            pass
+        finally:
+            self._writer = None
+            self._listener.disconnected()
+            writer.transport.abort()
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit, or lose it whole."""
+        if self._writer is None or self._writer.is_closing():
+            return
+        room = MOST_WAITING - self._writer.transport.get_write_buffer_size()
+        kept = bytearray()
+        for unit in units:
+            if len(kept) + len(unit) <= room:
+                kept += unit
+        if kept:
+            self._writer.write(bytes(kept))
+
+    def hang_up(self) -> None:
+        """Reset the connection, and every new one."""
+        self._down = True
+        if self._writer is not None:
+            self._writer.transport.abort()
+
+    def restore(self) -> None:
+        """Accept connections again."""
+        self._down = False
+
+    async def close(self) -> None:
+        """Stop listening."""
+        self.hang_up()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+
+class UdpPort:
+    """Sends each unit as a datagram to the address it names, where the driver is to listen."""
+
+    def __init__(self, listener: Listener, scheme: str) -> None:
+        self._listener = listener
+        self._scheme = scheme
+        self._down = False
+        self.address = ""
+
+    async def open(self) -> None:
+        """Choose a free port of this machine and begin to send to it."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._to = probe.getsockname()
+        self.address = f"{self._scheme}://127.0.0.1:{self._to[1]}"
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._listener.connected()
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit as a datagram; nobody need be there."""
+        for unit in () if self._down else units:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(unit, self._to)
+
+    def hang_up(self) -> None:
+        """Send nothing."""
+        self._down = True
+
+    def restore(self) -> None:
+        """Send again."""
+        self._down = False
+
+    async def close(self) -> None:
+        """Stop sending."""
+        self._socket.close()
+        self._listener.disconnected()
+
+
+class UdpServer(asyncio.DatagramProtocol):
+    """A UDP port that hears requests and sends each unit to whoever spoke last."""
+
+    def __init__(self, listener: Listener, scheme: str) -> None:
+        self._listener = listener
+        self._scheme = scheme
+        self._transport: asyncio.DatagramTransport | None = None
+        self._to: tuple[str, int] | None = None
+        self._down = False
+        self.address = ""
+
+    async def open(self) -> None:
+        """Listen on a free port of this machine."""
+        self._transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: self, local_addr=("127.0.0.1", 0)
+        )
+        number = self._transport.get_extra_info("sockname")[1]
+        self.address = f"{self._scheme}://127.0.0.1:{number}"
+        self._listener.connected()
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Hand over what came."""
+        if self._down:
+            return
+        self._to = addr
+        self._listener.received(data)
+
+    def send(self, units: Iterable[bytes]) -> None:
+        """Send each unit as a datagram; whoever asked need not be there any more."""
+        if self._transport is not None and self._to is not None:
+            for unit in units:
+                self._transport.sendto(unit, self._to)
+
+    def hang_up(self) -> None:
+        """Hear nobody, and forget who spoke last."""
+        self._down, self._to = True, None
+
+    def restore(self) -> None:
+        """Hear again."""
+        self._down = False
+
+    async def close(self) -> None:
+        """Stop listening."""
+        if self._transport is not None:
+            self._transport.close()
+        self._listener.disconnected()
+
+
+def make_wire(kind: Kind, listener: Listener, *, scheme: str, number: int = 0) -> Wire:
+    """Return a line of this kind, not yet open; ``number`` is that of a TCP port."""
+    if kind == "pty":
+        return PseudoTerminal(listener)
+    if kind == "udp-server":
+        return UdpServer(listener, scheme)
+    return TcpPort(listener, scheme, number) if kind == "tcp" else UdpPort(listener, scheme)

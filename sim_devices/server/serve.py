@@ -1,0 +1,294 @@
+"""Serve simulated devices: ``python -m sim_devices SPEC.json [INDEX]``.
+
+The specification is one JSON object::
+
+    {"epoch_ns": 123,              instant of the system's monotonic clock at which world time is 0
+     "speed": 1.0,                 world seconds that pass in one second
+     "scenario": {...},            see sim_devices.world.scenario
+     "faults": [...],              what goes wrong, see sim_devices.faults
+     "fault_log": "FILE",          where each fault is noted when it strikes, a JSON object a line
+     "sent_log": "FILE",           and each unit that goes onto a line somebody has open, in hex
+     "devices": [
+       {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
+        "driver": "epson",         whose protocol it speaks: a key of FAMILIES
+        "port": "pty",             or "tcp", "udp"
+        "number": 0,               of a TCP port, and of further ones those that the settings name;
+                                   any that are free if it is 0
+        "sampling_rate": 200.0,    Hz
+        "settings": {...},         as the driver's settings in the bench file
+        "sensor_settings": {"A": {...}},      where its sensors' settings differ
+        "model": "", "serial_number": "",     what it says it is; the family's own if empty
+        "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
+
+With INDEX this process serves that device alone; without, it starts one process for each. Each
+prints one JSON line when it can be connected to::
+
+    {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
+
+``settings`` holds what must be added to the sensors' settings (further port numbers). A process
+ends on SIGTERM, SIGINT, or when its standard input is closed, so that none outlives its parent.
+
+Device families (``FAMILIES``) are named here and imported when served; see
+:mod:`sim_devices.devices.interface` for what a family offers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim_devices.devices.interface import (
+    NEVER,
+    ChannelSpec,
+    DeviceSpec,
+    Endpoint,
+    Faulty,
+    Line,
+    Source,
+)
+from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
+from sim_devices.server.ports import Wire, make_wire
+from sim_devices.server.world_clock import WorldClock, utc_of
+from sim_devices.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+FAMILIES = {
+    "epson": "sim_devices.devices.epson:create",
+    "registers": "sim_devices.devices.registers:create",
+    "labjack": "sim_devices.devices.labjack:create",
+    "guralp": "sim_devices.devices.guralp:create",
+    "fifo": "sim_devices.devices.fifo:create",
+    "text": "sim_devices.devices.text:create",
+}
+"""Driver name → ``module:function`` that makes its simulated device."""
+
+LEAST_INTERVAL = 0.004
+"""Least time between two sends of one line, s: what is due in between goes together.
+
+Not between two answers: who asks is not held up.
+"""
+
+
+class Served:
+    """One endpoint on its wire: calls the one when the other says so, and when time has come.
+
+    Sends are made at absolute instants of world time, so that lateness never adds up.
+    """
+
+    def __init__(
+        self,
+        line: Line,
+        clock: WorldClock,
+        faults: LineFaults,
+        tell: Callable[[float, Fault], None],
+        tell_sent: Callable[[float, bytes], None] | None = None,
+        *,
+        number: int = 0,
+    ) -> None:
+        self.line = line
+        self._faults = faults
+        self._tell = tell
+        self._tell_sent = tell_sent
+        self._is_open = False
+        self._endpoint: Endpoint = line.endpoint
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._last = 0.0
+        self._down = False
+        self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme, number=number)
+
+    def connected(self) -> None:
+        """Somebody opened the line."""
+        self._is_open = True
+        self._send(self._endpoint.connected(self._clock.now()))
+        self._schedule()
+
+    def received(self, received: bytes) -> None:
+        """Bytes came."""
+        self._last = 0.0
+        self._send(self._endpoint.receive(received, self._clock.now()))
+        self._schedule()
+
+    def disconnected(self) -> None:
+        """Nobody has the line open any more."""
+        self._is_open = False
+        self._endpoint.disconnected(self._clock.now())
+        self._schedule()
+
+    async def close(self) -> None:
+        """Take the line away."""
+        await self.wire.close()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _send(self, units: Sequence[bytes]) -> None:
+        if units:
+            self._put(self._faults.send(units, self._clock.now()))
+
+    def _put(self, units: Sequence[bytes]) -> None:
+        self.wire.send(units)
+        if self._tell_sent is not None and self._is_open:
+            for unit in units:
+                self._tell_sent(self._clock.now(), unit)
+
+    def _strike(self) -> None:
+        """Let go wrong what is due to, and repair what was to be repaired."""
+        now = self._clock.now()
+        if self._down and now >= self._faults.down_until:
+            self._down = False
+            self.wire.restore()
+        faults, units = self._faults.act(now)
+        self._put(units)
+        for fault in faults:
+            if fault.kind == "disconnect" and not self._down:
+                self._down = True
+                self.wire.hang_up()
+            elif isinstance(self._endpoint, Faulty):
+                self._send(self._endpoint.fault(fault.kind, now, fault.duration))
+        for at, fault in self._faults.struck:
+            self._tell(at, fault)
+        self._faults.struck.clear()
+
+    def _schedule(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        when = min(self._endpoint.next_due(), self._faults.next_due())
+        if self._down:
+            when = min(when, self._faults.down_until)
+        if when < NEVER:
+            at = max(self._clock.monotonic(when), self._last + LEAST_INTERVAL)
+            self._timer = self._loop.call_at(at, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self._last = self._loop.time()
+        self._strike()
+        self._send(self._endpoint.due(self._clock.now()))
+        self._schedule()
+
+
+async def serve(spec: Mapping[str, Any], index: int) -> None:
+    """Serve device ``index`` of a specification until told to end; print where it listens."""
+    epoch_ns = int(spec["epoch_ns"])
+    device = replace(device_spec(spec["devices"][index]), utc_ns=utc_of(epoch_ns))
+    scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
+    clock = WorldClock(epoch_ns, float(spec.get("speed", 1.0)))
+    module, _, function = FAMILIES[device.driver].partition(":")
+    faults = parse(spec.get("faults", ()), device.sensors)
+    for fault in faults:
+        if fault.kind == "wrap":  # of a 16-bit counter
+            first = round(-fault.at * device.sampling_rate) % 65536
+            device = replace(device, settings={**device.settings, "first_count": first})
+    source = Source(scenario, device, faults=SampleFaults(faults))
+    for sensor in device.sensors:  # the first sample takes its time: before anybody waits for it
+        source.counts(sensor, source.first_sample_after(sensor, clock.now()), 1)
+    lines: Sequence[Line] = getattr(import_module(module), function)(device, source)
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ended.set)
+    with contextlib.suppress(PermissionError):  # /dev/null: nobody will close it
+        loop.add_reader(sys.stdin.fileno(), _end_of_input, ended)
+    name = ",".join(device.sensors)
+    tell_fault, tell_sent = _Log(spec.get("fault_log"), device), _Log(spec.get("sent_log"), device)
+
+    def tell(at: float, fault: Fault) -> None:
+        tell_fault.write(at=at, **fault.model_dump(exclude={"sensors", "at"}))
+
+    def sent(at: float, unit: bytes) -> None:
+        tell_sent.write(at=at, unit=unit.hex())
+
+    tell_sent.write(at=clock.now(), utc_ns=device.utc_ns)
+    first_port = int(spec["devices"][index].get("number", 0))
+    served = [
+        Served(
+            line,
+            clock,
+            LineFaults(
+                [f for f in faults if line.carries_samples or f.kind == "disconnect"],
+                f"{name} {k}",
+                begin=clock.now(),
+            ),
+            tell,
+            sent if line.carries_samples and tell_sent.is_wanted else None,
+            number=int(device.settings.get(line.setting, 0)) if k and first_port else first_port,
+        )
+        for k, line in enumerate(lines)
+    ]
+    opened: list[Served] = []
+    try:
+        for one in served:
+            opened.append(one)
+            await one.wire.open()
+        print(json.dumps(_announcement(device, served)), flush=True)
+        await ended.wait()
+    finally:
+        loop.remove_reader(sys.stdin.fileno())
+        for one in opened:
+            await one.close()
+
+
+class _Log:
+    """Lines of JSON that the processes of a bench append to one file; nothing without a file."""
+
+    def __init__(self, path: str | None, device: DeviceSpec) -> None:
+        self._path = path
+        self._sensors = list(device.sensors)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether there is a file."""
+        return bool(self._path)
+
+    def write(self, **told: object) -> None:
+        """Append one line, whole."""
+        if self._path:
+            line = json.dumps({"sensors": self._sensors, **told}) + "\n"
+            with Path(self._path).open("ab", buffering=0) as file:
+                file.write(line.encode())
+
+
+def _end_of_input(ended: asyncio.Event) -> None:
+    if not os.read(sys.stdin.fileno(), 4096):
+        ended.set()
+
+
+def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any]:
+    return {
+        "sensors": list(device.sensors),
+        "driver": device.driver,
+        "port": served[0].wire.address,
+        "settings": {
+            one.line.setting: int(one.wire.address.rpartition(":")[2]) for one in served[1:]
+        },
+    }
+
+
+def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
+    """Read one entry of ``devices``."""
+    return DeviceSpec(
+        sensors=tuple(table["sensors"]),
+        driver=table["driver"],
+        port=table.get("port", "pty"),
+        sampling_rate=float(table["sampling_rate"]),
+        channels={
+            sensor: tuple(ChannelSpec(**channel) for channel in channels)
+            for sensor, channels in table["channels"].items()
+        },
+        settings=table.get("settings", {}),
+        sensor_settings=table.get("sensor_settings", {}),
+        model=table.get("model", ""),
+        serial_number=table.get("serial_number", ""),
+    )

@@ -1,0 +1,230 @@
+"""The paper's studies, and a few scenes of our own, as scenarios with a name.
+
+Levels are in (m/s²)²/Hz; the paper's numerical studies have noise of 1e-15 g²/Hz and motion that
+is white, 1.5 times as strong along y as along x.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim_devices.errors import ScenarioError
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.spectrum import Mixed, Resonance, Sum, Tabulated, White
+from sim_devices.world.tables import CommonMotion, PlaneWaves, SensorModel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sim_devices.world.spectrum import Spectrum
+
+STANDARD_GRAVITY = 9.80665
+NOISE = 1e-15 * STANDARD_GRAVITY**2
+SAMPLING_RATE = 200.0
+SPACING = 0.12
+"""Between sensors that stand as close as they can, in metres."""
+
+CASES: Mapping[str, tuple[str, tuple[str, str, str]]] = {
+    "0": ("setup1", ("E", "C", "D")),
+    "1": ("setup1", ("E", "B", "C")),
+    "2": ("setup1", ("E", "A", "B")),
+    "3": ("setup2", ("E", "A", "B")),
+}
+"""Table 1: set-up and sensors of each case, the target first."""
+
+
+def _white_motion(along_x: float, ratio: float = 1.5) -> CommonMotion:
+    return CommonMotion(spectra=(White(level=along_x), White(level=ratio * along_x)))
+
+
+def three_channels(
+    *, turned: tuple[float, float, float], snr: float, ratio: float = 1.5, seed: int = 0
+) -> Scenario:
+    """Fig. 3: uniaxial sensors i, j, k in a plane, each turned from x by an angle in degrees.
+
+    Parameters
+    ----------
+    turned
+        Directions of the three sensors.
+    snr
+        Of sensor i: its motion's PSD over its noise's.
+    ratio
+        S_y over S_x.
+    """
+    cosine, sine = np.cos(np.radians(turned[0])), np.sin(np.radians(turned[0]))
+    along_x = snr * NOISE / float(cosine**2 + ratio * sine**2)
+    return Scenario(
+        seed=seed,
+        motion=_white_motion(along_x, ratio),
+        sensors={
+            name: SensorModel(
+                sampling_rate=SAMPLING_RATE,
+                directions=((1.0, 0.0),),
+                rotation=angle,
+                noise=White(level=NOISE),
+            )
+            for name, angle in zip("ijk", turned, strict=True)
+        },
+    )
+
+
+def biaxial(
+    *, theta: float, channel_angles: tuple[float, float, float], snr: float, seed: int = 0
+) -> Scenario:
+    """Figs. 8 and 11: biaxial sensors, j and k turned by theta, channels at an angle (degrees).
+
+    Channel 1 of sensor i points along x; `snr` is its own.
+    """
+    return Scenario(
+        seed=seed,
+        motion=_white_motion(snr * NOISE),
+        sensors={
+            name: SensorModel(
+                sampling_rate=SAMPLING_RATE,
+                directions=(
+                    (1.0, 0.0),
+                    (float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle)))),
+                ),
+                rotation=turned,
+                noise=White(level=NOISE),
+            )
+            for name, turned, angle in zip("ijk", (0.0, theta, theta), channel_angles, strict=True)
+        },
+    )
+
+
+def fig4(*, theta: float = 10.0, snr: float = 100.0, ratio: float = 1.5) -> Scenario:
+    """Sensor i at 10°, j and k together `theta` further: (13) says how biased i is."""
+    return three_channels(turned=(10.0, 10.0 + theta, 10.0 + theta), snr=snr, ratio=ratio)
+
+
+def fig5(*, theta: float = 30.0, snr: float = 100.0) -> Scenario:
+    """Sensor j along i, k turned by `theta`: no bias, but variance."""
+    return three_channels(turned=(10.0, 10.0, 10.0 + theta), snr=snr)
+
+
+def fig9(*, theta: float = 10.0, snr: float = 100.0) -> Scenario:
+    """Biaxial sensors with channels at 80°, 70° and 60° (the paper's angles are in a drawing)."""
+    return biaxial(theta=theta, channel_angles=(80.0, 70.0, 60.0), snr=snr)
+
+
+def fig12(*, alpha: float = 30.0, snr: float = 100.0) -> Scenario:
+    """All three sensors with channels at `alpha`, j and k turned by 5°."""
+    return biaxial(theta=5.0, channel_angles=(alpha, alpha, alpha), snr=snr)
+
+
+def fig13(*, alpha: float = 30.0, theta: float = 60.0) -> Scenario:
+    """All three sensors with channels at `alpha`, j and k turned by `theta`, SNR 100."""
+    return biaxial(theta=theta, channel_angles=(alpha, alpha, alpha), snr=100.0)
+
+
+def hexagon(spacing: float = SPACING) -> dict[str, tuple[float, float, float]]:
+    """Fig. 6: E in the middle, A to D around it at 60° from one to the next.
+
+    So C-D-E, B-C-E and A-B-E are equilateral triangles; in A-C-E and A-D-E the outer two stand
+    √3 and 2 spacings apart.
+    """
+    around = {
+        name: (
+            float(spacing * np.cos(np.pi / 3 * step)),
+            float(spacing * np.sin(np.pi / 3 * step)),
+            0.0,
+        )
+        for step, name in enumerate("ABCD")
+    }
+    return {**around, "E": (0.0, 0.0, 0.0)}
+
+
+SERVO_NOISE = Mixed(level=2e-13)
+"""Servo-accelerometers: pink below 20 Hz, rising above 30 Hz."""
+
+LABORATORY: Spectrum = Sum(
+    terms=(
+        Tabulated(
+            frequency=(0.1, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 90.0),
+            level=(3e-14, 1e-13, 4e-13, 2e-11, 2e-10, 1e-9, 5e-10, 2e-10),
+        ),
+        Resonance(level=2e-10, frequency=5.3, damping=0.02),
+        Resonance(level=1e-9, frequency=8.7, damping=0.015),
+        Resonance(level=2e-9, frequency=13.4, damping=0.02),
+        Resonance(level=4e-9, frequency=24.0, damping=0.03),
+        Resonance(level=2e-9, frequency=37.0, damping=0.03),
+    )
+)
+"""Motion of a laboratory floor: below the noise at 2 Hz, with the structure's modes above."""
+
+
+def laboratory(turned: Mapping[str, float], *, speed: float = 1000.0, seed: int = 0) -> Scenario:
+    """Five triaxial servo-accelerometers on a floor that waves of a finite speed cross."""
+    return Scenario(
+        seed=seed,
+        motion=PlaneWaves(spectrum=LABORATORY, speed=speed),
+        sensors={
+            name: SensorModel(
+                sampling_rate=SAMPLING_RATE,
+                rotation=turned[name],
+                noise=SERVO_NOISE,
+                position=position,
+            )
+            for name, position in hexagon().items()
+        },
+    )
+
+
+def setup1(*, seed: int = 0) -> Scenario:
+    """C, D and E alike; A and B turned together by 60°."""
+    return laboratory({"A": 60.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
+
+
+def setup2(*, seed: int = 1) -> Scenario:
+    """As set-up 1, A turned back by 15°."""
+    return laboratory({"A": 45.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
+
+
+def waves(*, snr: float = 1e3, speed: float = 150.0, seed: int = 0) -> Scenario:
+    """Five triaxial sensors of arbitrary directions where the motion is far from coherent.
+
+    White motion and noise; at 150 m/s the incoherence biases a three-sensor estimate several
+    times over from 20 Hz on.
+    """
+    angles = np.random.default_rng(9).uniform(-180.0, 180.0, (5, 3))
+    return Scenario(
+        seed=seed,
+        motion=PlaneWaves(spectrum=White(level=snr * NOISE), speed=speed),
+        sensors={
+            name: SensorModel(
+                sampling_rate=SAMPLING_RATE,
+                rotation=(float(yaw), float(pitch), float(roll)),
+                noise=White(level=NOISE),
+                position=position,
+            )
+            for (name, position), (yaw, pitch, roll) in zip(hexagon().items(), angles, strict=True)
+        },
+    )
+
+
+SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
+    "fig4": fig4,
+    "fig5": fig5,
+    "fig9": fig9,
+    "fig12": fig12,
+    "fig13": fig13,
+    "setup1": setup1,
+    "setup2": setup2,
+    "waves": waves,
+}
+
+
+def named(name: str) -> Scenario:
+    """Return the scenario of this name, with the values its function has by default.
+
+    Raises
+    ------
+    ScenarioError
+        If there is none.
+    """
+    if name not in SCENARIOS:
+        raise ScenarioError(f"no scenario {name!r}; expected one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]()

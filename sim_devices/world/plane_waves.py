@@ -1,0 +1,63 @@
+"""Motion of a floor crossed by plane waves: coherent in one point, less and less so apart.
+
+Rayleigh waves (horizontal along their way, vertical a quarter period behind) and Love waves
+(horizontal across it) come from directions all around at one speed; shear and pressure waves
+arrive from below. All are independent, and each reaches a sensor at its own time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sim_devices.arrays import ComplexArray, FloatArray
+    from sim_devices.world.tables import PlaneWaves
+
+
+def n_sources(waves: PlaneWaves) -> int:
+    """Waves in the field."""
+    return 2 * waves.n_directions + 3
+
+
+def field(
+    waves: PlaneWaves, position: tuple[float, float, float], frequency: FloatArray
+) -> ComplexArray:
+    """Say what each wave does at one place, for a spectrum of one in each direction.
+
+    Parameters
+    ----------
+    waves
+        The field.
+    position
+        In metres.
+    frequency
+        In Hz, shape (n_freqs,).
+
+    Returns
+    -------
+    complex128, shape (n_freqs, 3, n_sources)
+        Amplitude A with ``A(f, x) A(f, y)^H`` the coherence between places x and y: the unit
+        matrix where x = y.
+    """
+    n = waves.n_directions
+    bearing = 2 * np.pi * (np.arange(n) + 0.5) / n
+    along = np.array([np.cos(bearing), np.sin(bearing), np.zeros(n)])
+    across = np.array([-np.sin(bearing), np.cos(bearing), np.zeros(n)])
+    up = np.array([[0.0], [0.0], [1.0]])
+
+    surface = 1 - waves.from_below  # share of the vertical motion that Rayleigh waves make
+    rayleigh = surface * waves.ellipticity**2 / 2  # and what that brings to each horizontal
+    shape = np.concatenate(
+        [
+            np.sqrt(surface / n) * (waves.ellipticity * along - 1j * up),
+            np.sqrt(2 * (surface - rayleigh) / n) * across,
+            np.sqrt(waves.from_below) * np.eye(3),
+        ],
+        axis=1,
+    )
+    shape = np.where(frequency[:, None, None] > 0, shape, shape.real)  # no phase at rest
+    slowness = np.concatenate([along, along, np.tile(up, 3)], axis=1) / waves.speed
+    delay = np.asarray(position) @ slowness
+    return np.asarray(shape * np.exp(-2j * np.pi * frequency[:, None, None] * delay))

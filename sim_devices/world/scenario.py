@@ -1,0 +1,222 @@
+"""What moves, and which sensors feel it: the table under `[simulation]` in a bench file.
+
+One scenario describes one common motion and every sensor's place in it. All processes that hold
+the same table simulate the same world: whatever they ask for is the same function of time.
+
+Example, as it stands in a bench file (SI units, angles in degrees, spectra one-sided)::
+
+    [simulation]
+    seed = 7
+
+    [simulation.motion]                     # three directions: x, y, z (up)
+    spectra = [
+        {shape = "white", level = 1e-9},
+        {shape = "white", level = 1.5e-9},
+        {shape = "sum", terms = [
+            {shape = "white", level = 1e-9},
+            {shape = "resonance", level = 1e-7, frequency = 8, damping = 0.02}]},
+    ]
+
+    [simulation.sensors.A]                  # the sensor's name in the bench file
+    noise = {shape = "mixed", level = 1e-13}            # one for all channels, or one for each
+
+    [simulation.sensors.B]
+    rotation = 10.0                         # about z; or [about z, about y, about x]
+    gain = [1.0, 1.01, 0.99]
+    delay = 0.0005                          # reads the motion of half a millisecond ago
+    noise = {shape = "white", level = 1e-13}
+    clock = {offset = 0.3, ppm = 15.0, wander = 0.05}
+
+    [simulation.sensors.C]
+    directions = [[1, 0, 0], [1, 2, 0], [0, 0, 1]]      # a row a channel, any angles between
+    noise = [{shape = "white", level = 1e-13}, {shape = "pink", level = 1e-13},
+             {shape = "white", level = 2e-13}]
+    seed = 3                                # of this sensor's noise and clock
+
+A field of plane waves in place of one common motion, so that sensors apart are not coherent::
+
+    [simulation.motion]
+    kind = "plane-waves"
+    spectrum = {shape = "white", level = 1e-9}
+    speed = 150.0
+
+    [simulation.sensors.A]
+    position = [0.12, 0.0, 0.0]             # metres
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeInt, ValidationError, model_validator
+
+from sim_devices.errors import ScenarioError
+from sim_devices.world.tables import USABLE, MotionModel, SensorModel, Table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Self
+
+    from sim_devices.arrays import FloatArray
+    from sim_devices.world.spectrum import Spectrum
+
+ELSEWHERE = frozenset({"speed", "devices", "faults"})
+"""Keys of the `[simulation]` table that others read: they say nothing about the world."""
+
+
+class Scenario(Table):
+    """A motion and the sensors in it."""
+
+    seed: NonNegativeInt = 0
+    motion: MotionModel
+    sensors: dict[str, SensorModel] = Field(min_length=1)
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any], *, sampling_rate: float | None = None) -> Scenario:
+        """Read a table such as `[simulation]` of a bench file.
+
+        Parameters
+        ----------
+        table
+            The schema of this module. `speed`, `devices` and `faults` are others' keys.
+        sampling_rate
+            Of the sensors that do not state their own, in Hz.
+
+        Raises
+        ------
+        ScenarioError
+            Naming every key that is wrong, its value and what was expected.
+        """
+        own: dict[str, Any] = {key: value for key, value in table.items() if key not in ELSEWHERE}
+        motion = own.get("motion")
+        if isinstance(motion, dict):
+            own["motion"] = {"kind": "common", **motion}
+        sensors = own.get("sensors")
+        if sampling_rate is not None and isinstance(sensors, dict):
+            own["sensors"] = {
+                name: {"sampling_rate": sampling_rate, **sensor}
+                if isinstance(sensor, dict)
+                else sensor
+                for name, sensor in sensors.items()
+            }
+        try:
+            return cls.model_validate(own)
+        except ValidationError as error:
+            raise ScenarioError(_told(error, own)) from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the scenario as a table: plain TOML and JSON values, `None` left out."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sensors, in order."""
+        return tuple(self.sensors)
+
+    def n_channels(self, sensor: str) -> int:
+        """Channels of a sensor."""
+        directions = self.sensor(sensor).directions
+        return self.motion.n_dims if directions is None else len(directions)
+
+    def noise_spectra(self, sensor: str) -> tuple[Spectrum, ...]:
+        """Noise of every channel of a sensor."""
+        noise = self.sensor(sensor).noise
+        return noise if isinstance(noise, tuple) else (noise,) * self.n_channels(sensor)
+
+    def gains(self, sensor: str) -> FloatArray:
+        """Gain of every channel, shape (n_channels,)."""
+        return np.broadcast_to(
+            np.asarray(self.sensor(sensor).gain, dtype=float), self.n_channels(sensor)
+        )
+
+    def directions(self, sensor: str) -> FloatArray:
+        """Direction cosines in the world, shape (n_channels, n_dims): R of (16)."""
+        model, d = self.sensor(sensor), self.motion.n_dims
+        rows = np.eye(d) if model.directions is None else np.array(model.directions)
+        rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        return np.asarray(rows @ _rotation(model.rotation)[:d, :d].T)
+
+    @property
+    def bandwidth(self) -> float:
+        """The motion is whole to this frequency (Hz), and gone a ninth above it."""
+        if self.motion.bandwidth is not None:
+            return self.motion.bandwidth
+        return USABLE * min(sensor.sampling_rate for sensor in self.sensors.values()) / 2
+
+    def true_noise_psd(self, sensor: str, channel: int, frequency: FloatArray) -> FloatArray:
+        """One-sided noise PSD of a channel (by index) in (m/s²)²/Hz, shape of `frequency` (Hz)."""
+        return self.noise_spectra(sensor)[channel].psd(np.asarray(frequency, dtype=float))
+
+    def sensor(self, name: str) -> SensorModel:
+        """Return the table of one sensor.
+
+        Raises
+        ------
+        ScenarioError
+            There is no such sensor; the message names those there are.
+        """
+        try:
+            return self.sensors[name]
+        except KeyError:
+            raise ScenarioError(
+                f"no sensor {name!r} in the simulation; it has {', '.join(self.sensors)}"
+            ) from None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        d = self.motion.n_dims
+        faults = []
+        for name, sensor in self.sensors.items():
+            n_channels = self.n_channels(name)
+            if sensor.directions is not None:
+                faults += [
+                    f"sensors.{name}.directions: {list(row)} has {len(row)} values;"
+                    f" expected {d}, as the motion has, not all zero"
+                    for row in sensor.directions
+                    if len(row) != d or not any(row)
+                ]
+            for key, value in (("gain", sensor.gain), ("noise", sensor.noise)):
+                if isinstance(value, tuple) and len(value) != n_channels:
+                    faults.append(
+                        f"sensors.{name}.{key}: {len(value)} values;"
+                        f" expected one, or {n_channels}, one for each channel"
+                    )
+            turned = np.flatnonzero(np.atleast_1d(sensor.rotation)).tolist()
+            if d < 3 and any(axis > 0 or d == 1 for axis in turned):
+                faults.append(
+                    f"sensors.{name}.rotation: {sensor.rotation} leaves the {d} directions"
+                    f" of the motion; expected {'one angle' if d == 2 else 'none'}"
+                )
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+
+def _rotation(angles: float | tuple[float, float, float]) -> FloatArray:
+    """Matrix (3, 3) that turns about z, then the new y, then the new x, by degrees."""
+    yaw, pitch, roll = np.radians(angles if isinstance(angles, tuple) else (angles, 0.0, 0.0))
+    (cz, cy, cx), (sz, sy, sx) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def _told(error: ValidationError, table: Mapping[str, Any]) -> str:
+    """Every fault on its line: key = value, and what was expected."""
+    expected: dict[str, list[str]] = {}
+    for fault in error.errors(include_url=False):
+        key = "simulation"
+        given: Any = table
+        for part in fault["loc"]:  # a path holds names of alternatives too: those are no keys
+            if isinstance(given, dict) and part in given:
+                key, given = f"{key}.{part}", given[part]
+            elif isinstance(given, list | tuple) and isinstance(part, int):
+                key, given = f"{key}[{part}]", given[part]
+        if fault["type"] == "missing":
+            key = f"{key}.{fault['loc'][-1]}"
+        elif not isinstance(given, dict):
+            key = f"{key} = {given!r}"
+        expected.setdefault(key, []).append(fault["msg"])
+    return "\n".join(f"{key}: {', or '.join(said)}" for key, said in expected.items())

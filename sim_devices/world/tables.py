@@ -1,0 +1,131 @@
+"""The tables inside `[simulation]`: the motion, and each sensor's model, clock and response."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
+
+from sim_devices.world.spectrum import Spectrum, White
+
+if TYPE_CHECKING:
+    from typing import Self
+
+USABLE = 0.9
+"""The motion is whole up to this share of the lowest Nyquist frequency, and gone at it."""
+
+
+class Table(BaseModel):
+    """What every table has in common: it is closed and cannot change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TemperatureStep(Table):
+    """At `time` (s) the oscillator begins to settle `ppm` away, with `time_constant` (s)."""
+
+    time: float
+    ppm: float
+    time_constant: NonNegativeFloat = 60.0
+
+
+class SensorClock(Table):
+    """When a sensor takes its samples.
+
+    Sample n is taken `offset + n / (sampling_rate (1 + ppm 1e-6))` seconds after the world's
+    zero, further moved by the wander (a random walk of the rate: its standard deviation in ppm
+    after one hour) and by a temperature step.
+    """
+
+    offset: float = 0.0
+    ppm: float = 0.0
+    wander: NonNegativeFloat = 0.0
+    step: TemperatureStep | None = None
+
+
+class Response(Table):
+    """Poles and zeros in rad/s as pairs [real, imaginary], of unit gain at `normalised_at` (Hz)."""
+
+    poles: tuple[tuple[float, float], ...]
+    zeros: tuple[tuple[float, float], ...] = ()
+    normalised_at: PositiveFloat = 1.0
+
+
+class SensorModel(Table):
+    """One sensor: how it stands, what it does to the motion, its own noise and clock.
+
+    Channel r reads ``gain[r] · direction[r] · motion(t − delay, position) + noise[r]`` in m/s².
+    """
+
+    sampling_rate: PositiveFloat
+    rotation: float | tuple[float, float, float] = 0.0
+    directions: tuple[tuple[float, ...], ...] | None = None
+    gain: float | tuple[float, ...] = 1.0
+    delay: float = 0.0
+    response: Response | None = None
+    noise: Spectrum | tuple[Spectrum, ...] = White(level=0.0)
+    seed: NonNegativeInt | None = None
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clock: SensorClock = SensorClock()
+
+
+class CommonMotion(Table):
+    """One motion felt alike by all: independent components with these PSDs, then mixed.
+
+    With `mixing` (a row for each direction of the world, a column for each spectrum) the
+    directions become correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ.
+    """
+
+    kind: Literal["common"] = "common"
+    spectra: tuple[Spectrum, ...] = Field(min_length=1)
+    mixing: tuple[tuple[float, ...], ...] | None = None
+    bandwidth: PositiveFloat | None = None
+
+    @property
+    def n_dims(self) -> int:
+        """Directions the motion has."""
+        return len(self.spectra if self.mixing is None else self.mixing)
+
+    @model_validator(mode="after")
+    def _mixing_fits(self) -> Self:
+        if self.n_dims > 3:
+            raise ValueError(f"{self.n_dims} directions of motion; the world has at most 3")
+        if self.mixing is not None and any(len(row) != len(self.spectra) for row in self.mixing):
+            raise ValueError(
+                f"each row of mixing must have {len(self.spectra)} values, one for each spectrum"
+            )
+        return self
+
+
+class PlaneWaves(Table):
+    """Rayleigh, Love and vertically arriving waves from all directions at one finite speed.
+
+    `spectrum` is the PSD of each direction (x, y, z). A share `from_below` of it arrives
+    vertically, alike at all sensors on a level floor; Rayleigh waves, with `ellipticity` the
+    ratio of their horizontal to their vertical axis, and Love waves make up the rest.
+    """
+
+    kind: Literal["plane-waves"] = "plane-waves"
+    spectrum: Spectrum
+    speed: PositiveFloat = 150.0
+    n_directions: PositiveInt = 16
+    ellipticity: float = Field(default=0.7, gt=0, le=1)
+    from_below: float = Field(default=1 / 3, ge=0, le=1)
+    bandwidth: PositiveFloat | None = None
+
+    @property
+    def n_dims(self) -> int:
+        """Directions the motion has."""
+        return 3
+
+
+MotionModel: TypeAlias = Annotated[CommonMotion | PlaneWaves, Field(discriminator="kind")]

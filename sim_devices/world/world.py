@@ -1,0 +1,202 @@
+"""A scenario come to life: what every sensor reads at any of its samples.
+
+The motion lives on a master grid of its own, fast enough to be interpolated at any instant with
+an error 120 dB down. Each sensor's direction, gain, delay, response and place are part of the
+filters its channels are made with; its clock says at which instants they are taken; its noise
+is made on its own samples.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+from zlib import crc32
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from sim_devices.world import plane_waves
+from sim_devices.world.gaussian import GaussianSeries, WhiteSources
+from sim_devices.world.sample_clock import SampleClock
+from sim_devices.world.tables import USABLE, PlaneWaves
+
+if TYPE_CHECKING:
+    from sim_devices.arrays import ComplexArray, FloatArray
+    from sim_devices.world.scenario import Scenario
+    from sim_devices.world.tables import Response
+
+GRID_OVERSAMPLING = 4  # master grid rate over the frequency where the motion has ended
+N_TAPS = 22
+KAISER_BETA = 13.4
+"""Of a window with 130 dB (0.1102 times what exceeds 8.7 dB)."""
+POLYNOMIAL_DEGREE = 13
+CHUNK = 4096  # instants interpolated at a time: their windows stay in the cache
+
+
+class Motion:
+    """Motion as one sensor's channels feel it: a function of time, the same in every process."""
+
+    def __init__(self, series: GaussianSeries, *, sampling_rate: float) -> None:
+        self._series = series
+        self._rate = sampling_rate
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Motion at world `times` (s, shape (n,), in any order), shape (n, n_channels)."""
+        out = np.empty((len(times), self._series.n_outputs))
+        for start in range(0, len(times), CHUNK):
+            place = times[start : start + CHUNK] * self._rate
+            index = np.floor(place).astype(np.int64)
+            first = int(index.min()) - N_TAPS // 2 + 1
+            last = int(index.max()) + N_TAPS // 2
+            grid = self._series.read(first, last + 1 - first)
+            windows = sliding_window_view(grid, N_TAPS, axis=1)[:, index - index.min()]
+            weights = np.vander(2 * (place - index) - 1, POLYNOMIAL_DEGREE + 1) @ _TAPS
+            np.einsum("ont,nt->no", windows, weights, out=out[start : start + CHUNK])
+        return out
+
+
+class World:
+    """The motion, clocks and noise of a scenario's sensors, made as they are asked for."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        motion = scenario.motion
+        n_sources = (
+            plane_waves.n_sources(motion) if isinstance(motion, PlaneWaves) else len(motion.spectra)
+        )
+        self._sources = WhiteSources((scenario.seed, 0), n_sources)
+        self._motions: dict[str, Motion] = {}
+        self._noises: dict[str, GaussianSeries] = {}
+        self._clocks: dict[str, SampleClock] = {}
+
+    def samples(self, sensor: str, first_sample: int, n: int) -> FloatArray:
+        """Make what the sensor reads, noise included, in m/s², shape (n, n_channels)."""
+        felt = self.motion(sensor).at(self.sample_times(sensor, first_sample, n))
+        felt += self.noise(sensor, first_sample, n)
+        return felt
+
+    def sample_times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
+        """World time in seconds of the sensor's samples, shape (n,)."""
+        if sensor not in self._clocks:
+            model = self._scenario.sensor(sensor)
+            self._clocks[sensor] = SampleClock(
+                model.clock, sampling_rate=model.sampling_rate, key=self._key(sensor, "clock")
+            )
+        return self._clocks[sensor].times(first_sample, n)
+
+    def motion(self, sensor: str) -> Motion:
+        """Motion as the sensor's channels feel it."""
+        if sensor not in self._motions:
+            rate = GRID_OVERSAMPLING * self._scenario.bandwidth / USABLE
+            series = GaussianSeries(
+                self._sources, lambda f: self._response(sensor, f), sampling_rate=rate
+            )
+            self._motions[sensor] = Motion(series, sampling_rate=rate)
+        return self._motions[sensor]
+
+    def noise(self, sensor: str, first_sample: int, n: int) -> FloatArray:
+        """Make the sensor's own noise in m/s², shape (n, n_channels)."""
+        if sensor not in self._noises:
+            spectra = self._scenario.noise_spectra(sensor)
+            self._noises[sensor] = GaussianSeries(
+                WhiteSources(self._key(sensor, "noise"), len(spectra)),
+                lambda f: _diagonal(np.sqrt([spectrum.psd(f) for spectrum in spectra])),
+                sampling_rate=self._scenario.sensors[sensor].sampling_rate,
+            )
+        return self._noises[sensor].read(first_sample, n).T
+
+    def motion_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
+        """Cross-spectral matrix that perfect clocks and no noise would give.
+
+        Parameters
+        ----------
+        sensors
+            Names, in the order of the channels.
+        frequency
+            In Hz, shape (n_freqs,).
+
+        Returns
+        -------
+        complex128, shape (n_freqs, n_channels, n_channels)
+            ``E[X_p conj(X_q)]``, one-sided, in (m/s²)²/Hz.
+        """
+        rows = np.concatenate([self._response(sensor, frequency) for sensor in sensors], axis=1)
+        return np.asarray(rows @ rows.conj().transpose(0, 2, 1))
+
+    def true_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
+        """`motion_csm` and the sensors' true noise on its diagonal."""
+        csm = self.motion_csm(sensors, frequency)
+        noise = [
+            self._scenario.true_noise_psd(sensor, channel, frequency)
+            for sensor in sensors
+            for channel in range(self._scenario.n_channels(sensor))
+        ]
+        diagonal = np.arange(len(noise))
+        csm[:, diagonal, diagonal] += np.transpose(noise)
+        return csm
+
+    def _key(self, sensor: str, use: str) -> tuple[int, int]:
+        own = self._scenario.sensors[sensor].seed
+        return self._scenario.seed if own is None else own, crc32(f"{use} {sensor}".encode()) + 1
+
+    def _response(self, sensor: str, frequency: FloatArray) -> ComplexArray:
+        """Amplitude of every channel for every source, shape (n_freqs, n_channels, n_sources)."""
+        scenario = self._scenario
+        model = scenario.sensor(sensor)
+        channel = scenario.gains(sensor)[:, None] * scenario.directions(sensor)
+        common = _whole_to(scenario.bandwidth, frequency) * np.exp(
+            -2j * np.pi * frequency * model.delay
+        )
+        if model.response is not None:
+            common = common * _poles_and_zeros(model.response, frequency)
+        return np.asarray(
+            common[:, None, None] * (channel @ self._ground(model.position, frequency))
+        )
+
+    def _ground(self, position: tuple[float, float, float], frequency: FloatArray) -> ComplexArray:
+        """Amplitude of the world's directions, shape (n_freqs, n_dims, n_sources)."""
+        motion = self._scenario.motion
+        if isinstance(motion, PlaneWaves):
+            asd = np.sqrt(motion.spectrum.psd(frequency))
+            return asd[:, None, None] * plane_waves.field(motion, position, frequency)
+        each = _diagonal(np.sqrt([spectrum.psd(frequency) for spectrum in motion.spectra]))
+        return each if motion.mixing is None else np.asarray(np.array(motion.mixing) @ each)
+
+
+def _diagonal(rows: FloatArray) -> ComplexArray:
+    """Rows (n, n_freqs) on the diagonals of matrices (n_freqs, n, n)."""
+    return np.asarray(rows.T[:, :, None] * np.eye(len(rows)), dtype=complex)
+
+
+def _whole_to(bandwidth: float, frequency: FloatArray) -> FloatArray:
+    """One up to `bandwidth`, none from a ninth above it: a raised cosine between."""
+    beyond = (frequency / bandwidth - 1) / (1 / USABLE - 1)
+    return np.asarray((1 + np.cos(np.pi * np.clip(beyond, 0, 1))) / 2)
+
+
+def _poles_and_zeros(response: Response, frequency: FloatArray) -> ComplexArray:
+    def raw(f: FloatArray) -> ComplexArray:
+        s = 2j * np.pi * f[:, None]
+        poles, zeros = (
+            np.array(pairs).reshape(-1, 2) for pairs in (response.poles, response.zeros)
+        )
+        above = np.prod(s - (zeros[:, 0] + 1j * zeros[:, 1]), axis=1)
+        return np.asarray(above / np.prod(s - (poles[:, 0] + 1j * poles[:, 1]), axis=1))
+
+    return raw(frequency) / np.abs(raw(np.array([response.normalised_at])))
+
+
+def _interpolator() -> FloatArray:
+    """Weights of the taps as polynomials in the place between two grid samples, −1 to 1.
+
+    Shape (POLYNOMIAL_DEGREE + 1, N_TAPS), highest power first. A sinc under a Kaiser window,
+    flat to a quarter of the grid rate and 130 dB down from three quarters.
+    """
+    node = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
+    tap = np.arange(N_TAPS) - N_TAPS // 2 + 1
+    away = tap - (node[:, None] + 1) / 2
+    reach = np.clip(1 - (2 * away / N_TAPS) ** 2, 0, None)
+    weights = np.sinc(away) * np.i0(KAISER_BETA * np.sqrt(reach)) / np.i0(KAISER_BETA)
+    return np.asarray(np.polyfit(node, weights, POLYNOMIAL_DEGREE))
+
+
+_TAPS = _interpolator()

@@ -1,0 +1,85 @@
+"""What a driver yields, checked: anything it may have got wrong is said, nothing right refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+
+from daq.acquisition.block_checks import BlockValidator, FaultyDriverError
+from daq.protocols.block import Event, HostTime
+from tests.scripted_driver import PlayedDriver, bench, block
+
+if TYPE_CHECKING:
+    from daq.drivers.interface import DriverType
+
+NOW = HostTime(10**9, 10**18)
+FAULTY: dict[str, tuple[dict[str, Any], str]] = {
+    "shape": ({"counts": np.zeros((10, 3), np.int32)}, r"shape \(10, 3\); expected .* 2\)"),
+    "flat": ({"counts": np.zeros(10, np.int32)}, r"shape \(10,\)"),
+    "no array": ({"counts": [[1, 2]]}, "counts of shape None"),
+    "type": ({"counts": np.full((10, 2), 0.5)}, "type float64 that do not fit int32"),
+    "text": ({"counts": np.full((10, 2), "1")}, "type <U1 that do not fit int32"),
+    "nan": ({"counts": np.full((10, 2), np.nan)}, "type float64 that do not fit int32"),
+    "too large": ({"counts": np.full((10, 2), 2**40)}, "type int64 that do not fit int32"),
+    "empty": ({"counts": np.zeros((0, 2), np.int32)}, "a block without samples"),
+    "sensor": ({"sensor": "c"}, "a block of 'c'; expected 'a' or 'b'"),
+    "index": ({"first_sample": -5}, "begins at sample -5; expected one from 0 on"),
+    "no index": ({"first_sample": None}, "begins at sample None"),
+    "counter": ({"device_counter": 2**70}, "device_counter .*; expected 64 bits"),
+    "flags": ({"flags": 2**40}, "flags 1099511627776"),
+    "reason": ({"reason": None}, "reason None; expected text"),
+    "time": ({"received": 12.0}, r"received at 12\.0"),
+    "instants": ({"instants_ns": np.zeros(9, np.int64)}, r"shape \(9,\); expected int64 \(10,\)"),
+    "real instants": ({"instants_ns": np.zeros(10)}, "expected int64"),
+}
+
+
+def checked() -> BlockValidator:
+    return BlockValidator(
+        cast("DriverType", PlayedDriver()), bench("a", "b", a="bus", b="bus").sensors
+    )
+
+
+@pytest.mark.parametrize("case", FAULTY)
+def test_what_the_file_cannot_hold_is_named(case: str) -> None:
+    changes, said = FAULTY[case]
+    with pytest.raises(FaultyDriverError, match=f"^bus: driver 'played' yielded .*{said}"):
+        checked().check(replace(block("a", 100, 10, NOW), **changes))
+
+
+@pytest.mark.parametrize(
+    ("item", "said"),
+    [
+        (b"raw", "bytes; expected a Block or an Event"),
+        (None, "NoneType"),
+        (Event("c", "status", "", NOW), "an event of 'c'; expected 'a' or 'b'"),
+        (Event("a", "status", cast("str", None), NOW), "'status', None; expected text"),
+        (Event("a", "status", "", cast("HostTime", 5)), "an event received at 5"),
+    ],
+)
+def test_what_is_no_item_of_its_sensors_is_named(item: object, said: str) -> None:
+    with pytest.raises(FaultyDriverError, match=said):
+        checked().check(item)
+
+
+def test_instants_come_always_or_never() -> None:
+    one = checked()
+    one.check(block("a", 0, 10, NOW))
+    one.check(block("b", 0, 10, NOW, instants_ns=np.arange(10)))
+    with pytest.raises(FaultyDriverError, match="some without"):
+        one.check(block("a", 10, 10, NOW, instants_ns=np.arange(10)))
+
+
+@pytest.mark.parametrize("kind", ["i1", "u2", "i4", "i8", "u8", "f4", "f8"])
+def test_counts_of_any_type_that_fit_are_good(kind: str) -> None:
+    one = block("a", 0, 5, NOW)
+    item = replace(one, counts=one.counts.astype(kind))
+    assert checked().check(item) is item
+
+
+def test_events_of_the_port_are_good() -> None:
+    item = Event("", "status", "of the port", NOW)
+    assert checked().check(item) is item

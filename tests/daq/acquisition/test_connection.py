@@ -1,0 +1,164 @@
+"""One port kept connected: what is said, and when."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from daq.acquisition.connection import LONGEST_DELAY, BackOff, Connection, SensorLost
+from daq.errors import NoAnswerError
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, Event
+from tests.scripted_driver import (
+    ManualClock,
+    PlayedDevice,
+    PlayedDriver,
+    PlayedSession,
+    bench,
+    block,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from daq.acquisition.connection import Item
+    from daq.bench.model import Sensor
+    from daq.drivers.interface import DriverType
+    from daq.host_clock import HostClock
+
+
+class SlowToLeave(PlayedDriver):
+    """Leaves a device only when the test lets it."""
+
+    def __init__(self, devices: dict[str, PlayedDevice]) -> None:
+        super().__init__(devices)
+        self.may_leave = asyncio.Event()
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[PlayedSession]:
+        """Open a session; wait at its end."""
+        async with super().open(sensors, clock) as session:
+            try:
+                yield session
+            finally:
+                await self.may_leave.wait()
+
+
+def _kind(item: Item) -> list[str]:
+    event = item.event if isinstance(item, SensorLost) else item
+    return [event.kind] if isinstance(event, Event) else []
+
+
+async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
+    """A LabJack is told to stop its stream, and one that is gone takes 2 s not to answer."""
+    device = PlayedDevice()
+    driver = SlowToLeave({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, ManualClock())
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    device.items.put_nowait(NoAnswerError("no samples"))
+    kinds: list[str] = []
+    async with asyncio.timeout(60):
+        while "stalled" not in kinds:
+            item = await queue.get()
+            kinds += _kind(item)
+        driver.may_leave.set()
+        device.opened.clear()
+        await device.opened.wait()
+        while kinds.count("connected") < 2:
+            item = await queue.get()
+            kinds += _kind(item)
+    running.cancel()
+    await asyncio.wait([running])
+    assert kinds == ["connected", "stalled", "connected"]
+
+
+def test_only_a_session_that_lived_as_long_as_the_wait_shortens_it() -> None:
+    back_off = BackOff()
+    assert [back_off.failed() for _ in range(6)] == [0.2, 0.4, 0.8, 1.6, 3.2, LONGEST_DELAY]
+    back_off.lived(LONGEST_DELAY - 0.1)
+    assert back_off.failed() == LONGEST_DELAY
+    back_off.lived(LONGEST_DELAY)
+    assert back_off.failed() == 0.2
+
+
+async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> None:
+    """One block is no success: it would be set up anew five times a second, for weeks."""
+    device, clock = PlayedDevice(), ManualClock()
+    driver = PlayedDriver({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    loop, opened = asyncio.get_running_loop(), []
+    async with asyncio.timeout(20):
+        for _ in range(4):
+            await device.opened.wait()
+            device.opened.clear()
+            opened.append(loop.time())
+            device.items.put_nowait(block("A", 0, 10, clock.now()))
+            device.items.put_nowait(NoAnswerError("gone again"))
+    running.cancel()
+    await asyncio.wait([running])
+    assert opened[-1] - opened[0] > 0.2 + 0.4 + 0.7
+
+
+@pytest.mark.parametrize("counter", [None, 20])
+async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_count(
+    counter: int | None,
+) -> None:
+    device = PlayedDevice()
+    clock = ManualClock()
+    driver = PlayedDriver({"A": device})
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    clock.suspended = -0.2  # a busy computer was held up between its two clocks
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    said: list[Event] = []
+    n_blocks = 0
+    async with asyncio.timeout(60):
+        device.items.put_nowait(block("A", 0, 5, clock.now()))
+        while n_blocks < 1:
+            n_blocks += isinstance(await queue.get(), Block)
+        clock.suspended = 0.0
+        device.items.put_nowait(block("A", 5, 5, clock.now(), device_counter=counter))
+        while n_blocks < 2:
+            n_blocks += isinstance(await queue.get(), Block)
+        clock.advance(37.0)
+        clock.suspended += 37.0
+        for first in (10, 20):
+            device.items.put_nowait(block("A", first, 10, clock.now(), device_counter=counter))
+        while n_blocks < (3 if counter is None else 4):
+            item = await queue.get()
+            n_blocks += isinstance(item, Block)
+            event = item.event if isinstance(item, SensorLost) else item
+            if isinstance(event, Event) and event.kind != "connected":
+                said.append(event)
+    running.cancel()
+    await asyncio.wait([running])
+    assert device.n_sessions == (2 if counter is None else 1)
+    assert [event.kind for event in said] == ["stalled" if counter is None else "status"]
+    assert "the computer was suspended for 37" in said[0].text
+
+
+def test_host_time_goes_on_while_the_computer_is_suspended() -> None:
+    asleep_ns = 0
+    clock = SystemClock(2.0, lambda: time.monotonic_ns() + asleep_ns, _began_ns=time.monotonic_ns())
+    before = clock.now()
+    assert clock.suspended < 1.0
+    asleep_ns = 3_600_000_000_000
+    after = clock.now()
+    assert clock.suspended == pytest.approx(3600.0, abs=1.0)
+    assert after.monotonic_ns - before.monotonic_ns >= 2 * asleep_ns  # at twice life's pace
+    assert after.utc_ns - before.utc_ns == after.monotonic_ns - before.monotonic_ns

@@ -1,0 +1,564 @@
+"""The recorder, with devices the test plays: what comes, what is lost, what returns."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.acquisition.block_writer import MOST_ALIKE
+from daq.acquisition.recorder import Status, record, recording_path
+from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDeviceError
+from daq.protocols.block import Event
+from daq.recording.control import ControlRefusedError, ask
+from daq.recording.reader import Recording, control_address
+from daq.recording.repair import verify
+from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+
+class Run:
+    """A recorder in a task, its devices, and what it acknowledged."""
+
+    def __init__(self, path: Path, *names: str, **ports: str) -> None:
+        self.path = path
+        self.bench = bench(*names, **ports)
+        self.clock = ManualClock()
+        self.driver = PlayedDriver({port: PlayedDevice() for port in self.bench.ports()})
+        self.stop = asyncio.Event()
+        self.statuses: list[Status] = []
+        self.news = asyncio.Event()
+        self.duration: float | None = None
+
+    def device(self, port: str) -> PlayedDevice:
+        """Return what is on a port."""
+        return self.driver.devices[port]
+
+    async def record(self) -> Status:
+        """Run the recorder."""
+        return await record(
+            self.bench,
+            self.path,
+            duration=self.duration,
+            clock=self.clock,
+            stop=self.stop,
+            acknowledged=self._acknowledged,
+            drivers=self.driver.find,
+        )
+
+    def _acknowledged(self, status: Status) -> None:
+        self.statuses.append(status)
+        self.news.set()
+
+    @contextlib.asynccontextmanager
+    async def going(self) -> AsyncIterator[asyncio.Task[Status]]:
+        """Run it in the background until told to stop."""
+        task = asyncio.create_task(self.record())
+        try:
+            yield task
+            self.stop.set()
+            await task
+        finally:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def until(self, sensor: str, samples: int, state: str = "recording") -> None:
+        """Wait for an acknowledgment."""
+        while not self._is(sensor, samples, state):
+            self.news.clear()
+            await self.news.wait()
+
+    def _is(self, sensor: str, samples: int, state: str) -> bool:
+        if not self.statuses:
+            return False
+        now = self.statuses[-1].sensors[sensor]
+        return now.samples >= samples and now.state == state
+
+    def send(self, sensor: str, first: int, n: int) -> None:
+        """Let a device take samples and send them."""
+        self.clock.advance(n / 100.0)
+        port = self.bench.sensor(sensor).port
+        self.device(port).items.put_nowait(block(sensor, first, n, self.clock.now()))
+
+
+async def test_every_sensor_is_recorded(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        for first in range(0, 300, 30):
+            run.send("a", first, 30)
+            run.send("b", first, 30)
+        await run.until("b", 270)
+    final = run.statuses[-1]
+    assert final.closed
+    assert all(run.device(name).left_quiet for name in "ab")
+    report = verify(run.path)
+    assert report.closed
+    assert report.intact
+    with Recording.open(run.path) as recording:
+        for sensor in recording.sensors:
+            np.testing.assert_array_equal(sensor.counts(), counts(0, 300))
+            assert sensor.serial_number == "1"
+        kinds = [(event.sensor, event.kind) for event in recording.events]
+        assert kinds[0] == ("", "started")
+        assert sorted(kinds[1:3]) == [("a", "connected"), ("b", "connected")]
+        assert kinds[-1] == ("", "stopped")
+
+
+async def test_all_failures_at_the_start_come_at_once(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b", "c")
+    run.device("a").failure = NotConnectedError("sensor 'a' on a: no such port")
+    run.device("c").failure = NoAnswerError("sensor 'c' on c: no answer")
+    with pytest.RaisesGroup(
+        pytest.RaisesExc(NotConnectedError, match="'a'"),
+        pytest.RaisesExc(NoAnswerError, match="'c'"),
+    ):
+        await run.record()
+    assert not run.path.exists()
+    assert run.device("b").left_quiet
+
+
+async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 200)
+        await run.until("a", 200)
+        run.device("a").items.put_nowait(NotConnectedError("cable"))
+        await run.until("a", 200, "lost")
+        run.send("b", 0, 400)
+        await run.until("b", 400)
+        # 400 samples went by meanwhile; these come in a session of their own.
+        run.send("a", 0, 100)
+        await run.until("a", 300)
+    assert run.device("a").n_sessions == 2
+    assert run.device("b").n_sessions == 1
+    with Recording.open(run.path) as recording:
+        a, b = recording.sensors
+        (gap,) = a.gaps
+        assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (200, 400, 1)
+        assert gap["reason"] == b"disconnected"
+        assert a.blocks["first_sample"].tolist() == [0, 600]
+        assert len(b.gaps) == 0
+        said = [(e.kind, e.text) for e in recording.events if e.sensor == "a"]
+        assert [kind for kind, _ in said] == ["connected", "disconnected", "connected"]
+        assert said[1][1] == "cable"
+
+
+async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("a", 100, 100)
+        await run.until("a", 200)
+        # Nothing comes any more, and nothing says so.
+        await run.until("a", 200, "late")
+        await run.until("a", 200, "lost")
+        run.send("a", 0, 100)
+        await run.until("a", 300)
+    with Recording.open(run.path) as recording:
+        kinds = [event.kind for event in recording.events if event.sensor == "a"]
+        assert kinds == ["connected", "late", "stalled", "connected"]
+
+
+async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "daq.acquisition.stall_detector.LATENESS", 5.0
+    )  # however busy the machine is
+    run = Run(tmp_path / "r.h5", "a")
+    async with asyncio.timeout(60), run.going():
+        run.send("a", 0, 50)
+        run.send("a", 50, 50)
+        await run.until("a", 100, "late")
+        run.clock.advance(0.5)
+        run.send("a", 150, 100)
+        await run.until("a", 200)
+    assert run.device("a").n_sessions == 1
+    with Recording.open(run.path) as recording:
+        assert [e.kind for e in recording.events if e.sensor == "a"] == ["connected"]
+        (gap,) = recording.sensors[0].gaps
+        assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (100, 50, 0)
+
+
+async def test_a_word_of_the_decoder_does_not_make_a_sensor_lost(tmp_path: Path) -> None:
+    """Decoders call an answer or a block refused, too."""
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        for kind in ("refused", "stalled", "disconnected"):
+            run.device("a").items.put_nowait(Event("a", kind, "a block", run.clock.now()))
+        run.device("a").items.put_nowait(Event("a", "status", "last", run.clock.now()))
+        n_statuses = len(run.statuses)
+        while len(run.statuses) < n_statuses + 2:
+            run.news.clear()
+            await run.news.wait()
+        assert run.statuses[-1].sensors["a"].state == "recording"
+
+
+async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("a", 100)
+        wrong = replace(block("a", 100, 10, run.clock.now()), counts=np.full((10, 2), 0.5))
+        run.device("a").items.put_nowait(wrong)
+        await run.until("a", 100, "lost")
+        run.send("b", 100, 100)
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+        await run.until("b", 200)
+    assert run.statuses[-1].closed
+    assert verify(run.path).intact
+    with Recording.open(run.path) as recording:
+        assert [e.text for e in recording.events if e.kind == "disconnected"] == [
+            "a: driver 'played' yielded counts of type float64 that do not fit int32"
+        ]
+
+
+async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    items: asyncio.Queue[Any] = run.device("a").items
+    async with run.going():
+        items.put_nowait(b"raw bytes")
+        items.put_nowait(Event("c", "status", "of nobody", run.clock.now()))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        assert [e.text for e in recording.events if e.kind == "disconnected"] == [
+            "a: driver 'played' yielded bytes; expected a Block or an Event",
+            "a: driver 'played' yielded an event of 'c'; expected 'a'",
+        ]
+
+
+async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.acquisition.connection.LEAVE_TIMEOUT", 0.2)
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.device("a").hangs = True
+    async with asyncio.timeout(60), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    assert run.statuses[-1].closed
+    assert run.device("b").left_quiet
+    with Recording.open(run.path) as recording:
+        assert "the driver did not leave the device within 0.2 s" in [
+            e.text for e in recording.events if e.sensor == "a"
+        ]
+
+
+async def test_a_driver_that_cannot_be_ended_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.acquisition.connection.LEAVE_TIMEOUT", 0.2)
+    monkeypatch.setattr("daq.acquisition.recorder.CANCEL_TIMEOUT", 0.5)
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").may_end = may_end = asyncio.Event()
+    async with asyncio.timeout(60), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    assert run.statuses[-1].closed
+    with Recording.open(run.path) as recording:
+        assert "the driver on a does not end; it was left alone" in [
+            e.text for e in recording.events
+        ]
+    (left,) = [task for task in asyncio.all_tasks() if task.get_name() == "a"]
+    may_end.set()
+    await asyncio.wait([left])
+
+
+async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
+    tmp_path: Path,
+) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with asyncio.timeout(60), run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        address = control_address(run.path)
+        assert address is not None
+        reader, writer = await asyncio.open_connection("127.0.0.1", address[0])
+        await asyncio.to_thread(ask, run.path, "stop")
+    with contextlib.suppress(ConnectionError):
+        assert await reader.read() == b""
+    writer.close()
+    with contextlib.suppress(ConnectionError):
+        await writer.wait_closed()
+
+
+async def test_another_device_on_the_port_is_refused(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    device = run.device("a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        device.serial_number = "2"
+        device.items.put_nowait(NotConnectedError("cable"))
+        while device.n_sessions < 3:
+            device.opened.clear()
+            await device.opened.wait()
+        device.serial_number = "1"
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        refused = [e.text for e in recording.events if e.kind == "refused"]
+        assert refused == ["sensor 'a' on a: expected serial number '1', got '2'"]
+
+
+async def test_a_wrong_rate_is_refused_at_the_start(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").sampling_rate = 200.0
+    with pytest.RaisesGroup(pytest.RaisesExc(WrongDeviceError, match="expected 100 Hz")):
+        await run.record()
+
+
+async def test_a_slightly_different_rate_is_taken_over(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").sampling_rate = 100.1
+    async with run.going():
+        run.send("a", 0, 200)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        assert recording.sensors[0].sampling_rate == 100.1
+
+
+async def test_repeated_blocks_are_recorded_once(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("a", 0, 100)
+        run.send("a", 50, 150)
+        run.send("a", 190, 10)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        np.testing.assert_array_equal(recording.sensors[0].counts(), counts(0, 200))
+        said = [e.text for e in recording.events if e.kind == "resynchronised"]
+        assert [text.split()[0] for text in said] == ["100", "150"]
+
+
+async def test_a_fault_in_a_driver_concerns_its_device_only(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("a", 100)
+        run.device("a").items.put_nowait(ZeroDivisionError("a bug"))
+        run.send("a", 0, 100)
+        await run.until("a", 200)
+    with Recording.open(run.path) as recording:
+        assert ("disconnected", "a bug") in [(e.kind, e.text) for e in recording.events]
+
+
+async def test_the_duration_is_of_the_devices(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.duration = 2.0
+    run.send("a", 0, 200)
+    run.send("b", 0, 150)
+    run.send("b", 150, 50)
+    status = await run.record()
+    assert status.closed
+    assert [sensor.samples for sensor in status.sensors.values()] == [200, 200]
+
+
+async def test_a_lost_sensor_is_not_waited_for_beyond_the_duration(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    run.duration = 2.0
+    async with run.going() as task:
+        run.send("b", 0, 100)
+        run.device("b").items.put_nowait(NotConnectedError("cable"))
+        await run.until("b", 100, "lost")
+        run.device("b").failure = NotConnectedError("still away")
+        run.clock.advance(5.0)
+        status = await task
+    assert status.sensors["b"].missing == 500
+    with Recording.open(run.path) as recording:
+        (gap,) = recording.sensor("b").gaps
+        assert gap["reason"] == b"lost at the end"
+
+
+async def test_sensors_on_one_port_share_a_session(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b", a="bus", b="bus")
+    async with run.going():
+        run.send("a", 0, 100)
+        run.send("b", 0, 100)
+        await run.until("b", 100)
+        await run.until("a", 100)
+    assert run.device("bus").n_sessions == 1
+
+
+async def test_commands_from_outside(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going() as task:
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        status = await asyncio.to_thread(ask, run.path, "status")
+        assert status["sensors"]["a"]["samples"] == 100
+        await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
+        address = control_address(run.path)
+        assert address is not None
+        port, token = address
+        with pytest.raises(ControlRefusedError, match="wrong token"):
+            await asyncio.to_thread(ask, (port, "guess"), "stop")
+        with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
+            await asyncio.to_thread(ask, (port, token), "dance")
+        await asyncio.to_thread(ask, run.path, "stop")
+        assert (await task).closed
+    with pytest.raises(NotConnectedError, match="no recorder is writing it"):
+        ask(run.path, "stop")
+    with Recording.open(run.path) as recording:
+        marks = [event.text for event in recording.events if event.kind == "mark"]
+        assert marks == ["a door slammed"]
+        assert recording.events[-1].text == "stopped by command"
+
+
+async def test_nonsense_on_the_control_port_harms_nothing(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+        address = control_address(run.path)
+        assert address is not None
+        port, _ = address
+        for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            with contextlib.suppress(ConnectionError):
+                writer.write(nonsense)
+                writer.write_eof()
+                await reader.read()
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        assert (await asyncio.to_thread(ask, run.path, "status"))["closed"] is False
+
+
+async def test_stopped_before_it_began(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.stop.set()
+    status = await run.record()
+    assert not status.closed
+    assert not run.path.exists()
+
+
+async def test_a_file_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "r.h5").write_text("precious", encoding="utf-8")
+    run = Run(tmp_path / "r.h5", "a")
+    with pytest.raises(RecordingError, match="exists already"):
+        await run.record()
+    assert run.device("a").left_quiet
+
+
+async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        run.device("a").items.put_nowait(Event("a", "checksum", "2 frames", run.clock.now()))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        assert ("a", "checksum", "2 frames") in [
+            (e.sensor, e.kind, e.text) for e in recording.events
+        ]
+
+
+async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    async with run.going():
+        now = run.clock.now()
+        for k in range(1000):
+            run.device("a").items.put_nowait(Event("a", "checksum", f"noise {k}", now))
+        run.device("a").items.put_nowait(Event("a", "status", "another kind", now))
+        run.send("a", 0, 100)
+        await run.until("a", 100)
+    with Recording.open(run.path) as recording:
+        texts = [e.text for e in recording.events if e.sensor == "a" and e.kind != "connected"]
+    expected = [f"noise {k}" for k in range(MOST_ALIKE)]
+    assert texts == [*expected, "another kind", f"{1000 - MOST_ALIKE} more of these before"]
+
+
+FULL_DISK = """
+import asyncio, resource, signal, sys
+from daq.errors import RecordingError
+from daq.acquisition.recorder import record
+from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block
+
+async def main():
+    clock, driver = ManualClock(), PlayedDriver({"a": PlayedDevice()})
+    for first in range(0, 1_000_000, 1000):
+        driver.devices["a"].items.put_nowait(block("a", first, 1000, clock.now()))
+    await record(bench("a"), sys.argv[1], clock=clock, drivers=driver.find)
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+try:
+    asyncio.run(main())
+except RecordingError as error:
+    print(error, flush=True)
+"""
+
+
+def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    # A process of its own: HDF5 may crash the interpreter when it exits with what it cannot write.
+    said = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert said.stdout == f"{path}: cannot be written: File too large\n", said.stderr
+    report = verify(path)
+    assert report.intact
+    assert not report.closed
+
+
+STUBBORN = """
+import asyncio, functools, signal, sys
+from daq.acquisition import connection, recorder
+from tests.scripted_driver import PlayedDevice, PlayedDriver, bench
+
+def interrupt(status):
+    if not status.closed:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+connection.LEAVE_TIMEOUT, recorder.CANCEL_TIMEOUT = 0.1, 0.3
+if "windows" in sys.argv:
+    def not_here(*_):
+        raise NotImplementedError
+    asyncio.SelectorEventLoop.add_signal_handler = not_here
+device = PlayedDevice(may_end=asyncio.Event() if "stubborn" in sys.argv else None)
+driver = PlayedDriver({"a": device})
+recorder.record = functools.partial(recorder.record, drivers=driver.find)
+print(recorder.run(bench("a"), sys.argv[1], acknowledged=interrupt).closed, flush=True)
+"""
+
+
+@pytest.mark.parametrize("how", ["stubborn", "windows"])
+def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
+    tmp_path: Path, how: str
+) -> None:
+    path = tmp_path / "r.h5"
+    said = subprocess.run(
+        [sys.executable, "-c", STUBBORN, str(path), how],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert (said.returncode, said.stdout) == (0, "True\n"), said.stderr
+    assert verify(path).closed
+
+
+def test_the_usual_path() -> None:
+    path = recording_path(bench("a"), ManualClock(0).now())
+    assert path.as_posix() == "recordings/played-bench-20010909T014640Z.h5"

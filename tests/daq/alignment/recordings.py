@@ -1,0 +1,113 @@
+"""Small recordings, written block by block."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.bench.model import Channel
+from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+ORIGIN = HostTime(7_000_000_000_000, 1_468_458_000_000_000_000)
+
+
+@dataclass
+class Sensor:
+    """Counts at a rate, from an instant on (seconds from ORIGIN), each block arriving `late`."""
+
+    counts: NDArray[Any]
+    rate: float = 100.0
+    start: float = 0.0
+    late: float = 2e-4
+    clock: str = ""
+    utc: bool = False
+    utc_ahead: float = 0.0
+    """Seconds of what it states before the host's UTC."""
+    gaps: tuple[tuple[int, int], ...] = ()
+    """(first, end) of samples never received."""
+    restarts: tuple[int, ...] = ()
+    unit: str = "m/s²"
+    channel: dict[str, Any] | None = None
+    nominal: float | None = None
+
+
+def blocks(name: str, sensor: Sensor, block: float = 0.5) -> list[Block]:
+    """Blocks of a sensor, cut at gaps and restarts."""
+    length = round(block * sensor.rate)
+    n = len(sensor.counts)
+    cuts = {*range(0, n, length), n, *sensor.restarts}
+    cuts |= {edge for gap in sensor.gaps for edge in gap}
+    edges = sorted(cuts)
+    found = []
+    for first, end in itertools.pairwise(edges):
+        if any(low <= first < high for low, high in sensor.gaps):
+            continue
+        arrival = round((sensor.start + (end - 1) / sensor.rate + sensor.late) * 1e9)
+        flags, counter = BlockFlag.NONE, None
+        if sensor.utc:
+            flags = BlockFlag.DEVICE_UTC
+            stated = sensor.start + first / sensor.rate + sensor.utc_ahead
+            counter = ORIGIN.utc_ns + round(stated * 1e9)
+        if first == 0 or first in sensor.restarts:
+            flags |= BlockFlag.CLOCK_RESTART
+        found.append(
+            Block(
+                name,
+                first,
+                sensor.counts[first:end],
+                HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
+                device_counter=counter,
+                flags=flags,
+            )
+        )
+    return found
+
+
+def create(path: Path, sensors: dict[str, Sensor]) -> RecordingWriter:
+    """Return a writer with these sensors and nothing in it."""
+    layouts = []
+    for name, sensor in sensors.items():
+        channels = tuple(
+            Channel(
+                name=f"c{number}",
+                unit=sensor.unit,
+                **({"sensitivity": 1.0} | (sensor.channel or {})),
+            )
+            for number in range(sensor.counts.shape[1])
+        )
+        layouts.append(
+            SensorLayout(
+                name,
+                channels,
+                sensor.nominal or sensor.rate,
+                sensor.counts.dtype,
+                clock=sensor.clock,
+            )
+        )
+    return RecordingWriter.create(path, sensors=layouts, created=ORIGIN)
+
+
+def write(path: Path, sensors: dict[str, Sensor]) -> Path:
+    """Write and close a recording."""
+    writer = create(path, sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            writer.append(block)
+    writer.close()
+    return path
+
+
+def counts(n_samples: int, n_channels: int, seed: int) -> NDArray[np.int32]:
+    """White integers."""
+    rng = np.random.default_rng(seed)
+    return rng.integers(-10_000, 10_000, (n_samples, n_channels), dtype=np.int32)

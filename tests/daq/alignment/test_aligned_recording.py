@@ -1,0 +1,399 @@
+"""The common grid: what passes, what is interpolated, what is invalid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.alignment.aligned_recording import AlignedRecording
+from daq.alignment.resampling import reach
+from daq.errors import CannotAlignError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import HostTime
+from daq.recording.reader import Recording
+from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+def test_sensors_of_one_clock_pass_bit_exact_however_the_reading_is_cut(tmp_path: Path) -> None:
+    raw = {name: counts(5000, 2, seed) for seed, name in enumerate("abc")}
+    path = write(tmp_path / "r.h5", {n: Sensor(c, clock="one") for n, c in raw.items()})
+    with Recording.open(path) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        assert aligned.n_available == 5000
+        assert aligned.dims == (2, 2, 2)
+        whole, valid = aligned.read(0, 5000)
+        assert valid.all()
+        assert np.array_equal(whole, np.hstack([*raw.values()]).astype(float))
+        assert np.array_equal(aligned.read(1234, 4321)[0], whole[1234:4321])
+
+
+def test_exact_times_align_whole_samples_and_name_the_start(tmp_path: Path) -> None:
+    raw = {name: counts(3000, 1, seed) for seed, name in enumerate("abc")}
+    starts = {"a": 0.0055, "b": 0.1255, "c": 0.0355}  # 12 and 3 samples later
+    sensors = {n: Sensor(c, utc=True, start=starts[n]) for n, c in raw.items()}
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert len(samples) == 3000 - 12
+        assert valid.all()
+        expected = [raw["a"][12:, 0], raw["b"][:2988, 0], raw["c"][9:2997, 0]]
+        assert np.array_equal(samples, np.stack(expected, axis=1).astype(float))
+        assert aligned.start_utc_ns == 1_468_458_000_125_500_000
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.3, 30.0, -30.0, 10_800.0])  # of the host's UTC
+def test_a_sensor_with_utc_meets_those_without_whatever_the_host_takes_utc_for(
+    tmp_path: Path, ahead: float
+) -> None:
+    sensors = {
+        "a": Sensor(counts(3000, 1, 1), start=0.5),
+        "b": Sensor(counts(3000, 1, 2), start=0.7, utc=True, utc_ahead=ahead),
+        "c": Sensor(counts(3000, 1, 3), start=0.6, utc=True, utc_ahead=ahead),
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        offsets = [clock.offset for clock in aligned.clocks]
+        assert offsets == pytest.approx([0.5, 0.7, 0.6], abs=1e-3)
+        assert offsets[1] - offsets[2] == pytest.approx(0.1, abs=1e-9)
+        assert 2800 < aligned.n_available < 3000
+
+
+def test_a_device_whose_channels_are_out_of_step_is_slow_and_not_wrong(tmp_path: Path) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=7.5),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, seconds in (("a", 0.5), ("b", 10.0)):
+        for block in blocks(name, sensors[name], seconds):
+            writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        delays = AlignedRecording(recording).delays(np.array([3000.0]))
+        assert np.ptp(delays) < 1e-3
+
+
+@pytest.mark.parametrize("ahead", [3, -40])
+def test_wrong_utc_until_a_device_finds_the_right_one_moves_nothing(
+    tmp_path: Path, ahead: int
+) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            stated = block.device_counter
+            if stated is not None and block.first_sample < 500:
+                stated += ahead * 10**9
+            writer.append(replace(block, device_counter=stated))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
+        assert np.ptp(aligned.delays(at)) < 1e-3
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_gap_is_invalid_for_all_and_nothing_else_is(tmp_path: Path, shared: bool) -> None:
+    clock = {name: "one" if shared else name for name in "abc"}
+    sensors = {n: Sensor(counts(4000, 1, ord(n)), clock=clock[n]) for n in "abc"}
+    sensors["b"].gaps = ((1530, 1571),)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        _, valid = aligned.read(0, aligned.n_available)
+        invalid = np.flatnonzero(~valid)
+        # Interpolated samples need their neighbours as well.
+        margin = 0 if shared else reach()
+        start = 0 if shared else reach()
+        assert invalid[0] + start >= 1530 - margin - 1
+        assert invalid[-1] + start <= 1570 + margin + 1
+        assert np.all(np.diff(invalid) == 1)
+        assert len(invalid) >= 41
+
+
+def _band_limited(times: NDArray[np.float64], seed: int, edge: float) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    frequency = rng.uniform(0.2, edge, 40)
+    phase = rng.uniform(0, 2 * np.pi, 40)
+    return np.asarray(np.cos(2 * np.pi * np.outer(times, frequency) + phase).sum(axis=1))
+
+
+def test_free_running_sensors_meet_on_the_grid(tmp_path: Path) -> None:
+    sensors = {}
+    for name, ppm, start in (("a", 0.0, 0.0), ("b", 18.0, 0.0123), ("c", -20.0, 0.0371)):
+        rate = 100.0 * (1 + ppm * 1e-6)
+        times = start + np.arange(60_000) / rate
+        signal = np.round(1e6 * _band_limited(times, 3, 44.0)).astype(np.int32)
+        sensors[name] = Sensor(signal[:, None], rate=rate, nominal=100.0, start=start, clock=name)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert not aligned.is_exact
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert valid.all()
+        for column in (1, 2):
+            error = samples[:, column] - samples[:, 0]
+            # Arrival times to 1 ns; the interpolation's 100 dB; quantisation far below.
+            assert np.std(error) < 1e-5 * np.std(samples[:, 0])
+        for state, ppm in zip(aligned.clocks, (0.0, 18.0, -20.0), strict=True):
+            assert state.ppm == pytest.approx(ppm, abs=0.01)
+
+
+def test_unequal_rates_meet_at_the_lower_without_aliases(tmp_path: Path) -> None:
+    times = {"a": np.arange(20_000) / 100.0, "b": np.arange(50_000) / 250.0}
+    sensors = {}
+    for name, rate in (("a", 100.0), ("b", 250.0)):
+        signal = 1e6 * _band_limited(times[name], 5, 40.0)
+        if rate > 100:
+            signal += 1e6 * np.cos(2 * np.pi * 90 * times[name])
+        sensors[name] = Sensor(np.round(signal).astype(np.int32)[:, None], rate=rate, clock=name)
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.sampling_rate == 100.0
+        samples, valid = aligned.read(0, aligned.n_available)
+        inner = samples[valid]
+        assert np.std(inner[:, 1] - inner[:, 0]) < 1e-5 * np.std(inner[:, 0])
+
+
+def test_a_restart_gets_a_clock_of_its_own(tmp_path: Path) -> None:
+    first = Sensor(counts(3000, 1, 1), clock="a")
+    other = Sensor(counts(3000, 1, 2), clock="b", restarts=(1500,))
+    writer = create(tmp_path / "r.h5", {"a": first, "b": other})
+    for block in blocks("a", first):
+        writer.append(block)
+    for block in blocks("b", other):
+        late = 3_700_000 if block.first_sample >= 1500 else 0  # restarted 0.37 samples later
+        at = type(block.received)(block.received.monotonic_ns + late, block.received.utc_ns + late)
+        writer.append(type(block)("b", block.first_sample, block.counts, at, flags=block.flags))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert [state.n_epochs for state in aligned.clocks] == [1, 2]
+        delays = aligned.delays(np.array([500.0, 2500.0]))
+        moved = (delays[1] - delays[0])[1] - (delays[1] - delays[0])[0]
+        assert moved == pytest.approx(3.7e-3, abs=1e-5)
+
+
+def test_blocks_beyond_those_taken_at_once_go_on_where_the_others_ended(tmp_path: Path) -> None:
+    raw = {name: counts(17_000, 1, seed) for seed, name in enumerate("ab")}  # a block each
+    gaps = ((16_384, 16_386),)
+    sensors = {n: Sensor(c, 10.0, clock="one", gaps=gaps) for n, c in raw.items()}
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor, 0.1):
+            writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert len(recording.sensors[0].blocks) == 16_998
+        assert len(samples) == 17_000
+        assert np.flatnonzero(~valid).tolist() == [16_384, 16_385]
+        assert np.array_equal(samples[valid], np.hstack([*raw.values()])[valid].astype(float))
+
+
+def test_a_growing_file_is_read_as_far_as_it_is_committed(tmp_path: Path) -> None:
+    sensors = {name: Sensor(counts(2000, 1, ord(name)), clock="one") for name in "abc"}
+    writer = create(tmp_path / "r.h5", sensors)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.n_available == 0
+        written = {name: blocks(name, sensor) for name, sensor in sensors.items()}
+        for some in written.values():
+            for block in some[:20]:
+                writer.append(block)
+        committed = min(each.rows for each in writer.commit().sensors.values())
+        aligned.refresh()
+        assert aligned.n_available == committed >= 900
+        with pytest.raises(CannotAlignError, match=f"{committed} available"):
+            aligned.read(900, 1100)
+        for some in written.values():
+            for block in some[20:]:
+                writer.append(block)
+        writer.close()
+        aligned.refresh()
+        assert aligned.n_available == 2000
+        assert np.array_equal(aligned.read(0, 2000)[0][:, 1], sensors["b"].counts[:, 0])
+
+
+def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
+    sensors = {name: Sensor(counts(500, 1, 1), clock="one") for name in "abc"}
+    with (
+        Recording.open(write(tmp_path / "r.h5", sensors)) as recording,
+        pytest.raises(CannotAlignError, match="ask for 100 Hz or less"),
+    ):
+        AlignedRecording(recording, sampling_rate=200.0)
+
+
+@pytest.mark.parametrize("begun", [0.0, 8.0])  # seconds after the recording was created
+def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(
+    tmp_path: Path, begun: float
+) -> None:
+    raw = counts(5000, 1, 8)
+    sensors = {
+        "a": Sensor(raw[:4000], clock="one", start=begun),
+        "b": Sensor(raw[137:4600], clock="one", start=begun + 1.37, late=1.2e-3),
+        "c": Sensor(raw[60:4700], clock="one", start=begun + 0.60, late=2.9e-3, restarts=(2000,)),
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert valid.all()
+        assert len(samples) == 4000 - 137
+        assert np.array_equal(samples, np.repeat(raw[137:4000], 3, axis=1).astype(float))
+        assert [clock.source for clock in aligned.clocks] == [
+            "clock of one",
+            *["clock of one, whole samples apart by arrival times"] * 2,
+        ]
+
+
+def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    motion = np.cumsum(rng.standard_normal((12_200, 1)), axis=0)
+
+    def seen(first: int, seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
+        return np.round(1e5 * (motion[first : first + 12_000] + 0.01 * noise)).astype(np.int32)
+
+    sensors = {
+        "a": Sensor(seen(0, 1), clock="one"),
+        "b": Sensor(seen(0, 2), clock="one"),
+        "c": Sensor(seen(50, 3), clock="one", start=0.5, late=27e-3),  # nearly three samples late
+    }
+    path = write(tmp_path / "r.h5", sensors)
+    apart = {}
+    for clocks in ("arrivals", "refined"):
+        snapshot = estimate([path], Settings(segment=4.0, clocks=clocks))
+        apart[clocks] = -100.0 * (snapshot.drift[:, 3] - snapshot.drift[:, 1])
+        assert snapshot.clocks[1].source == "clock of one"  # with "a" in every block
+    assert np.allclose(apart["arrivals"], -53.0)
+    assert np.allclose(apart["refined"], -50.0)
+    assert snapshot.clocks[2].source == "clock of one, whole samples apart by samples"
+    assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
+
+
+def test_a_first_sensor_that_hears_noise_only_keeps_no_other_from_being_refined(
+    tmp_path: Path,
+) -> None:
+    motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
+
+    def seen(seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
+        return np.round(1e5 * (motion + 0.01 * noise)).astype(np.int32)
+
+    sensors = {
+        "a": Sensor(counts(12_000, 1, 4)),
+        "b": Sensor(seen(1)),
+        "c": Sensor(seen(2)),
+        "d": Sensor(seen(3), late=27e-3),  # nearly three samples
+    }
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], Settings(segment=4.0))
+    assert [clock.refined for clock in snapshot.clocks] == [False, False, True, True]
+    apart = snapshot.drift[:, 3:] - snapshot.drift[:, 2:3]
+    assert np.abs(apart).max() < 1e-4  # 2.7e-2 by arrival times
+
+
+def test_an_hour_of_suspend_is_a_short_gap_and_clocks_meet_again_behind_it(tmp_path: Path) -> None:
+    # CLOCK_MONOTONIC stands still in suspend; the sensors' counters do not.
+    hour, n_before, n_after = 3600.0, 30_000, 30_000
+    writer_of, found = {}, []
+    for name, ppm, start in (("a", 0.0, 0.0), ("b", 18.0, 0.0123), ("c", -20.0, 0.0371)):
+        rate = 100.0 * (1 + ppm * 1e-6)
+        lost = round(hour * rate)
+        index = np.concatenate([np.arange(n_before), n_before + lost + np.arange(n_after)])
+        times = start + index / rate
+        signal = np.round(1e6 * _band_limited(times, 3, 44.0)).astype(np.int32)
+        sensor = Sensor(signal[:, None], rate=rate, nominal=100.0, start=start, clock=name)
+        writer_of[name] = sensor
+        for block in blocks(name, sensor):
+            if block.first_sample < n_before:
+                found.append(block)
+                continue
+            # It counts on; the host has slept for all of the hour.
+            arrival = start + (block.end_sample + lost - 1) / rate - hour + sensor.late
+            shift = round(arrival * 1e9) + ORIGIN.monotonic_ns - block.received.monotonic_ns
+            at = HostTime(block.received.monotonic_ns + shift, block.received.utc_ns + shift)
+            found.append(replace(block, first_sample=block.first_sample + lost, received=at))
+    writer = create(tmp_path / "r.h5", writer_of)
+    for block in found:
+        writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        assert [clock.n_epochs for clock in aligned.clocks] == [2, 2, 2]
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert n_before + n_after - 200 < len(samples) < n_before + n_after
+        assert np.count_nonzero(~valid) < 200  # two seconds, with the kernel's neighbours
+        middle = int(np.flatnonzero(~valid)[0])
+        for rows in (slice(0, middle), slice(middle + 200, None)):
+            for column in (1, 2):
+                error = samples[rows, column] - samples[rows, 0]
+                assert np.std(error) < 1e-4 * np.std(samples[rows, 0])
+
+
+@pytest.mark.parametrize(("late", "missed"), [(2e-4, 0), (7.3e-3, 0), (7.3e-3, 130)])
+def test_a_sensor_wired_twice_is_named_and_stops_nothing(
+    tmp_path: Path, late: float, missed: int
+) -> None:
+    motion = np.cumsum(np.random.default_rng(1).standard_normal((16_000, 2)), axis=0)
+
+    def seen(seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal(motion.shape)
+        return np.round(1e4 * (motion + 0.05 * noise)).astype(np.int32)
+
+    twice = seen(2)
+    sensors = {n: Sensor(c) for n, c in (("a", seen(1)), ("b", twice), ("c", seen(3)))}
+    restarts = (6000,) if missed else ()  # of one of the wires
+    sensors["d"] = Sensor(twice[missed:], start=missed / 100.0, late=late, restarts=restarts)
+    methods = ("three-sensor", "maximum-likelihood")
+    path = write(tmp_path / "r.h5", sensors)
+    snapshot = estimate([path], Settings(segment=4.0, methods=methods))
+    problems = [each.text for each in snapshot.diagnostics["advice"] if each.level == "problem"]
+    assert problems[0].startswith("d.c0 repeats b.c0 and d.c1 repeats b.c1")
+    apart = snapshot.drift[:, 4] - snapshot.drift[:, 2]
+    assert np.abs(apart - missed / 100.0).max() < 1e-6
+    for method in methods:
+        assert np.isfinite(snapshot.results[method].noise_psd[4:160, [0, 1, 4, 5]]).all()
+
+
+def test_coarse_counts_that_are_equal_by_chance_at_first_are_not_one_sensor(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    tones, phases = rng.uniform(0.5, 40.0, (100, 1)), rng.uniform(0.0, 2 * np.pi, (100, 1))
+
+    def seen(ppm: float) -> Sensor:  # without noise, from the same instant on
+        rate = 100.0 * (1 + ppm * 1e-6)
+        motion = np.sin(2 * np.pi * tones * np.arange(12_000) / rate + phases).sum(axis=0)
+        return Sensor(np.round(motion / 14)[:, None].astype(np.int32), rate=rate, nominal=100.0)
+
+    sensors = {"a": seen(0.0), "b": seen(10.0)}
+    assert np.array_equal(sensors["a"].counts[:500], sensors["b"].counts[:500])
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        rates = [state.ppm for state in AlignedRecording(recording).clocks]
+    assert rates == pytest.approx([0.0, 10.0], abs=0.01)
+
+
+def test_a_shared_clock_has_a_rate_too(tmp_path: Path) -> None:
+    rate = 100.0 * (1 + 18e-6)
+    sensors = {
+        n: Sensor(counts(60_000, 1, 1), rate=rate, nominal=100.0, clock="one") for n in "abc"
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        for state in aligned.clocks:
+            assert state.ppm == pytest.approx(18.0, abs=0.01)
+            assert state.ppm_std < 0.01

@@ -1,0 +1,363 @@
+"""The bench file: what is read, and every way it can be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, ConfigDict
+
+from daq.bench.durations import format_duration, parse_duration
+from daq.bench.loading import dump, load, parse
+from daq.bench.model import Bench, PolesZeros
+from daq.drivers import bench_file
+from daq.errors import BenchFileError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.drivers.interface import DriverType
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    baud_rate: int = 9600
+    mode: Literal["auto", "manual"] = "auto"
+
+
+@dataclass(frozen=True)
+class _Driver:
+    """As much of a DriverType as a bench file needs."""
+
+    name: str
+    shares_clock: bool = False
+    settings: type[BaseModel] = _Settings
+
+
+DRIVERS = cast(
+    "dict[str, DriverType]", {"serial": _Driver("serial"), "scan": _Driver("scan", True)}
+)
+
+HEAD = """\
+name = "floor"
+sampling_rate = 200
+"""
+
+
+def sensor_text(name: str, *, port: str = "", driver: str = "serial", extra: str = "") -> str:
+    return f"""
+[[sensors]]
+name = "{name}"
+driver = "{driver}"
+port = "{port or "/dev/" + name}"
+{extra}
+[[sensors.channels]]
+name = "x"
+sensitivity = 1e6
+[[sensors.channels]]
+name = "y"
+sensitivity = 1e6
+"""
+
+
+THREE = "".join(sensor_text(name) for name in ("a", "b", "c"))
+
+
+def read(text: str) -> Bench:
+    return parse(text, "bench.toml", drivers=DRIVERS)
+
+
+def faults(text: str) -> list[str]:
+    with pytest.raises(BenchFileError) as caught:
+        read(text)
+    return str(caught.value).splitlines()
+
+
+def test_a_small_bench() -> None:
+    bench = read(HEAD + THREE)
+    assert [sensor.sampling_rate for sensor in bench.sensors] == [200.0] * 3
+    assert bench.estimate.segment == 10.0
+    assert bench.text == HEAD + THREE
+    assert bench.sensor("b").clock_name(shares_clock=DRIVERS["serial"].shares_clock) == "b"
+    assert bench.sensor("b").clock_name(shares_clock=DRIVERS["scan"].shares_clock) == "/dev/b"
+    assert list(bench.ports()) == ["/dev/a", "/dev/b", "/dev/c"]
+
+
+def test_relative_directories_are_beside_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(HEAD + THREE, encoding="utf-8")
+    loaded = parse(path.read_text(encoding="utf-8"), path, drivers=DRIVERS)
+    assert loaded.recording_directory == tmp_path / "recordings"
+    assert loaded.source == path
+
+
+def test_an_absent_file(tmp_path: Path) -> None:
+    with pytest.raises(BenchFileError, match=r"none\.toml: cannot be read: No such file"):
+        load(tmp_path / "none.toml")
+
+
+def test_dump_parses_to_the_same_bench() -> None:
+    text = (
+        HEAD
+        + THREE
+        + """
+[sensors.channels.response]
+poles = [[-1.0, 2.0], -3.0]
+zeros = [0]
+[estimate]
+segment = "20s"
+band = [0.5, 50]
+method = "all"
+reject = false
+octaves = true
+dimension = "auto"
+gains = {b = 1.02, "c.x" = 1}
+[recording]
+duration = "1h"
+[[limits]]
+name = "quiet \\"floor\\""
+frequency = [1, 10]
+psd = [1e-12, 1e-13]
+[simulation]
+speed = 4
+seed = 1
+[simulation.motion]
+psd = [[1, 2], [3, 4]]
+"""
+    )
+    bench = read(text)
+    assert bench.speed == 4.0
+    assert read(dump(bench)).model_dump() == bench.model_dump()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name = 3\n", "bench.toml: name = 3: expected a valid string"),
+        ('sampling_rate = "200"\n', 'sampling_rate = "200": expected a valid number'),
+        (
+            '[estimate]\nsegment = "fast"\n',
+            'estimate.segment = "fast": expected a positive duration',
+        ),
+        (
+            sensor_text("d").replace("/dev/d", ""),
+            'sensors["d"].port = "": expected a port, such as /dev/ttyUSB0',
+        ),
+        ('[estimate]\nwindow = "han"\n', "(did you mean 'hann'?)"),
+        ('[estimate]\nwindow = "kaiser"\n', "its parameter as well, above 0, as in kaiser,0.5"),
+        ('[estimate]\nmethod = "three_sensor"\n', "(did you mean 'three-sensor'?)"),
+        (
+            '[estimate]\nsegmnt = "1s"\n',
+            'estimate.segmnt = "1s": unknown key; expected one of segment',
+        ),
+        (
+            '[estimate]\nsegment = "10ms"\n',
+            'estimate.segment = "0.01s": expected at least 0.08s, 16 samples at 200 Hz',
+        ),
+        (
+            "[estimate]\nband = [0.01, 50]\n",
+            "estimate.band = [0.01, 50.0]: expected [low, high] Hz from 0.1",
+        ),
+        (
+            '[estimate]\nreject = "yes"\n',
+            'estimate.reject = "yes": expected a valid boolean',
+        ),
+        ("[estimate]\noctaves = 1\n", "estimate.octaves = 1: expected a valid boolean"),
+        (
+            '[estimate]\ndimension = "all"\n',
+            'estimate.dimension = "all": expected "auto", or a number of dimensions such as 3',
+        ),
+        (
+            '[estimate]\nmethod = "maximum-likelihood"\ndimension = 4\n',
+            "estimate.dimension = 4: expected at most 3: more cannot be told from the noise of 6",
+        ),
+        (
+            "[estimate]\ndimension = 2\n",
+            'estimate.dimension = 2: expected with method = "maximum-likelihood" or "all" only',
+        ),
+        (
+            "[estimate]\ngains = {b = 1.1}\n",
+            'expected with method = "two-channel" or "all" only, not "three-sensor"',
+        ),
+        (
+            '[estimate]\nmethod = "two-channel"\ngains = {b = 0}\n',
+            "estimate.gains.b = 0: expected a number other than 0, such as 1.02",
+        ),
+        (
+            '[estimate]\nmethod = "all"\ngains = {"b.z" = 2}\n',
+            'estimate.gains["b.z"] = 2.0: expected one of a, b, c, a.x',
+        ),
+        ("[estimate]\noverlap = 1\n", "estimate.overlap = 1: expected less than 1"),
+        (
+            '[recording]\nduration = "30s"\n',
+            '"30s": expected at least 35s: 5 segments of 10s are fewer than the 6 channels',
+        ),
+        (
+            '[schedule]\ncron = ["every day"]\n',
+            'schedule.cron[1] = "every day": expected a cron line',
+        ),
+        ('[schedule]\ntime_zone = "Mars"\n', 'schedule.time_zone = "Mars": expected a time zone'),
+        ("[simulation]\nspeed = 0\n", "simulation.speed = 0: expected a positive number"),
+        (
+            '[[limits]]\nname = "n"\nfrequency = [2, 1]\npsd = [1, 1]\n',
+            'limits["n"].frequency = [2.0, 1.0]: expected rising',
+        ),
+        (
+            '[[limits]]\nname = "n"\nfrequency = [1, 2]\npsd = [1, 1]\nsensors=["d"]\n',
+            'limits["n"].sensors = "d": expected one of a, b, c',
+        ),
+        (sensor_text("a"), 'sensors["a"].name = "a": used 2 times; expected once'),
+        (
+            sensor_text("d", driver="seral"),
+            ".driver = \"seral\": expected one of serial, scan (did you mean 'serial'?)",
+        ),
+        (
+            sensor_text("d", port="/dev/a", driver="scan"),
+            "expected \"serial\", which sensor 'a' uses on the same port /dev/a",
+        ),
+        (
+            sensor_text("d", extra="settings = {mode = 'odd'}"),
+            "sensors[\"d\"].settings.mode = \"odd\": expected 'auto' or 'manual'",
+        ),
+        (
+            sensor_text("d", extra="settings = {mood = 1}"),
+            "mood = 1: unknown key; expected one of baud_rate, mode (did you mean 'mode'?)",
+        ),
+        (sensor_text("d", extra="sampling_rate = 100"), "expected at least the bench's 200 Hz"),
+        (
+            sensor_text("d") + "[[sensors.channels]]\nname='z'\nsensitivity=1.0\n",
+            'sensors["d"].channels = "3 channels": expected 2',
+        ),
+        (
+            sensor_text("d") + "[[sensors.channels]]\nname='x'\nsensitivity=1.0\nauxiliary=true",
+            'sensors["d"].channels["x"].name = "x": used 2 times',
+        ),
+        (
+            sensor_text("d") + "[[sensors.channels]]\nsensitivity=1.0\nauxiliary=true",
+            'sensors["d"].channels[3].name: is missing; expected the channel\'s name',
+        ),
+        (
+            sensor_text("d") + "[[sensors.channels]]\nname='t'\nsensitivity=0\nauxiliary=true",
+            'sensors["d"].channels["t"]: sensitivity: expected counts per unit, not zero',
+        ),
+        (sensor_text("d/e"), "expected a printable name without '/'"),
+        (
+            sensor_text("d", port="/dev/s", driver="scan")
+            + sensor_text("e", port="/dev/s", driver="scan", extra="sampling_rate=400"),
+            "expected 200 Hz, as sensor 'd' on the same clock",
+        ),
+    ],
+)
+def test_each_fault_names_file_key_value_and_what_was_expected(text: str, expected: str) -> None:
+    keys = text.partition("=")[0].strip()
+    head = "\n".join(line for line in HEAD.splitlines() if not line.startswith(f"{keys} ="))
+    top = text if text.startswith(("name", "sampling_rate")) else ""
+    found = faults(f"{head}\n{top}{THREE}{'' if top else text}")
+    assert len(found) == 1, found
+    assert found[0].startswith("bench.toml: ")
+    assert expected in found[0]
+
+
+def test_too_few_sensors() -> None:
+    found = faults(HEAD + sensor_text("a") + sensor_text("b"))
+    assert found == [
+        "bench.toml: sensors = \"2 sensors\": expected at least 3 for method 'three-sensor'"
+    ]
+    method = '[estimate]\nmethod = "two-channel"\n'
+    assert len(read(HEAD + sensor_text("a") + sensor_text("b") + method).sensors) == 2
+
+
+def test_all_faults_at_once() -> None:
+    text = """
+sampling_rate = -1
+colour = "red"
+[estimate]
+detrend = "quadratic"
+[[sensors]]
+name = "a"
+driver = "serila"
+port = "p"
+[[sensors.channels]]
+name = "x"
+sensitivity = "big"
+[[sensors]]
+name = "b"
+driver = "serial"
+port = "q"
+settings = {baud_rate = "fast"}
+[[sensors.channels]]
+name = "x"
+sensitivity = 1
+"""
+    found = "\n".join(faults(text))
+    for expected in (
+        "name: is missing; expected the bench's name",
+        "sampling_rate = -1: expected greater than 0",
+        'colour = "red": unknown key',
+        'estimate.detrend = "quadratic": expected',
+        'sensors["a"].channels["x"].sensitivity = "big": expected a valid number',
+        'sensors["a"].driver = "serila"',
+        'sensors["b"].settings.baud_rate = "fast": expected a valid integer',
+    ):
+        assert expected in found
+
+
+def test_what_a_device_cannot_do_is_said_without_it() -> None:
+    text = HEAD.replace("200", "201") + sensor_text("A", driver="epson")
+    with pytest.raises(BenchFileError, match=r'sensors\["A"\]: .*sampling_rate = 201'):
+        bench_file.parse(text)
+
+
+def test_not_toml_says_where() -> None:
+    assert "at line 1, column" in faults("name = = 3")[0]
+
+
+def test_a_recorded_bench_is_read_without_its_drivers() -> None:
+    bench = parse(HEAD + sensor_text("a", driver="elsewhere"), "recording")
+    assert bench.sensors[0].driver == "elsewhere"
+
+
+@given(st.floats(1e-3, 1e7, allow_nan=False))
+def test_durations_come_back(seconds: float) -> None:
+    assert parse_duration(format_duration(seconds)) == pytest.approx(seconds, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("10s", 10),
+        ("90 min", 5400),
+        ("3h", 10800),
+        ("1d 12h", 129600),
+        ("1.5 h", 5400),
+        ("7", 7),
+        ("250ms", 0.25),
+        (2.5, 2.5),
+    ],
+)
+def test_durations(text: str | float, seconds: float) -> None:
+    assert parse_duration(text) == pytest.approx(seconds)
+
+
+def test_no_time_at_all_is_a_duration_where_that_makes_sense() -> None:
+    assert parse_duration("0s", zero=True) == 0
+
+
+@pytest.mark.parametrize("text", ["", "s", "-1s", "1h 30", "3 parsecs", "0", "1 2", True])
+def test_not_durations(text: str | float) -> None:
+    with pytest.raises(ValueError, match="expected a positive duration"):
+        parse_duration(text)
+
+
+def test_poles_and_zeros_are_one_at_their_frequency() -> None:
+    response = PolesZeros(
+        zeros=(0j, 0j), poles=(-0.1 + 0.1j, -0.1 - 0.1j, -300 + 0j), frequency=2.0
+    )
+    assert abs(response.at(np.array([2.0]))[0]) == pytest.approx(1.0, rel=1e-12)
+    # Two zeros at the origin over a pair of poles: 12 dB an octave well below the corner.
+    low = np.abs(response.at(np.array([1e-4, 2e-4])))
+    assert low[1] / low[0] == pytest.approx(4.0, rel=1e-3)

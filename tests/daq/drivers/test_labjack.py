@@ -1,0 +1,262 @@
+"""LabJack driver and simulated digitizer: three sensors on one, both stream modes."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel, Sensor
+from daq.drivers.registry import driver_type
+from daq.errors import (
+    BenchFileError,
+    DeviceError,
+    NoAnswerError,
+    NotConnectedError,
+    WrongDeviceError,
+)
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.labjack.registers import actual_scan_rate
+from sim_devices.server import launch
+from sim_devices.world.world import World
+from tests.daq.drivers.reading import reading
+from tests.sim_devices.simulated_bench import scenario, spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sim_devices.server.launch import RunningDevice
+
+SPEED = 4.0
+RATE = 200.0
+TICKS = 200_000
+COUNTS = 3166.5 * 100
+CENTER = 33523
+DRIVER = driver_type("labjack")
+NAMES = ("A", "B", "C")
+
+
+def table(names: Sequence[str] = NAMES, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
+    channels = [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]
+    return {
+        "sensors": list(names),
+        "driver": "labjack",
+        "port": "tcp",
+        "sampling_rate": RATE,
+        "channels": dict.fromkeys(names, channels),
+        **changes,
+    }
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    tables = [
+        table(serial_number="470001234"),
+        table(["F"], settings={"ends_with": 2945, "ends_after": 400}),
+    ]
+    with launch.start(spec(*tables, speed=SPEED, sampling_rate=RATE)) as devices:
+        yield devices
+
+
+def bench(
+    one: RunningDevice,
+    *,
+    own: dict[str, dict[str, Any]] | None = None,
+    **changes: Any,  # noqa: ANN401
+) -> list[Sensor]:
+    settings = changes.pop("settings", {})
+    return [
+        Sensor(
+            **{
+                "name": name,
+                "driver": "labjack",
+                "port": one.port,
+                "sampling_rate": RATE,
+                "settings": {**one.settings, **settings, **(own or {}).get(name, {})},
+                "channels": tuple(Channel(name=a, sensitivity=COUNTS) for a in "xyz"),
+                **changes,
+            }
+        )
+        for name in one.sensors
+    ]
+
+
+async def record(some: list[Sensor], n_samples: int) -> tuple[dict[str, list[Block]], list[Event]]:
+    blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in some}
+    events: list[Event] = []
+    async with reading(DRIVER, some, speed=SPEED) as items:
+        async for item in items:
+            if isinstance(item, Event):
+                events.append(item)
+                continue
+            blocks[item.sensor].append(item)
+            if item.sensor == some[-1].name and item.end_sample >= n_samples:
+                break
+    return blocks, events
+
+
+def joined(blocks: list[Block]) -> NDArray[Any]:
+    return np.concatenate([b.counts for b in blocks])
+
+
+@pytest.mark.parametrize("mode", ["spontaneous", "command-response"])
+@pytest.mark.parametrize("core_timer", [True, False])
+async def test_three_sensors_on_one_digitizer(
+    running: tuple[RunningDevice, ...], mode: str, core_timer: bool
+) -> None:
+    some = bench(running[0], settings={"mode": mode, "core_timer": core_timer})
+    found, events = await record(some, 400)
+    assert not events
+    truth = World(scenario(NAMES, sampling_rate=RATE))
+    before = None
+    for name in NAMES:
+        blocks = found[name]
+        assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+        assert blocks[0].flags == BlockFlag.CLOCK_RESTART
+        counts = joined(blocks)[:400]
+        assert counts.dtype == np.uint16
+        if core_timer:
+            assert all(
+                b.device_counter == (blocks[0].device_counter or 0) + b.first_sample * TICKS
+                for b in blocks
+            )
+            before = (blocks[0].device_counter or 0) // TICKS % (2**32 // TICKS)
+        if before is None:
+            continue
+        index = next(
+            i
+            for wraps in range(3)
+            if np.abs(
+                truth.samples(name, i := round(before + wraps * 2**32 / TICKS), 1) * COUNTS
+                + CENTER
+                - counts[0]
+            ).max()
+            <= 0.5
+        )
+        expected = truth.samples(name, index, 400) * COUNTS + CENTER
+        assert np.abs(expected - counts).max() <= 0.5
+
+
+async def test_all_sensors_have_one_index(running: tuple[RunningDevice, ...]) -> None:
+    found, _ = await record(bench(running[0]), 400)
+    starts = {name: [b.first_sample for b in blocks][:3] for name, blocks in found.items()}
+    assert starts["A"] == starts["B"] == starts["C"]
+    assert DRIVER.shares_clock
+
+
+async def test_inputs_may_be_any(running: tuple[RunningDevice, ...]) -> None:
+    """The simulated inputs are A's x, y, z on AIN0-2, B's on AIN3-5, C's on AIN6-8."""
+    own: dict[str, dict[str, Any]] = {
+        "A": {"inputs": ["AIN8", 0, "ain4"]},
+        "B": {"inputs": [1, 2, 3]},
+        "C": {"inputs": [5, 6, 7]},
+    }
+    found, _ = await record(bench(running[0], own=own), 600)
+    straight, _ = await record(bench(running[0]), 600)
+    mixed = np.hstack([joined(found[n])[:600] for n in NAMES]).std(axis=0)
+    plain = np.hstack([joined(straight[n])[:600] for n in NAMES]).std(axis=0)
+    assert mixed == pytest.approx(plain[[8, 0, 4, 1, 2, 3, 5, 6, 7]], rel=0.4)
+    a = joined(found["A"]).astype(float)[:, 2] - CENTER
+    b = joined(found["B"]).astype(float)[:, 0] - CENTER  # AIN4 and AIN1: both y
+    assert np.corrcoef(a, b)[0, 1] > 0.999
+
+
+async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+    some = bench(running[0], sampling_rate=333.0, serial_number="470001234")
+    async with DRIVER.open(some, SystemClock(SPEED)) as session:
+        information = session.information
+    assert [i.sensor for i in information] == list(NAMES)
+    assert information[0].model == "LabJack T7"
+    assert information[0].serial_number == "470001234"
+    assert information[0].firmware == "1.0292"
+    assert information[0].temperature == pytest.approx(25.0)
+    assert information[0].sampling_rate == pytest.approx(actual_scan_rate(333.0), rel=1e-12)
+    assert information[1].details == {
+        "inputs": "AIN3, AIN4, AIN5",
+        "range": "±10 V",
+        "counts per volt": "3166.5029",
+        "counts per volt, negative": "3166.5029",
+        "counts at 0 V": "33523",
+    }
+
+
+async def test_a_stream_that_breaks_off_is_started_anew(running: tuple[RunningDevice, ...]) -> None:
+    found, events = await record(bench(running[1]), 1200)
+    blocks = found["F"]
+    assert [e.text for e in events] == ["the buffer is full (2945)"]
+    again = next(b for b in blocks if b.reason)
+    assert again.flags == BlockFlag.CLOCK_RESTART
+    assert again.reason == "the buffer is full"
+    before = blocks[blocks.index(again) - 1]
+    assert before.end_sample == 400
+    ticks = (again.device_counter or 0) - (before.device_counter or 0)
+    assert again.first_sample - before.first_sample == pytest.approx(ticks / TICKS, abs=0.5)
+
+
+async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    """Nobody reads for a while: 4096 bytes hold 186 scans of eleven."""
+    some = bench(running[0], settings={"mode": "command-response", "buffer_bytes": 4096})
+    blocks: list[Block] = []
+    events: list[Event] = []
+    async with reading(DRIVER, some, speed=SPEED) as items:
+        async for item in items:
+            if isinstance(item, Event):
+                events.append(item)
+            elif item.sensor == "A":
+                blocks.append(item)
+                if len(blocks) == 5:
+                    await asyncio.sleep(0.8)  # the test's own idleness is what is tested
+                if len(blocks) > 5 and any(b.reason for b in blocks) and len(events) >= 2:
+                    break
+    gap = next(b for b in blocks if b.reason)
+    before = blocks[blocks.index(gap) - 1]
+    assert gap.reason == "buffer overflow"
+    assert gap.flags == BlockFlag.NONE
+    assert gap.first_sample - before.end_sample > 100
+    elapsed = (gap.device_counter or 0) - (blocks[0].device_counter or 0)
+    assert elapsed == gap.first_sample * TICKS
+    assert "2940" in events[0].text
+    assert "2941" in events[1].text
+
+
+async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
+    settings = {"mode": "command-response"}
+    told = spec(table(["R"], settings=settings), speed=SPEED, sampling_rate=RATE)
+    told["faults"] = [{"kind": "reset", "at": 6.0, "every": 1.0}]
+    said = "reading the stream: .*exception 4.*, reason 2620"
+    with launch.start(told) as (one,), pytest.raises(DeviceError, match=said):
+        await record(bench(one, settings=settings), 10**6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "own", "error", "said"),
+    [
+        (
+            {"serial_number": "1"},
+            {},
+            WrongDeviceError,
+            "expected serial number '1', got '470001234'",
+        ),
+        ({}, {"B": {"inputs": [1, 2]}}, BenchFileError, "one for each of its 3 channels"),
+        ({}, {"B": {"inputs": [0, 4, 5]}}, BenchFileError, "'B': AIN0 is already an input of 'A'"),
+        ({"settings": {"stream_port": 1}}, {}, NotConnectedError, "nothing listens there"),
+        ({"sampling_rate": 20_000.0}, {}, DeviceError, "does not go on: scan overlap"),
+        ({"settings": {"trigger_index": 1 << 31}}, {}, NoAnswerError, "no samples"),
+    ],
+)
+async def test_what_cannot_be_is_named(
+    running: tuple[RunningDevice, ...],
+    changes: dict[str, Any],
+    own: dict[str, dict[str, Any]],
+    error: type[Exception],
+    said: str,
+) -> None:
+    with pytest.raises(error, match=said):
+        await record(bench(running[0], own=own, **changes), 10**6)

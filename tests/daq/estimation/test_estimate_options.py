@@ -1,0 +1,339 @@
+"""The estimator's options through a recording: rejection, octaves, dimension, gains, diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel
+from daq.errors import CannotAlignError
+from daq.estimation.diagnosis import vertical_channel
+from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import BlockFlag
+from estimator.errors import InsufficientDataError
+from estimator.methods import Flag, self_noise
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+from tests.daq.alignment.recordings import Sensor, blocks, create, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+
+RATE = 100.0
+SETTINGS = Settings(segment=1.0)
+N_SAMPLES = 12_000
+
+
+def bench(
+    channels: tuple[int, ...] = (3, 3, 3), *, n_samples: int = N_SAMPLES, motion: int = 3
+) -> dict[str, Sensor]:
+    """Sensors on one white motion of standard deviation 10⁴ in so many dimensions, noise of 10²."""
+    rng = np.random.default_rng(7)
+    directions = np.linalg.qr(rng.standard_normal((3, 3)))[0][:motion]
+    common = rng.standard_normal((n_samples, motion)) @ directions * 1e4
+    return {
+        name: Sensor(
+            np.rint(common[:, :d] + 100 * rng.standard_normal((n_samples, d))).astype(np.int32),
+            clock="one",
+        )
+        for name, d in zip("abcdef", channels, strict=False)
+    }
+
+
+def spectra_of(sensors: dict[str, Sensor], starts: list[int]) -> CrossSpectra:
+    """Spectra of these segments, straight from the samples."""
+    spectra = CrossSpectra(
+        WelchSettings(RATE, 100), sum(s.counts.shape[1] for s in sensors.values())
+    )
+    samples = np.hstack([sensor.counts for sensor in sensors.values()]).astype(float)
+    spectra.add(samples, np.array(starts, dtype=np.int64))
+    return spectra
+
+
+def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snapshot:
+    """Write a recording bit by bit while it is followed; return how that ends."""
+    writer = create(path, sensors)
+    arriving = sorted(
+        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
+        key=lambda block: block.received.monotonic_ns,
+    )
+    with Estimation([path], settings) as live:
+        for number, block in enumerate(arriving):
+            writer.append(block)
+            if number % 60 == 59:
+                writer.commit()
+                live.update()
+                assert "advice" not in live.snapshot().diagnostics  # only of a finished estimate
+        writer.close()
+        live.update()
+        return live.finish()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"reject": True},
+        {"octaves": True},
+        {"octaves": True, "reject": True},
+        {"dimension": "auto", "methods": ("maximum-likelihood",)},
+    ],
+    ids=["reject", "octaves", "undisturbed octaves", "dimension"],
+)
+def test_what_was_followed_ends_as_the_estimate_from_the_file(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    sensors = bench()
+    if "reject" in options:
+        sensors["b"].counts[6010:6020] += 3_000_000  # someone knocks
+    sensors["c"].gaps = ((8000, 8100),)
+    settings = replace(SETTINGS, **options)
+    live = followed(tmp_path / "r.h5", sensors, settings)
+    offline = estimate([tmp_path / "r.h5"], settings)
+    assert live.left_out == offline.left_out
+    assert live.octaves == offline.octaves
+    if "reject" in options:
+        assert live.left_out["transient"] == 2
+        assert all(octave.left_out["transient"] == 2 for octave in live.octaves[-1:])
+    if live.octaves:
+        assert live.n_segments == live.octaves[-1].n_segments
+    (one,), (other,) = live.results.values(), offline.results.values()
+    np.testing.assert_allclose(one.noise_psd, other.noise_psd, rtol=1e-9)
+    np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9)
+
+
+def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -> None:
+    sensors = bench()
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            clipped = name == "b" and block.first_sample == 5000  # samples 5000 to 5049
+            flags = block.flags | BlockFlag.CLIPPED if clipped else block.flags
+            counts = np.full_like(block.counts, 70_000) if clipped else block.counts
+            writer.append(replace(block, flags=flags, counts=counts))
+    writer.close()
+    found = estimate([tmp_path / "r.h5"], SETTINGS)
+    assert "clipped" not in found.diagnostics  # what says so itself is left out
+    kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
+    assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
+    np.testing.assert_allclose(found.csm, spectra_of(sensors, kept).csm(), rtol=1e-9, atol=1e-3)
+    assert estimate([tmp_path / "r.h5"], replace(SETTINGS, reject=False)).n_dropped == 0
+
+
+def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -> None:
+    sensors = bench(n_samples=60_000)
+    n = np.arange(60_000)
+    sensors["a"].counts[:, 0] = np.rint(3000 * np.sin(2 * np.pi * n / 77.7))  # a shaker is no fault
+    sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 1e4)  # nor are few values
+    sensors["b"].counts[:, 1] = np.clip(sensors["b"].counts[:, 1], -30_000, 20_000)
+    sensors["c"].counts[:, 1] = 5
+    found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, methods=("all",)))
+    shares = found.diagnostics["clipped"]
+    assert set(shares) == {"b.c1"}
+    at_ends = np.mean(
+        (sensors["b"].counts[:, 1] == 20_000) | (sensors["b"].counts[:, 1] == -30_000)
+    )
+    assert shares["b.c1"] == pytest.approx(at_ends, rel=0.2)
+    assert "clipped" not in estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics
+
+
+@pytest.mark.parametrize(("reject", "duration"), [(None, 5), (True, 5), (True, 30)])
+def test_a_channel_that_was_dead_for_a_while_is_named_and_its_sensitivity_is_not_blamed(
+    tmp_path: Path, reject: bool | None, duration: int
+) -> None:
+    sensors = bench()
+    sensors["b"].counts[3000 : 3000 + 100 * duration, 1] = 7
+    sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 3e4)  # coarse, often at rest
+    sensors["c"].counts[:, 0] = 5  # dead throughout is said elsewhere
+    found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, reject=reject))
+    blamed = [each.text for each in found.diagnostics["advice"] if "gain" in each.numbers]
+    assert not any("b.c1" in text for text in blamed)
+    if reject and duration == 5:  # all of it is left out; what lasts is taken for a new level
+        assert "stood_still" not in found.diagnostics
+        assert found.left_out["transient"] >= 9
+    else:
+        assert set(found.diagnostics["stood_still"]) == {"b.c1"}
+        assert found.diagnostics["stood_still"]["b.c1"] == pytest.approx(duration, abs=1)
+
+
+def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_path: Path) -> None:
+    snapshot = estimate(
+        [write(tmp_path / "r.h5", bench(n_samples=60_000))], replace(SETTINGS, octaves=True)
+    )
+    assert snapshot.octaves[0].segment >= 16 * snapshot.octaves[-1].segment == 16.0
+    assert all(o.n_effective >= 20 for o in snapshot.octaves)
+    assert np.all(np.diff(snapshot.frequency) > 0)
+    assert snapshot.frequency[1] <= 1 / 16
+    assert snapshot.frequency[-1] == RATE / 2
+    truth = 100.0**2 / (RATE / 2)
+    noise = snapshot.results["three-sensor"]
+    for octave in snapshot.octaves:
+        inside = (snapshot.frequency > 0) & (snapshot.frequency < RATE / 2)
+        inside &= (snapshot.frequency >= octave.low) & (snapshot.frequency <= octave.high)
+        mean = noise.noise_psd[inside].mean()
+        std = np.median(noise.cov[inside]) * truth / np.sqrt(inside.sum() * 9 / 1.5)
+        assert abs(mean - truth) < 4 * std
+
+
+def test_octaves_of_several_recordings_add(tmp_path: Path) -> None:
+    sensors = bench()
+    paths = [write(tmp_path / name, sensors) for name in ("1.h5", "2.h5")]
+    settings = replace(SETTINGS, octaves=True)
+    once, twice = estimate(paths[:1], settings), estimate(paths, settings)
+    assert twice.octaves[-1].n_segments == 2 * once.octaves[-1].n_segments
+    top = once.frequency > once.octaves[-1].low
+    np.testing.assert_allclose(
+        twice.csm[-top.sum() :], once.csm[top], rtol=1e-9, atol=1e-9 * np.abs(once.csm).max()
+    )
+
+
+def test_the_dimension_is_chosen_by_band_and_lowers_the_scatter(tmp_path: Path) -> None:
+    path = write(tmp_path / "r.h5", bench(motion=1))
+    usual = replace(SETTINGS, methods=("maximum-likelihood",))
+    found = estimate([path], replace(usual, dimension="auto"))
+    choices = found.diagnostics["dimension"]
+    assert sum(choice.n_factors == 1 for choice in choices) >= 0.8 * len(choices)
+    one, three = (estimate([path], replace(usual, dimension=q)) for q in (1, None))
+    with_one, with_three = (each.results["maximum-likelihood"].cov for each in (one, three))
+    assert [each.diagnostics["n_factors"] for each in (one, three, found)] == [1, 3, 3]
+    assert np.nanmedian(with_one[1:-1]) < 0.9 * np.nanmedian(with_three[1:-1])
+    with pytest.raises(InsufficientDataError, match="at most"):
+        estimate([path], replace(usual, dimension=9))
+
+
+def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
+    tmp_path: Path,
+) -> None:
+    sensors = bench()
+    writer = create(tmp_path / "r.h5", sensors)
+    arriving = sorted(
+        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
+        key=lambda block: block.received.monotonic_ns,
+    )
+    settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
+    chosen_at: list[int] = []
+    last: object = None
+    with Estimation([tmp_path / "r.h5"], settings) as live:
+        for number, block in enumerate(arriving[:480]):  # 80 s, 160 segments
+            writer.append(block)
+            if number % 30 == 29:
+                writer.commit()
+                live.update()
+                choices = live.snapshot().diagnostics.get("dimension")
+                if choices is not None and choices is not last:
+                    chosen_at.append(live.n_segments)
+                    last = choices
+        writer.close()
+    assert len(chosen_at) >= 3
+    assert all(later >= 2 * earlier for earlier, later in pairwise(chosen_at))
+
+
+def test_gains_known_beforehand_are_those_of_the_two_channel_method(tmp_path: Path) -> None:
+    sensors = bench((1, 1))
+    sensors["b"].counts *= 3
+    path = write(tmp_path / "r.h5", sensors)
+    settings = replace(SETTINGS, methods=("two-channel",), gains={"b": 3.0})
+    found = estimate([path], settings)
+    known = self_noise(
+        "two-channel",
+        found.csm,
+        dims=(1, 1),
+        n_effective=found.n_effective,
+        response=np.array([1, 3], dtype=complex),
+    )
+    np.testing.assert_array_equal(found.results["two-channel"].noise_psd, known.noise_psd)
+    by_channel = estimate([path], replace(settings, gains={"b.c0": 3.0}))
+    np.testing.assert_array_equal(by_channel.results["two-channel"].noise_psd, known.noise_psd)
+    assert found.diagnostics.get("advice") is None  # two sensors: nothing to diagnose with
+    for wrong in ({"z": 1.0}, {"b": 0.0}):
+        with pytest.raises(CannotAlignError, match="gain"):
+            estimate([path], replace(settings, gains=wrong))
+
+
+def test_samples_that_are_no_numbers_are_gaps(tmp_path: Path) -> None:
+    sensors = bench()
+    for sensor in sensors.values():
+        sensor.counts = sensor.counts.astype(np.float64)
+    sensors["a"].counts[3000, 1] = np.nan
+    sensors["c"].counts[7030, 0] = -np.inf
+    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
+    assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0}  # 2950, 3000; 6950, 7000
+    assert np.isfinite(found.results["three-sensor"].noise_psd).all()
+
+
+@pytest.mark.parametrize("value", [0, 7, 8_388_607])
+def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
+    tmp_path: Path, value: int
+) -> None:
+    sensors = bench()
+    sensors["b"].counts[:, 1] = value
+    settings = replace(SETTINGS, methods=("all",), target_cov=0.1)
+    found = estimate([write(tmp_path / "r.h5", sensors)], settings)
+    for noise in found.results.values():
+        assert np.all(noise.flags[:, 4] & Flag.DEAD_CHANNEL)
+        assert np.isnan(noise.noise_psd[:, 4]).all()
+    others = np.delete(found.results["maximum-likelihood"].noise_psd[1:-1], 4, axis=1)
+    assert np.isfinite(others).all()
+    assert found.diagnostics["advice"][0].text.startswith("b.c1 has no signal")
+    assert np.isfinite([band.test.p_value for band in found.diagnostics["bands"]]).all()
+
+
+def test_duplicates_are_flagged_and_nothing_alive_is_an_error(tmp_path: Path) -> None:
+    sensors = bench()
+    sensors["b"].counts[:, 1] = sensors["a"].counts[:, 1]
+    settings = replace(SETTINGS, methods=("maximum-likelihood",))
+    found = estimate([write(tmp_path / "r.h5", sensors)], settings)
+    flags = found.results["maximum-likelihood"].flags
+    copies = (flags[1:-1] & Flag.DUPLICATE).any(axis=0)
+    assert np.flatnonzero(copies).tolist() == [1, 4]
+    # by three-sensor nothing is left, and the message says why, and what is
+    with pytest.raises(InsufficientDataError, match=r"b\.c1 repeats a\.c1.*maximum-likelihood"):
+        estimate([tmp_path / "r.h5"], SETTINGS)
+    for sensor in sensors.values():
+        sensor.counts[:] = 0
+    with pytest.raises(InsufficientDataError, match="no signal"):
+        estimate([write(tmp_path / "0.h5", sensors)], settings)
+
+
+def test_sensors_with_different_numbers_of_channels(tmp_path: Path) -> None:
+    found = estimate([write(tmp_path / "r.h5", bench((3, 2, 1, 3)))], SETTINGS)
+    noise, flags = found.results["three-sensor"].noise_psd, found.results["three-sensor"].flags
+    alone = np.isnan(noise).all(axis=0)
+    assert np.flatnonzero(alone).tolist() == [2, 8]  # only two sensors have a third channel
+    assert np.all(flags[:, alone] & Flag.NO_COUNTERPART)
+    truth = 100.0**2 / (RATE / 2)
+    np.testing.assert_allclose(noise[1:-1, ~alone].mean(axis=0), truth, rtol=0.1)
+    # By three directions nobody but they themselves feels they cannot be compared.
+    assert all({pair.first, pair.second} != {0, 3} for pair in found.diagnostics["responses"])
+
+
+def test_the_diagnosis_is_that_of_the_estimator(tmp_path: Path) -> None:
+    sensors = bench()
+    angle = np.radians(4.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    sensors["c"].counts[:, :2] = np.rint(sensors["c"].counts[:, :2] @ turn)
+    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS).diagnostics
+    assert found["pairs"] == (("a", "b"), ("a", "c"), ("b", "c"))
+    turned = {(pair.first, pair.second): pair.rotation_deg for pair in found["responses"]}
+    assert turned[0, 1] == pytest.approx(0.0, abs=0.2)
+    assert turned[0, 2] == pytest.approx(4.0, abs=0.2)
+    assert {band.test.p_value > 1e-4 for band in found["bands"]} == {True}
+    assert found["per_frequency"]["p_value"].shape == (51,)
+    assert found["per_frequency"]["coherence"].shape == (51, 3)
+
+
+def test_which_channel_is_vertical() -> None:
+    def named(*names: str) -> list[Channel]:
+        return [Channel(name=name, sensitivity=1.0) for name in names]
+
+    assert vertical_channel(named("BHE", "BHN", "BHZ")) == 2
+    assert vertical_channel(named("BH0", "BH1", "BH2")) == 0
+    third = Channel(name="3", sensitivity=1.0, direction="Z")
+    assert vertical_channel([*named("1", "2"), third]) == 2
+    assert vertical_channel(named("1", "2", "3")) is None
+    assert vertical_channel(named("X", "Z")) is None

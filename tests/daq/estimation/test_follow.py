@@ -1,0 +1,250 @@
+"""Following a recording: looks between segments, the estimate when there is news, the end."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.estimation.follow import follow
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.recording.monitor import RecordingMonitor, RecordingStatus, SensorStatus
+from daq.recording.reader import Recording
+from tests.tui.example_snapshot import SETTINGS, growing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.writer import RecordingWriter
+
+RATE = 200
+
+
+@dataclass
+class Noted:
+    """Writes down what it is told, in order."""
+
+    ended: threading.Event = field(default_factory=threading.Event)
+    wanted: int = 10**9
+    """Looks after which it has seen enough."""
+    told: list[str] = field(default_factory=list)
+    nows: list[RecordingStatus] = field(default_factory=list)
+    snapshots: list[Snapshot] = field(default_factory=list)
+    troubles: list[str] = field(default_factory=list)
+
+    def look(self, now: RecordingStatus) -> None:
+        """Count it."""
+        self.told.append("look")
+        self.nows.append(now)
+        if len(self.nows) >= self.wanted:
+            self.ended.set()
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Keep it."""
+        assert settings.segment > 0
+        self.told.append("snapshot")
+        self.snapshots.append(snapshot)
+
+    def progress(self, done: int, total: int) -> None:
+        """Check it."""
+        assert 0 < done <= total
+
+    def trouble(self, text: str) -> None:
+        """Keep it."""
+        self.troubles.append(text)
+
+
+class Bench:
+    """Three sensors that send what the test wants, at times it gives in seconds."""
+
+    def __init__(self, writer: RecordingWriter) -> None:
+        self.writer, self.begun = writer, SystemClock().now()
+        self._rng = np.random.default_rng(7)
+        self._sent = dict.fromkeys("ABC", 0)
+
+    def at(self, seconds: float) -> HostTime:
+        """Return an instant after the start."""
+        ns = round(seconds * 1e9)
+        return HostTime(self.begun.monotonic_ns + ns, self.begun.utc_ns + ns)
+
+    def send(
+        self, sensors: str, until: float, *, dead: int | None = None, clipped: bool = False
+    ) -> None:
+        """Send one block a second up to a time."""
+        for sensor in sensors:
+            while self._sent[sensor] < until * RATE:
+                first = self._sent[sensor]
+                counts = self._rng.integers(-999, 999, (RATE, 3)).astype(np.int32)
+                if dead is not None:
+                    counts[:, dead] = 4
+                flags = BlockFlag.CLIPPED if clipped else BlockFlag.NONE
+                at = self.at(first / RATE + 1)
+                self.writer.append(Block(sensor, first, counts, at, flags=flags))
+                self._sent[sensor] += RATE
+        self.writer.commit()
+
+    def say(self, sensor: str, kind: str, at: float, text: str = "") -> None:
+        """Write an event."""
+        self.writer.event(Event(sensor, kind, text, self.at(at)))
+        self.writer.commit()
+
+
+@contextmanager
+def looked_at(path: Path) -> Iterator[tuple[Bench, Callable[[], dict[str, SensorStatus]]]]:
+    """Yield a bench that is recorded, and how its sensors are by name."""
+    with growing(path) as writer, Recording.open(path) as recording:
+        lookout = RecordingMonitor(recording)
+
+        def look() -> dict[str, SensorStatus]:
+            recording.refresh()
+            return {sensor.name: sensor for sensor in lookout.look_closely().sensors}
+
+        yield Bench(writer), look
+
+
+def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> None:
+    with looked_at(tmp_path / "run.h5") as (bench, look):
+        assert {sensor.state for sensor in look().values()} == {"waiting"}
+        bench.send("ABC", 6)
+        assert {sensor.state for sensor in look().values()} == {"live"}
+        bench.send("AC", 8)
+        assert look()["B"].state == "live"  # not so long yet
+        bench.send("AC", 12)
+        seen = look()["B"]
+        assert (seen.state, round(seen.since), seen.is_lost) == ("silent", 6, True)
+        bench.say("B", "late", 12.1, "no block for 2 s")
+        assert look()["B"].state == "late"
+        bench.say("B", "stalled", 12.5, "no block for 6.5 s")
+        seen = look()["B"]
+        assert (seen.state, seen.why) == ("stalled", "no block for 6.5 s")
+        bench.say("B", "connected", 12.8)
+        assert look()["B"].state == "waiting"
+        bench.send("B", 14)
+        assert look()["B"].state == "live"
+        bench.say("C", "disconnected", 14.5, "the port is gone")
+        bench.writer.close()
+        states = {name: sensor.state for name, sensor in look().items()}
+        assert states == {"A": "ended", "B": "ended", "C": "disconnected"}
+
+
+@pytest.mark.parametrize("duration", [60.0, None])
+def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path, duration=duration) as writer, Recording.open(path) as recording:
+        Bench(writer).send("ABC", 8)
+        recording.refresh()
+        now = RecordingMonitor(recording).look()
+        assert now.ends_in == (None if duration is None else pytest.approx(60 - now.elapsed))
+        writer.close()
+        recording.refresh()
+        assert RecordingMonitor(recording).look().ends_in is None
+
+
+def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer, Recording.open(path) as recording:
+        bench, lookout = Bench(writer), RecordingMonitor(recording)
+        bench.send("ABC", 2)
+        recording.refresh()
+        assert not lookout.quiet()
+        bench.send("AC", 4)
+        recording.refresh()
+        assert lookout.quiet()
+        now = lookout.with_states(lookout.look(), {"A": "recording", "B": "late", "C": "lost"})
+        assert [sensor.state for sensor in now.sensors] == ["live", "late", "live"]
+        assert now.sensors[1].since == pytest.approx(2, abs=0.1)
+
+
+def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -> None:
+    with looked_at(tmp_path / "run.h5") as (bench, look):
+        bench.send("AB", 6)
+        bench.send("C", 6, dead=1)
+        bench.send("A", 8, clipped=True)
+        seen = look()
+        assert (seen["A"].clips, seen["A"].n_clipped) == (True, 2)
+        assert seen["C"].stuck == ("Y",)
+        assert not any((seen["B"].clips, seen["B"].stuck, seen["A"].stuck))
+        bench.send("ABC", 20)
+        seen = look()
+        assert (seen["A"].clips, seen["A"].n_clipped) == (False, 2)
+        assert (seen["C"].stuck, seen["C"].was_stuck) == ((), ("Y",))
+
+
+def test_an_estimate_is_made_only_when_a_segment_has_come(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        bench, noted = Bench(writer), Noted(wanted=4)
+        bench.send("ABC", 6)
+        follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    assert noted.told == ["look", "look", "snapshot", "look", "look"]
+    assert noted.nows[-1].elapsed >= 6
+
+
+def test_the_end_is_one_result(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        Bench(writer).send("ABC", 30)
+        writer.close()
+    noted = Noted()
+    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    (snapshot,) = noted.snapshots
+    assert snapshot.closed
+    assert "advice" in snapshot.diagnostics
+    assert noted.nows[-1].closed
+    assert not noted.troubles
+
+
+def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+
+        class Closing(Noted):
+            def look(self, now: RecordingStatus) -> None:
+                if not self.nows:  # it has been seen open, and ends before the next look
+                    Bench(writer).send("ABC", 30)
+                    writer.close()
+                super().look(now)
+
+        noted = Closing()
+        follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    (snapshot,) = noted.snapshots
+    assert snapshot.closed
+    assert "advice" in snapshot.diagnostics
+
+
+def test_nobody_waits_for_a_result_that_nobody_wants(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        Bench(writer).send("ABC", 30)
+        writer.close()
+    noted = Noted(wanted=1)
+    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    assert not noted.snapshots
+
+
+def test_too_short_a_recording_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        Bench(writer).send("ABC", 1)
+        writer.close()
+    noted = Noted()
+    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    assert noted.snapshots[-1].closed
+    assert "record longer" in noted.troubles[0]
+
+
+def test_a_recorder_that_is_gone_is_trouble(tmp_path: Path) -> None:
+    path = tmp_path / "killed.h5"
+    with growing(path):
+        pass
+    noted = Noted()
+    follow(path, None, onlooker=noted, ended=noted.ended, silence=0.0)
+    assert f"huddle repair {path}" in noted.troubles[0]

@@ -1,0 +1,168 @@
+"""Foreign files become recordings that say the same samples at the same times."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.alignment.aligned_recording import AlignedRecording
+from daq.bench.loading import parse
+from daq.errors import ImportFormatError, RecordingError
+from daq.formats.importer import import_files
+from daq.protocols.block import BlockFlag
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SENSOR = """
+[[sensors]]
+name = "{name}"
+driver = "epson"
+port = "/dev/null"
+channels = [{{name = "east", sensitivity = 2.0}}, {{name = "north", sensitivity = 4.0}}]
+"""
+BENCH = 'name = "lab"\nsampling_rate = 50.0\noperator = "somebody"\n' + "".join(
+    SENSOR.format(name=name) for name in ("A", "B")
+)
+
+
+def write_npz(
+    path: Path, n: int = 40_000
+) -> dict[str, np.ndarray[tuple[int, int], np.dtype[np.int32]]]:
+    rng = np.random.default_rng(3)
+    arrays = {name: rng.integers(-(2**20), 2**20, (n, 2), np.int32) for name in ("B", "A")}
+    np.savez(
+        path,
+        sampling_rate=50.0,
+        start_time="2026-11-21T03:00:00.0005",
+        A=arrays["A"],
+        B=arrays["B"],
+    )
+    return arrays
+
+
+def test_samples_times_and_bench_survive(tmp_path: Path) -> None:
+    arrays = write_npz(tmp_path / "a.npz")
+    bench = parse(BENCH)
+    imported = import_files([tmp_path / "a.npz"], tmp_path / "a.h5", bench=bench)
+    assert [(e.sensor, e.n_samples, e.n_gaps) for e in imported] == [
+        ("A", 40_000, 0),
+        ("B", 40_000, 0),
+    ]
+    with Recording.open(tmp_path / "a.h5") as recording:
+        assert recording.closed
+        assert recording.operator == "somebody"
+        for name, counts in arrays.items():
+            sensor = recording.sensor(name)
+            np.testing.assert_array_equal(sensor.counts(), counts)
+            assert sensor.dtype == np.dtype("<i4")
+            assert [c.name for c in sensor.channels] == ["east", "north"]
+            assert all(sensor.blocks["flags"] & BlockFlag.DEVICE_UTC)
+            first = 1_795_230_000_000_500_000
+            np.testing.assert_array_equal(
+                sensor.blocks["device_counter"],
+                first + sensor.blocks["first_sample"] * 20_000_000,
+            )
+        aligned = AlignedRecording(recording)
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert valid.all()
+        np.testing.assert_array_equal(samples[:, :2], arrays["A"] / [2.0, 4.0])
+
+
+def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
+    rows = [f"{k / 10:.1f},{k},{-k}" for k in range(1000) if not 300 <= k < 317]
+    (tmp_path / "a.csv").write_text("time,A.X [m/s],B.X [m/s]\n" + "\n".join(rows) + "\n")
+    (first, _) = import_files([tmp_path / "a.csv"], tmp_path / "a.h5")
+    assert (first.n_gaps, first.missing, first.sampling_rate) == (1, 17, 10.0)
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (gap,) = recording.sensor("A").gaps
+        assert (gap["first_sample"], gap["missing"]) == (300, 17)
+        assert recording.sensor("A").channels[0].unit == "m/s"
+        samples, valid = AlignedRecording(recording).read(0, 1000)
+        assert np.flatnonzero(~valid).tolist() == list(range(300, 317))
+        np.testing.assert_array_equal(samples[317:, 0], np.arange(317, 1000))
+
+
+def test_one_response_serves_all_channels(tmp_path: Path, usgs_recording: Path) -> None:
+    write_npz(tmp_path / "a.npz", 100)
+    response = usgs_recording / "T-compact_Q330HR_BH_40"
+    import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response=response)
+    with Recording.open(tmp_path / "a.h5") as recording:
+        channels = [channel for sensor in recording.sensors for channel in sensor.channels]
+    assert len(channels) == 4
+    for channel in channels:
+        assert channel.sensitivity == pytest.approx(754.3 * 2**26 / 40, rel=1e-6)
+        assert channel.unit == "m/s"
+        assert channel.response is not None
+        assert np.abs(channel.response.at(np.array([1.0]))) == pytest.approx(1.0, abs=1e-6)
+        assert (len(channel.response.zeros), len(channel.response.poles)) == (6, 11)
+
+
+def test_stationxml_gives_each_channel_its_own(tmp_path: Path) -> None:
+    obspy = pytest.importorskip("obspy", reason="ObsPy is an extra")
+    inventory = obspy.core.inventory
+    channels = []
+    for number, code in enumerate("XY", start=1):
+        response = inventory.Response.from_paz(
+            zeros=[0.0],
+            poles=[-1.0 + 1.0j, -1.0 - 1.0j],
+            stage_gain=100.0 * number,
+            input_units="M/S**2",
+            output_units="COUNTS",
+        )
+        channels.append(
+            inventory.Channel(code, "00", 0.0, 0.0, 0.0, 0.0, response=response, sample_rate=50.0)
+        )
+    station = inventory.Station("ABC", 0.0, 0.0, 0.0, channels=channels)
+    network = inventory.Network("XX", stations=[station])
+    path = tmp_path / "station.xml"
+    inventory.Inventory(networks=[network], source="test").write(str(path), format="STATIONXML")
+    samples = "\n".join(f"{k},{k}" for k in range(100))
+    (tmp_path / "a.csv").write_text(f"XX.ABC.00.X,XX.ABC.00.Y\n{samples}\n")
+
+    import_files([tmp_path / "a.csv"], tmp_path / "a.h5", response=path, sampling_rate=50.0)
+
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (sensor,) = recording.sensors
+    assert [c.sensitivity for c in sensor.channels] == pytest.approx([100.0, 200.0])
+    assert {c.unit for c in sensor.channels} == {"m/s²"}
+
+    (tmp_path / "b.csv").write_text(f"other.X,other.Y\n{samples}\n")
+    with pytest.raises(
+        ImportFormatError, match=r"no response for other\.X; it holds XX\.ABC\.00\.X"
+    ):
+        import_files([tmp_path / "b.csv"], tmp_path / "b.h5", response=path, sampling_rate=50.0)
+    assert not (tmp_path / "b.h5").exists()
+
+
+def test_what_does_not_fit_is_said_and_leaves_no_file(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", 10)
+    write_npz(tmp_path / "b.npz", 10)
+    out = tmp_path / "a.h5"
+    bench = parse(BENCH.replace('"B"', '"C"'))
+    with pytest.raises(ImportFormatError, match="the bench file has the sensors A, C"):
+        import_files([tmp_path / "a.npz"], out, bench=bench)
+    with pytest.raises(ImportFormatError, match="expected each sensor once"):
+        import_files([tmp_path / "a.npz", tmp_path / "b.npz"], out)
+    with pytest.raises(ImportFormatError, match="no such file"):
+        import_files([tmp_path / "c.npz"], out)
+    with pytest.raises(ImportFormatError, match="expected a RESP or StationXML"):
+        import_files([tmp_path / "a.npz"], out, response=tmp_path / "a.npz")
+    assert not out.exists()
+    import_files([tmp_path / "a.npz"], out)
+    with pytest.raises(RecordingError, match="exists already"):
+        import_files([tmp_path / "a.npz"], out)
+    assert out.exists()
+
+
+def test_samples_in_units_already_are_not_scaled_by_a_bench_in_counts(tmp_path: Path) -> None:
+    bench = parse(BENCH)
+    unit = bench.sensors[0].channels[0].unit
+    header = ",".join(f"{s}.{c} ({unit})" for s in "AB" for c in ("east", "north"))
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n1,2,3,4\n5,6,7,8\n", encoding="utf-8")
+    with pytest.raises(ImportFormatError, match="scale it again"):
+        import_files([path], tmp_path / "a.h5", bench=bench, sampling_rate=50.0)

@@ -1,0 +1,245 @@
+"""Foreign files are read to exact instants and samples, and refused in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from daq.errors import ImportFormatError
+from daq.formats.csv_reader import read_delimited
+from daq.formats.miniseed import read_waveforms
+from daq.formats.npz import read_mat, read_npz
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+RATE = 200.0
+START_NS = 1_700_000_000_123_456_000
+
+
+def write_mseed(path: Path, pieces: list[tuple[str, str, int, np.ndarray[Any, Any]]]) -> Path:
+    """Write (location, channel, start in ns, counts) as miniSEED, each piece a trace."""
+    obspy = pytest.importorskip("obspy", reason="ObsPy is an extra")
+    traces = [
+        obspy.Trace(
+            counts,
+            {
+                "network": "XX",
+                "station": "ABC",
+                "location": location,
+                "channel": channel,
+                "starttime": obspy.UTCDateTime(ns=start_ns),
+                "sampling_rate": RATE,
+            },
+        )
+        for location, channel, start_ns, counts in pieces
+    ]
+    obspy.Stream(traces).write(str(path), format="MSEED")
+    return path
+
+
+def counts(n: int, seed: int = 0) -> np.ndarray[Any, Any]:
+    return np.random.default_rng(seed).integers(-(2**23), 2**23, n, dtype=np.int32)
+
+
+def test_miniseed_sensor_is_network_station_location_and_times_are_exact(tmp_path: Path) -> None:
+    x, y = counts(1000, 1), counts(1000, 2)
+    path = write_mseed(
+        tmp_path / "a.mseed", [("00", "HNX", START_NS, x), ("00", "HNY", START_NS, y)]
+    )
+    (sensor,) = read_waveforms([path])
+    assert (sensor.name, sensor.channels) == ("XX.ABC.00", ("HNX", "HNY"))
+    assert sensor.sampling_rate == RATE
+    (stretch,) = sensor.stretches
+    assert stretch.start_utc_ns == START_NS
+    np.testing.assert_array_equal(stretch.counts, np.stack([x, y], axis=1))
+
+
+def test_miniseed_a_gap_in_one_channel_is_a_gap_of_the_sensor(tmp_path: Path) -> None:
+    x, y = counts(1000, 1), counts(1000, 2)
+    step = 5_000_000
+    path = write_mseed(
+        tmp_path / "a.mseed",
+        [
+            ("00", "HNX", START_NS, x[:400]),
+            ("00", "HNX", START_NS + 450 * step, x[450:]),
+            ("00", "HNY", START_NS + 10 * step, y[10:]),
+        ],
+    )
+    (sensor,) = read_waveforms([path])
+    first, second = sensor.stretches
+    assert first.start_utc_ns == START_NS + 10 * step
+    np.testing.assert_array_equal(first.counts, np.stack([x, y], axis=1)[10:400])
+    assert sensor.first_sample(second) == 440
+    np.testing.assert_array_equal(second.counts, np.stack([x, y], axis=1)[450:])
+
+
+@pytest.mark.parametrize(
+    ("shift_ns", "said"), [(2_000_000, "apart"), (10_000_000_000, "no samples in common")]
+)
+def test_miniseed_channels_apart_are_refused(tmp_path: Path, shift_ns: int, said: str) -> None:
+    pieces = [
+        ("00", "HNX", START_NS, counts(100)),
+        ("00", "HNY", START_NS + shift_ns, counts(100)),
+    ]
+    with pytest.raises(ImportFormatError, match=said):
+        read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
+
+
+def test_miniseed_overlap_with_other_samples_is_refused(tmp_path: Path) -> None:
+    later = START_NS + 50 * 5_000_000
+    pieces = [("", "HNX", START_NS, counts(100, 1)), ("", "HNX", later, counts(100, 2))]
+    with pytest.raises(ImportFormatError, match="overlap"):
+        read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
+
+
+def test_miniseed_what_obspy_cannot_read_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("obspy", reason="ObsPy is an extra")
+    path = tmp_path / "notes.mseed"
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(ImportFormatError, match=r"notes\.mseed"):
+        read_waveforms([path])
+
+
+def test_npz_one_array_a_sensor(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    a, b = counts(300).reshape(100, 3), np.arange(100.0)
+    np.savez(path, sampling_rate=RATE, start_time="2026-11-21T03:00:00.005Z", A=a, B=b)
+    first, second = read_npz(path)
+    assert (first.name, first.channels, first.sampling_rate) == ("A", ("1", "2", "3"), RATE)
+    np.testing.assert_array_equal(first.stretches[0].counts, a)
+    assert first.stretches[0].start_utc_ns == 1_795_230_000_005_000_000
+    assert second.channels == ("1",)
+    assert second.stretches[0].counts.shape == (100, 1)
+
+
+def test_npz_rows_that_are_not_numbers_are_gaps(tmp_path: Path) -> None:
+    values = np.arange(20.0).reshape(10, 2)
+    values[4, 1] = np.nan
+    np.savez(tmp_path / "a.npz", sampling_rate=2.0, A=values)
+    (sensor,) = read_npz(tmp_path / "a.npz")
+    assert [s.n_samples for s in sensor.stretches] == [4, 5]
+    assert [sensor.first_sample(s) for s in sensor.stretches] == [0, 5]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"A": np.zeros((5, 2))}, "sampling_rate"),
+        ({"A": np.zeros((5, 2)), "sampling_rate": 0.0}, "positive sampling_rate"),
+        ({"A": np.zeros((5, 2)), "sampling_rate": np.ones(2)}, "one number"),
+        ({"sampling_rate": 1.0}, "no sensors"),
+        ({"A": np.zeros((5, 2, 1)), "sampling_rate": 1.0}, r"\(n_samples, n_channels\)"),
+        ({"A": np.array(["x"]), "sampling_rate": 1.0}, "expected numbers"),
+        ({"A": np.zeros(5), "sampling_rate": 1.0, "start_time": "noon"}, "start_time"),
+    ],
+)
+def test_npz_what_is_wrong_is_said(tmp_path: Path, arrays: dict[str, Any], said: str) -> None:
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(ImportFormatError, match=said):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_npz_pickles_and_other_files_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", sampling_rate=1.0, A=np.array([{}], dtype=object))
+    (tmp_path / "b.npz").write_text("not a zip")
+    for name in ("a.npz", "b.npz"):
+        with pytest.raises(ImportFormatError, match=name):
+            read_npz(tmp_path / name)
+
+
+def test_mat_is_read_as_npz_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    a, b = counts(300).reshape(100, 3), np.arange(100.0)
+    start = "2026-11-21T03:00:00.005Z"
+    savemat(path, {"sampling_rate": RATE, "start_time": start, "A": a, "B": b})
+    first, second = read_mat(path)
+    assert (first.name, first.channels, first.sampling_rate) == ("A", ("1", "2", "3"), RATE)
+    np.testing.assert_array_equal(first.stretches[0].counts, a)
+    assert first.stretches[0].start_utc_ns == 1_795_230_000_005_000_000
+    assert second.stretches[0].counts.shape == (100, 1)
+
+
+@pytest.mark.parametrize(
+    "contents", [b"nothing of the kind", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"]
+)
+def test_mat_what_cannot_be_read_is_said(tmp_path: Path, contents: bytes) -> None:
+    (tmp_path / "a.mat").write_bytes(contents)
+    with pytest.raises(ImportFormatError, match=r"a\.mat: .*MATLAB"):
+        read_mat(tmp_path / "a.mat")
+
+
+def test_delimited_header_names_sensors_channels_and_units(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    path.write_text(
+        "# made by hand\n"
+        "time [s];A.X [m/s²];A.Y (m/s²);B.X\n"
+        "10.000;1;-2;3e3\n10.005;4;5;6\n10.010;7;8;9\n",
+        encoding="utf-8",
+    )
+    a, b = read_delimited(path)
+    assert (a.name, a.channels, a.units) == ("A", ("X", "Y"), ("m/s²", "m/s²"))
+    assert (b.name, b.channels, b.units) == ("B", ("X",), ("counts",))
+    assert a.sampling_rate == b.sampling_rate == RATE
+    assert a.stretches[0].start_utc_ns == 10_000_000_000
+    np.testing.assert_array_equal(a.stretches[0].counts, [[1, -2], [4, 5], [7, 8]])
+
+
+def test_delimited_times_since_1970_keep_their_last_decimal(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,X\n1700000000.123456789,1\n1700000001.123456789,2\n")
+    (sensor,) = read_delimited(path)
+    assert sensor.name == "a"
+    assert sensor.stretches[0].start_utc_ns == 1_700_000_000_123_456_789
+
+
+def test_delimited_written_times_and_missing_cells_make_gaps(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = [f"2026-11-21T03:00:{s:02d}Z,{s},{'' if s == 4 else s}" for s in range(10) if s != 7]
+    path.write_text("time,A.X,A.Y\n" + "\n".join(rows) + "\n")
+    (sensor,) = read_delimited(path)
+    assert sensor.sampling_rate == 1.0
+    assert [sensor.first_sample(s) for s in sensor.stretches] == [0, 5, 8]
+    assert [s.n_samples for s in sensor.stretches] == [4, 2, 2]
+
+
+def test_delimited_a_clock_that_is_off_keeps_its_rate(tmp_path: Path) -> None:
+    rate = 100.0 * (1 + 50e-6)
+    path = tmp_path / "a.csv"
+    rows = [f"{k / rate:.9f},{k}" for k in range(20_000)]
+    path.write_text("time,X\n" + "\n".join(rows) + "\n")
+    (sensor,) = read_delimited(path)
+    assert sensor.sampling_rate == pytest.approx(rate, rel=1e-9)
+    assert len(sensor.stretches) == 1
+
+
+def test_delimited_without_time_the_rate_must_be_given(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("X,Y\n1,2\n3,4\n")
+    with pytest.raises(ImportFormatError, match="--sampling-rate"):
+        read_delimited(path)
+    (sensor,) = read_delimited(path, 50.0)
+    assert (sensor.sampling_rate, sensor.channels) == (50.0, ("X", "Y"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "names every column"),
+        ("1,2\n3,4\n", "names every column"),
+        ("time,X\n0,1\n1,oops\n", "oops"),
+        ("time,X\n0,1\n1,2,3\n", "cells"),
+        ("time,X\n0,1\n0,2\n", "always increases"),
+        ("time,X\nnoon,1\n1,2\n", "noon"),
+        ("time\n0\n1\n", "column of samples"),
+    ],
+)
+def test_delimited_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(ImportFormatError, match=said):
+        read_delimited(path)

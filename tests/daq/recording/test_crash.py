@@ -1,0 +1,286 @@
+"""What was acknowledged survives kill -9, a full disk and a torn end; healing loses nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel
+from daq.errors import NotARecordingError, RecordingError
+from daq.protocols.block import Block, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.reader import Recording, control_address
+from daq.recording.repair import heal, verify, write_results
+from daq.recording.superblock import lookup3
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
+
+# Writes noise for ever, or until it fails; acknowledges on standard output.
+WRITER = """
+import json, resource, sys
+import numpy as np
+from daq.bench.model import Channel
+from daq.errors import RecordingError
+from daq.protocols.block import Block, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.superblock import lookup3
+from daq.recording.writer import RecordingWriter
+path, limit = sys.argv[1], int(sys.argv[2])
+if limit:
+    import signal
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+now = HostTime(0, 0)
+channels = tuple(Channel(name=n, sensitivity=1.0) for n in "xyz")
+sensors = [SensorLayout(n, channels, 100.0, np.dtype("i4")) for n in ("a", "b")]
+writer = RecordingWriter.create(path, sensors=sensors, created=now, control=(7, "token"))
+rng = np.random.default_rng(1)
+first = 0
+try:
+    while True:
+        n = int(rng.integers(1, 160))
+        for sensor in ("a", "b"):
+            counts = rng.integers(-2**20, 2**20, (n, 3)).astype(np.int32)
+            writer.append(Block(sensor, first, counts, now))
+        first += n
+        done = writer.commit()
+        print(json.dumps({k: v.rows for k, v in done.sensors.items()}), flush=True)
+except RecordingError as error:
+    print(json.dumps({"error": str(error)}), flush=True)
+    try:
+        writer.close()
+    except RecordingError:
+        pass
+"""
+
+
+def run_writer(path: Path, limit: int = 0) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", WRITER, str(path), str(limit)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def killed(path: Path, n_lines: int) -> dict[str, int]:
+    """Kill a writer after some acknowledgments; return the last one it managed to give."""
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        lines = [writer.stdout.readline() for _ in range(n_lines)]
+        writer.send_signal(signal.SIGKILL)
+        lines += writer.stdout.readlines()
+    whole = [line for line in lines if line.endswith("\n")]
+    rows: dict[str, int] = json.loads(whole[-1])
+    return rows
+
+
+def make(path: Path, n_rows: int = 250) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+    counts = np.random.default_rng(2).integers(-1000, 1000, (n_rows, 1)).astype(np.int32)
+    channels = (Channel(name="x", sensitivity=1.0),)
+    sensor = SensorLayout("a", channels, 100.0, np.dtype("i4"))
+    writer = RecordingWriter.create(path, sensors=[sensor], created=NOW)
+    for first in range(0, n_rows, 25):
+        writer.append(Block("a", first, counts[first : first + 25], NOW))
+    writer.close()
+    return counts
+
+
+@pytest.mark.parametrize("n_lines", [3, 12, 31])
+def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
+    path = tmp_path / "r.h5"
+    acknowledged = killed(path, n_lines)
+    before = verify(path)
+    assert before.intact
+    assert not before.closed
+    assert not before.being_written
+    with Recording.open(path) as recording:
+        kept = {sensor.name: sensor.counts() for sensor in recording.sensors}
+    for name, rows in acknowledged.items():
+        assert len(kept[name]) >= rows > 0
+
+    healed = heal(path, now=NOW)
+    assert healed.closed
+    assert healed.intact
+    assert [s.n_uncommitted for s in healed.sensors] == [0, 0]
+    with h5py.File(path, "r") as file:
+        for name, counts in kept.items():
+            np.testing.assert_array_equal(file["sensors"][name]["samples"][...], counts)
+    with Recording.open(path) as recording:
+        assert recording.closed
+        assert [event.kind for event in recording.events] == ["stopped"]
+    assert heal(path) == healed
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        with Recording.open(path) as lagging:
+            lagging.sensors[0].counts()
+            lines = [writer.stdout.readline() for _ in range(40)]
+            writer.send_signal(signal.SIGKILL)
+            writer.stdout.read()
+            healed = heal(path, now=NOW)
+    assert healed.intact
+    for sensor in healed.sensors:
+        assert sensor.n_samples >= json.loads(lines[-1])[sensor.name] > 0
+
+
+def test_asking_who_writes_does_not_disturb_a_reader(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        seen = dict.fromkeys("ab", 0)
+        with Recording.open(path) as following:
+            while min(seen.values()) < 3000:
+                assert control_address(path) == (7, "token")
+                writer.stdout.readline()
+                following.refresh()
+                for sensor in following.sensors:
+                    counts = sensor.counts(seen[sensor.name])
+                    assert len(counts) == sensor.n_samples - seen[sensor.name]
+                    assert not len(counts) or counts.any(axis=1).all()
+                    seen[sensor.name] = sensor.n_samples
+        writer.kill()
+    assert control_address(path) == (7, "token")
+    heal(path, now=NOW)
+    assert control_address(path) is None
+
+
+@pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])
+def test_a_killed_file_that_lost_its_end(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "r.h5"
+    killed(path, 40)
+    with path.open("r+b") as raw:
+        raw.truncate(int(kept * path.stat().st_size))
+    if kept < 0.5:
+        with pytest.raises(NotARecordingError):
+            verify(path)
+    else:
+        # What came first is there and said to be right; what is cut off is said to be missing.
+        for sensor in verify(path).sensors:
+            assert sensor.bad_blocks
+            assert sensor.bad_blocks == tuple(range(sensor.bad_blocks[0], sensor.n_blocks))
+
+
+def test_full_disk_is_said_and_nothing_committed_is_lost(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path, 150_000) as writer:
+        assert writer.stdout is not None
+        *lines, last = map(json.loads, writer.stdout)
+    assert last["error"] == f"{path}: cannot be written: File too large"
+    assert len(lines) > 5
+    report = verify(path)
+    assert report.intact
+    for sensor in report.sensors:
+        assert sensor.n_samples >= lines[-1][sensor.name] > 0
+    assert heal(path).intact
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="mounts a small disk")
+def test_small_disk(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("this system does not let root mount")
+    try:
+        with run_writer(disk / "r.h5") as writer:
+            assert writer.stdout is not None
+            *lines, last = map(json.loads, writer.stdout)
+        assert last["error"].endswith("cannot be written: No space left on device")
+        report = verify(disk / "r.h5")
+        assert report.intact
+        assert [s.n_samples >= lines[-1][s.name] > 0 for s in report.sensors] == [True, True]
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_being_written_is_not_healed(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with run_writer(path) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        assert verify(path).being_written
+        with pytest.raises(RecordingError, match="is being written"):
+            heal(path)
+        with pytest.raises(OSError, match="lock"):
+            h5py.File(path, "r+")
+        writer.send_signal(signal.SIGKILL)
+
+
+def test_damage_is_found_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    make(path)
+    with h5py.File(path, "r") as file:
+        chunk = file["sensors/a/samples"].id.get_chunk_info(1)
+    with path.open("r+b") as raw:
+        raw.seek(chunk.byte_offset + 20)
+        raw.write(b"\xff" * 4)
+    report = verify(path)
+    # Rows 100 to 199 are in that chunk, four blocks of 25.
+    assert report.sensors[0].bad_blocks == (4, 5, 6, 7)
+    with Recording.open(path) as recording, pytest.raises(RecordingError, match="is damaged"):
+        recording.sensors[0].counts()
+
+
+def test_a_wrong_block_row_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    make(path)
+    with h5py.File(path, "r+") as file:
+        row = file["sensors/a/blocks"][3]
+        row["utc_ns"] += 1
+        file["sensors/a/blocks"][3] = row
+    assert verify(path).sensors[0].bad_blocks == (3,)
+
+
+def test_results_are_added(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    counts = make(path)
+    write_results(path, "three-sensor", {"frequency": np.arange(3.0)}, {"unit": "Hz"})
+    write_results(path, "three-sensor", {"frequency": np.arange(4.0)}, {"unit": "Hz"})
+    with Recording.open(path) as recording:
+        ((method, (arrays, attributes)),) = recording.results().items()
+        assert method == "three-sensor"
+        assert arrays["frequency"].tolist() == [0, 1, 2, 3]
+        assert attributes == {"unit": "Hz"}
+        np.testing.assert_array_equal(recording.sensors[0].counts(), counts)
+    assert verify(path).intact
+
+
+def test_a_failed_rewrite_leaves_the_recording(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    make(path)
+    before = path.read_bytes()
+    with pytest.raises(RecordingError, match="stays as it was"):
+        write_results(path, "m", {"a/b": np.arange(3.0), "a": np.arange(3.0)})
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_results_wait_for_the_recorder(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    killed(path, 3)
+    write_results(path, "m", {"x": np.arange(3.0)})
+    assert verify(path).closed
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    # From the comments of lookup3.c, driver5.
+    [(b"", 0xDEADBEEF), (b"Four score and seven years ago", 0x17770551)],
+)
+def test_lookup3(key: bytes, expected: int) -> None:
+    assert lookup3(key) == expected

@@ -1,0 +1,282 @@
+"""What is written is what is read, while it grows and afterwards."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.bench.model import Channel, PolesZeros
+from daq.errors import NotARecordingError, RecordingError
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.locking import is_being_written
+from daq.recording.reader import Recording
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
+RATE = 100.0
+CHANNELS = (
+    Channel(name="x", sensitivity=1e6, direction="up"),
+    Channel(
+        name="y",
+        sensitivity=2.5,
+        unit="V",
+        response=PolesZeros(poles=(-1 + 2j, -1 - 2j), zeros=(0j,), frequency=5.0),
+    ),
+    Channel(name="temperature", sensitivity=100.0, unit="°C", auxiliary=True),
+)
+
+
+def layout(name: str) -> SensorLayout:
+    return SensorLayout(name, CHANNELS, RATE, np.dtype("i4"), clock="c")
+
+
+def samples(first: int, n: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+    """Return counts that tell their place."""
+    return (np.arange(first, first + n)[:, None] * 10 + np.arange(3)).astype(np.int32)
+
+
+def at(sample: int) -> HostTime:
+    elapsed = round(sample / RATE * 1e9)
+    return HostTime(NOW.monotonic_ns + elapsed, NOW.utc_ns + elapsed)
+
+
+def block(sensor: str, first: int, n: int, **rest: object) -> Block:
+    return Block(sensor, first, samples(first, n), at(first + n), **rest)  # type: ignore[arg-type]
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "sub" / "r.h5"
+    writer = RecordingWriter.create(
+        path, sensors=[layout("b"), layout("a")], created=NOW, control=(4711, "token")
+    )
+    writer.append(block("b", 0, 130, flags=BlockFlag.CLOCK_RESTART, device_counter=7))
+    writer.append(block("b", 150, 70, reason="cable"))
+    writer.gap("b", 130, 20, reason="Käbel" * 30, estimated=True)
+    instants = np.arange(50, dtype=np.int64) * 10_000_000
+    writer.append(block("a", 0, 50, instants_ns=instants))
+    writer.event(Event("b", "connected", "hello", NOW))
+    done = writer.close()
+    assert done.closed
+    assert done.sensors["b"].rows == 200
+
+    with Recording.open(path) as recording:
+        assert recording.closed
+        assert [sensor.name for sensor in recording.sensors] == ["b", "a"]
+        b, a = recording.sensors
+        assert b.channels == CHANNELS
+        assert b.n_samples == 200
+        np.testing.assert_array_equal(b.counts(0, 130), samples(0, 130))
+        np.testing.assert_array_equal(b.counts(130), samples(150, 70))
+        assert b.blocks["first_sample"].tolist() == [0, 150]
+        assert b.blocks["first_row"].tolist() == [0, 130]
+        assert b.blocks["device_counter"].tolist() == [7, -1]
+        assert b.blocks["monotonic_ns"].tolist() == [at(130).monotonic_ns, at(220).monotonic_ns]
+        (gap,) = b.gaps
+        assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (130, 20, 1)
+        assert len(gap["reason"]) in {99, 100}
+        assert gap["reason"].decode().startswith("KäbelKäbel")
+        np.testing.assert_array_equal(a.instants_ns(), instants)
+        assert a.polled
+        assert not b.polled
+        assert recording.events == (Event("b", "connected", "hello", NOW),)
+        assert recording.bench is None
+        assert not recording.refresh()
+        with pytest.raises(IndexError, match="200 are committed"):
+            b.counts(0, 201)
+        with pytest.raises(RecordingError, match="no instants"):
+            b.instants_ns()
+
+
+def test_plain_h5py_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    writer.append(block("a", 0, 250))
+    writer.close()
+    with h5py.File(path, "r") as file:
+        assert file.attrs["format"] == "huddle-recording"
+        dataset = file["sensors/a/samples"]
+        assert dataset.shape == (250, 3)
+        assert dataset.chunks == (100, 3)
+        assert dataset.fletcher32
+        assert list(dataset.attrs["unit"]) == ["m/s²", "V", "°C"]
+        np.testing.assert_array_equal(dataset[...], samples(0, 250))
+
+
+def test_only_whole_chunks_and_whole_blocks_are_committed(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    for first in range(0, 195, 15):
+        writer.append(block("a", first, 15))
+    done = writer.commit()
+    # 195 samples: one chunk of 100 is on disk, and the blocks up to row 90 end within it.
+    assert done.sensors["a"].rows == 90
+    assert done.sensors["a"].blocks == 6
+    with h5py.File(path, "r", swmr=True, locking=False) as file:
+        assert file["sensors/a/samples"].shape == (100, 3)
+    assert writer.close().sensors["a"].rows == 195
+
+
+def test_small_blocks_become_rows_of_a_tenth_of_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    for first in range(0, 20, 2):
+        writer.append(block("a", first, 2))
+    writer.append(block("a", 24, 2, reason="dropped"))
+    writer.append(block("a", 26, 2, flags=BlockFlag.CLIPPED))
+    writer.append(block("a", 28, 2, flags=BlockFlag.CLIPPED))
+    writer.close()
+    with Recording.open(path) as recording:
+        blocks = recording.sensors[0].blocks
+        assert blocks["first_sample"].tolist() == [0, 10, 24, 26]
+        assert blocks["n_samples"].tolist() == [10, 10, 2, 4]
+        assert blocks["monotonic_ns"].tolist() == [at(n).monotonic_ns for n in (10, 20, 26, 30)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(1, 350), min_size=1, max_size=12), st.sets(st.integers(0, 11)))
+def test_any_blocks_and_commits(
+    tmp_path_factory: pytest.TempPathFactory, lengths: list[int], commits: set[int]
+) -> None:
+    path = tmp_path_factory.mktemp("r") / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    first = 0
+    for number, length in enumerate(lengths):
+        writer.append(block("a", first, length))
+        first += length
+        if number in commits:
+            rows = writer.commit().sensors["a"].rows
+            assert first - rows < 100 + max(lengths)
+    writer.close()
+    with Recording.open(path) as recording:
+        np.testing.assert_array_equal(recording.sensors[0].counts(), samples(0, first))
+
+
+FOLLOWER = """
+import json, sys
+from daq.recording.reader import Recording
+with Recording.open(sys.argv[1]) as recording:
+    sensor = recording.sensors[0]
+    for line in sys.stdin:
+        news = recording.refresh()
+        print(json.dumps([news, sensor.n_samples, int(sensor.counts().sum()), recording.closed,
+                          len(recording.events)]), flush=True)
+"""
+
+
+def test_another_process_follows(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    command = [sys.executable, "-c", FOLLOWER, str(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as follower:
+        assert follower.stdin is not None
+        assert follower.stdout is not None
+        asking, answering = follower.stdin, follower.stdout
+
+        def ask() -> list[object]:
+            print(file=asking, flush=True)
+            answer: list[object] = json.loads(answering.readline())
+            return answer
+
+        assert ask() == [False, 0, 0, False, 0]
+        for first in range(0, 300, 100):
+            writer.append(block("a", first, 100))
+            writer.event(Event("a", "mark", "", NOW))
+            writer.commit()
+            end = first + 100
+            assert ask() == [True, end, int(samples(0, end).sum()), False, end // 100]
+            assert ask()[0] is False
+        writer.append(block("a", 300, 7))
+        assert is_being_written(path)
+        writer.close()
+        assert not is_being_written(path)
+        assert ask() == [True, 307, int(samples(0, 307).sum()), True, 3]
+
+
+def test_it_can_be_followed_within_one_process(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    with Recording.open(path) as recording:
+        writer.append(block("a", 0, 100))
+        writer.commit()
+        assert recording.refresh()
+        np.testing.assert_array_equal(recording.sensors[0].counts(), samples(0, 100))
+        writer.close()
+        assert recording.refresh()
+        assert recording.closed
+
+
+def test_refuses_to_overwrite(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    path.write_text("precious", encoding="utf-8")
+    with pytest.raises(RecordingError, match="exists already"):
+        RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+
+
+def test_counts_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    writer = RecordingWriter.create(tmp_path / "r.h5", sensors=[layout("a")], created=NOW)
+    wide = Block("a", 0, np.full((3, 3), 2**40), NOW)
+    with pytest.raises(RecordingError, match="int64 do not fit int32"):
+        writer.append(wide)
+    writer.abandon()
+
+
+# What is no recording is refused, and the message says why.
+
+
+@pytest.fixture
+def closed(tmp_path: Path) -> Path:
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    writer.append(block("a", 0, 250))
+    writer.close()
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(NotARecordingError) as caught:
+        Recording.open(path)
+    return str(caught.value)
+
+
+def test_refuses_text(tmp_path: Path) -> None:
+    (tmp_path / "t.h5").write_text("hello", encoding="utf-8")
+    assert "not even an HDF5 file" in refusal(tmp_path / "t.h5")
+
+
+def test_refuses_absent(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="No such file"):
+        Recording.open(tmp_path / "none.h5")
+
+
+def test_refuses_foreign(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        file["data"] = [1, 2, 3]
+    assert "it does not say what it is" in refusal(tmp_path / "f.h5")
+
+
+def test_refuses_newer(closed: Path) -> None:
+    with h5py.File(closed, "r+") as file:
+        file.attrs["format_version"] = 99
+    assert "written by a newer huddle (format 99)" in refusal(closed)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.001, 0.01, 0.5, 0.99])
+def test_refuses_truncated(closed: Path, kept: float) -> None:
+    size = closed.stat().st_size
+    with closed.open("r+b") as file:
+        file.truncate(int(kept * size))
+    assert ("truncated" if kept else "not even") in refusal(closed)

@@ -1,0 +1,275 @@
+"""Every kind of port is the same byte stream."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import threading
+import tty
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel, Sensor
+from daq.drivers.epson.device import Configuration
+from daq.drivers.epson.driver import EpsonSession
+from daq.drivers.interface import DeviceInformation
+from daq.drivers.registry import driver_type
+from daq.errors import NotConnectedError
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block
+from daq.protocols.epson import commands
+from daq.transport.address import host_and_port
+from daq.transport.ports import open_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+
+class _Far:
+    """The far end of a port."""
+
+    def __init__(self, send: Callable[[bytes], None], hang_up: Callable[[], None]) -> None:
+        self.send = send
+        self.hang_up = hang_up
+        self.received = bytearray()
+        self._more = asyncio.Event()
+
+    def take(self, received: bytes) -> None:
+        self.received.extend(received)
+        self._more.set()
+
+    async def arrived(self, n_bytes: int) -> bytes:
+        while len(self.received) < n_bytes:
+            self._more.clear()
+            await self._more.wait()
+        return bytes(self.received)
+
+
+@asynccontextmanager
+async def _pseudo_terminal() -> AsyncIterator[tuple[str, _Far]]:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    name = os.ttyname(slave)
+    os.set_blocking(master, False)
+    opened = [slave, master]
+    loop = asyncio.get_running_loop()
+
+    def hang_up() -> None:
+        loop.remove_reader(master)
+        while opened:
+            os.close(opened.pop())
+
+    far = _Far(lambda payload: (os.write(master, payload), None)[1], hang_up)
+    loop.add_reader(master, lambda: far.take(os.read(master, 4096)))
+    try:
+        yield name, far
+    finally:
+        if opened:
+            hang_up()
+
+
+@asynccontextmanager
+async def _tcp() -> AsyncIterator[tuple[str, _Far]]:
+    ready = asyncio.Event()
+    writers: list[asyncio.StreamWriter] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers.append(writer)
+        ready.set()
+        while received := await reader.read(4096):
+            far.take(received)
+        writer.close()
+
+    def send(payload: bytes) -> None:
+        writers[0].write(payload)
+
+    def hang_up() -> None:
+        writers[0].close()
+
+    far = _Far(send, hang_up)
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        number = server.sockets[0].getsockname()[1]
+        yield f"socket://127.0.0.1:{number}", far
+        await asyncio.gather(*(writer.wait_closed() for writer in writers))
+
+
+KINDS = {"pseudo-terminal": _pseudo_terminal, "TCP": _tcp}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_bytes_pass_both_ways_with_their_time(kind: str) -> None:
+    clock = SystemClock()
+    async with KINDS[kind]() as (port, far), open_port(port, clock) as stream:
+        await stream.write(b"\x80\x0d\xff")
+        assert await far.arrived(3) == b"\x80\x0d\xff"
+        before = clock.now()
+        far.send(bytes(range(256)))
+        received = b""
+        while len(received) < 256:
+            part, at = await stream.read()
+            received += part
+            assert before.monotonic_ns <= at.monotonic_ns <= clock.now().monotonic_ns
+        assert received == bytes(range(256))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_hang_up_ends_the_stream_after_its_last_bytes(kind: str) -> None:
+    async with KINDS[kind]() as (port, far):
+        label = f"sensor A on {port}"
+        async with open_port(port, SystemClock(), label=label) as stream:
+            await stream.write(b"?")
+            await far.arrived(1)
+            if kind == "TCP":  # a pseudo-terminal drops what was not read when its master closes
+                far.send(b"last")
+            far.hang_up()
+            if kind == "TCP":
+                assert (await stream.read())[0] == b"last"
+            with pytest.raises(NotConnectedError, match=f"{label}: the port closed"):
+                await stream.read()
+            with pytest.raises(NotConnectedError):
+                await stream.write(b"?")
+
+
+async def test_a_port_without_descriptor_is_read_by_a_thread() -> None:
+    async with open_port("loop://", SystemClock()) as stream:
+        await stream.write(b"round")
+        received = b""
+        while received != b"round":
+            received += (await stream.read())[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_it_wakes_when_as_many_bytes_are_there_as_were_expected(kind: str) -> None:
+    async with KINDS[kind]() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(99))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 100
+        stream.expect(100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(1))
+        far.hang_up()  # is seen at once, whatever is expected
+        with contextlib.suppress(NotConnectedError):
+            await reading
+
+
+async def test_a_terminal_that_cannot_count_so_far_wakes_at_the_end_of_a_frame() -> None:
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(3, 100)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(199))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 200
+
+
+async def test_what_came_of_a_frame_already_is_not_waited_for_again() -> None:
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        await stream.write(b"?")
+        await far.arrived(1)
+        stream.expect(2, 100, begun=30)
+        reading = asyncio.create_task(stream.read())
+        far.send(bytes(169))
+        done, _ = await asyncio.wait([reading], timeout=0.05)
+        assert not done
+        far.send(bytes(1))
+        assert len((await reading)[0]) == 170
+
+
+async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() -> None:
+    """Else every block's time is late by most of a sample period, until the host is late once."""
+    channels = tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz")
+    sensor = Sensor(name="A", driver="epson", port="x", sampling_rate=50.0, channels=channels)
+    configuration = Configuration.of(sensor)
+    zeros = np.zeros(20, np.int32)
+    sent = commands.encode_bursts(
+        configuration.burst, x=zeros, y=zeros, z=zeros, count=np.arange(20)
+    )
+    cut = 7
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        decoder = configuration.decoder("A")
+        session = EpsonSession(stream, configuration, DeviceInformation("A"), decoder)
+        items = session.read()
+
+        async def block() -> Block:
+            while not isinstance(item := await anext(items), Block):
+                pass
+            return item
+
+        reading = asyncio.create_task(block())
+        await far.arrived(1)  # it is told to begin
+        size = configuration.burst.size
+        far.send(sent[cut : cut + 5 * size])  # its first frame lacks its start
+        assert ((await reading).n_samples, decoder.begun) == (4, cut)
+        reading = asyncio.create_task(block())
+        far.send(sent[cut + 5 * size : 10 * size])
+        async with asyncio.timeout(30):  # the driver loses its own patience sooner
+            second = await reading
+        assert (second.first_sample, second.n_samples, decoder.begun) == (4, 5, 0)
+
+
+async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience() -> None:
+    async with open_port("loop://", SystemClock()) as stream:
+        stream.expect(10)
+        await stream.write(bytes(1))  # for the read that is under way
+        await stream.read()
+        reading = asyncio.create_task(stream.read())
+        for _ in range(10):  # they take three times as long as a read waits
+            await stream.write(bytes(1))
+            await asyncio.to_thread(threading.Event().wait, 0.03)
+        assert len((await reading)[0]) == 10
+
+
+async def test_discard_forgets_what_was_not_read() -> None:
+    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
+        stream.feed(b"old")
+        assert stream.discard() == 3
+        far.send(b"new")
+        assert (await stream.read())[0] == b"new"
+
+
+async def test_a_busy_port_is_named() -> None:
+    async with _pseudo_terminal() as (port, _), open_port(port, SystemClock()):
+        with pytest.raises(NotConnectedError, match=f"{port}: busy: another program"):
+            async with open_port(port, SystemClock()):
+                pass
+
+
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("/dev/ttyNotThere", "there is no such port; serial ports here: "),
+        ("/dev/null", "not a serial port|Inappropriate ioctl"),
+        ("socket://127.0.0.1:1", "nothing listens there"),
+        ("socket://127.0.0.1", "expected socket://host:port"),
+        ("nonsense://x", "nonsense"),
+    ],
+)
+async def test_why_a_port_does_not_open(port: str, reason: str) -> None:
+    with pytest.raises(NotConnectedError, match=reason) as caught:
+        async with open_port(port, SystemClock(), label="sensor A"):
+            pass
+    assert str(caught.value).startswith("sensor A: ")
+
+
+def test_addresses() -> None:
+    assert host_and_port("socket://[::1]:502") == ("::1", 502)
+    with pytest.raises(ValueError, match="expected modbus-tcp://host:port"):
+        host_and_port("modbus-tcp://somewhere:many")
+
+
+def test_an_unknown_driver_is_told_which_there_are() -> None:
+    with pytest.raises(ValueError, match=r"'seismo'; expected one of .*epson"):
+        driver_type("seismo")

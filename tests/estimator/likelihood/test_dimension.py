@@ -1,0 +1,238 @@
+"""The dimension the model test accepts, what it buys, and what it costs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimator.errors import InsufficientDataError, InvalidMatrixError
+from estimator.likelihood.dimension import bands, choose_dimension
+from estimator.likelihood.maximum_likelihood import maximum_likelihood
+from estimator.likelihood.prior import expected_noise
+from estimator.self_noise.three_sensor import three_sensor
+from tests.estimator.csm_models import pentagon, plane_waves, random_bench, rotation, wishart
+
+FIVE = (3,) * 5
+THREE = (3,) * 3
+INDEPENDENT = np.zeros(0)
+ITEM_9_SNR = 400.0
+"""Of each horizontal: at this the three-sensor estimate has the biases that item 9 gives."""
+
+
+def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
+    """Item 9 of method.md: bias of the mean over each band and all channels."""
+    centres = np.array([1.0, 3.5, 7, 10, 20, 50])
+    frequency = (centres[:, None] * np.linspace(0.95, 1.05, 24)).ravel()
+    band = np.repeat(np.arange(len(centres)), 24)
+    csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR)
+    averages = wishart(csm, 1080, np.random.default_rng(1))[0]
+    n_factors, choices = choose_dimension(
+        averages, frequency, dims=FIVE, n_effective=1080, band=band, neighbours=INDEPENDENT
+    )
+    found = maximum_likelihood(averages, dims=FIVE, n_effective=1080, n_factors=n_factors)
+    plain = three_sensor(averages, dims=FIVE, n_effective=1080)
+
+    def bias(psd: np.ndarray) -> np.ndarray:
+        return np.array([psd[band == b].mean() - 1 for b in range(len(centres))])
+
+    at = dict(zip(centres.tolist(), bias(plain.noise_psd), strict=True))
+    assert at[20.0] == pytest.approx(1.95, abs=0.15)
+    assert at[50.0] == pytest.approx(11.95, abs=0.6)
+    assert np.all(np.abs(bias(found.noise_psd)[centres <= 20]) < 0.05)
+    assert abs(bias(found.noise_psd)[-1]) < 0.20
+    # 24 frequencies of 15 channels a band; the least visible factors are at 3.5 and 7 Hz
+    covered = ((found.low < 1) & (found.high > 1)).reshape(len(centres), -1).mean(axis=1)
+    assert np.all(covered > 0.88)
+    assert covered[1:].mean() > 0.95
+    assert choices[0].n_factors == 3
+    assert all(choice.accepted for choice in choices)
+    assert all(choice.n_factors >= 9 for choice in choices[-2:])
+    assert np.all(np.diff([choice.n_factors for choice in choices]) >= 0)
+    assert "do not feel one motion" in choices[-1].text
+    for choice in choices[2:]:
+        assert choice.cov > choice.usual_cov  # the price
+        assert all(test.p_value < 0.05 for test in choice.tried[:-1])
+
+
+def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:
+    """Aligned sensors whose noise spans a factor of 12, told apart where the motion is one."""
+    noise_psd = np.repeat([1, 0.5, 2, 1, 3.0], 3) * np.tile([1, 1, 2.0], 5)
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 20 * np.linspace(0.95, 1.05, 40)])
+    csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
+    averages = wishart(csm, 1080, np.random.default_rng(7))[0]
+    n_factors, (_, above) = choose_dimension(
+        averages,
+        frequency,
+        dims=FIVE,
+        n_effective=1080,
+        band=np.repeat([0, 1], 40),
+        neighbours=INDEPENDENT,
+    )
+    assert above.n_factors == 9
+    found = maximum_likelihood(averages, dims=FIVE, n_effective=1080, n_factors=n_factors)
+    ratio = found.noise_psd[40:] / noise_psd
+    assert ratio.mean() == pytest.approx(1, abs=0.05)
+    assert np.all(np.abs(ratio.mean(axis=0) - 1) < 0.25)
+    covered = (found.low[40:] < noise_psd) & (noise_psd < found.high[40:])
+    assert covered.mean() > 0.9
+
+
+def test_known_ratios_spare_factors() -> None:
+    """A prior of equal noise would ask for ten to explain noise a hundred times apart."""
+    noise_psd = np.repeat([1, 0.2, 5, 1, 20.0], 3)
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 10 * np.linspace(0.95, 1.05, 40)])
+    csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
+    _, choices = choose_dimension(
+        wishart(csm, 1080, np.random.default_rng(3))[0],
+        frequency,
+        dims=FIVE,
+        n_effective=1080,
+        band=np.repeat([0, 1], 40),
+        neighbours=INDEPENDENT,
+    )
+    assert choices[0].n_factors == 3
+    assert 7 <= choices[1].n_factors <= 9
+
+
+def test_ratios_come_from_the_nearest_frequencies() -> None:
+    noise_psd = np.ones((200, 3))
+    noise_psd[:100, 1] = 4.0
+    noise_psd[100:, 1] = 0.25
+    usual = np.arange(200) % 100 >= 60
+    noise_psd[~usual] = np.nan
+    kind = np.zeros(3, np.int64)
+    expected = expected_noise(noise_psd, usual, kind)
+    np.testing.assert_allclose(expected[70, 1] / expected[70, 0], 4)
+    np.testing.assert_allclose(expected[190, 1] / expected[190, 0], 0.25)
+    np.testing.assert_array_equal(expected_noise(noise_psd, usual & False, kind), 1)
+
+
+def test_three_sensors_have_no_room_and_say_so() -> None:
+    frequency = np.linspace(18, 22, 20)
+    csm = wishart(plane_waves(frequency, pentagon()[:3]), 1080, np.random.default_rng(2))[0]
+    n_factors, (choice,) = choose_dimension(
+        csm, frequency, dims=THREE, n_effective=1080, band=np.zeros(20, np.int64)
+    )
+    assert not choice.accepted
+    assert np.all(n_factors == choice.n_factors)
+    assert "biased" in choice.text
+
+
+def test_a_missing_dimension_is_left_out_and_precision_gained() -> None:
+    """Horizontal motion only, triaxial sensors at random orientations."""
+    rng = np.random.default_rng(3)
+    directions = np.concatenate([rotation(rng, 3) for _ in range(3)])[:, :2]
+    csm = directions @ np.diag([100.0, 150.0]) @ directions.T + np.eye(9)
+    averages = wishart(csm.astype(np.complex128), 1080, rng, n_draws=200)
+    frequency = np.linspace(1, 2, 200)
+    whole = np.zeros(200, np.int64)
+    n_factors, (choice,) = choose_dimension(
+        averages, frequency, dims=THREE, n_effective=1080, band=whole, neighbours=INDEPENDENT
+    )
+    assert choice.n_factors == 2
+    assert "2 of 3 dimensions" in choice.text
+    chosen = maximum_likelihood(averages, dims=THREE, n_effective=1080, n_factors=n_factors)
+    usual = maximum_likelihood(averages, dims=THREE, n_effective=1080)
+    scatter = chosen.noise_psd.std(axis=0).mean()
+    assert scatter < 0.8 * usual.noise_psd.std(axis=0).mean()
+    assert scatter == pytest.approx(choice.cov, rel=0.1)
+    assert chosen.noise_psd.mean() == pytest.approx(1, abs=0.005)
+
+
+@pytest.mark.parametrize("snr", [0.0, 1.0, 1e4])
+def test_the_full_motion_is_left_alone(snr: float) -> None:
+    """The fewest dimensions that explain noise alone are none."""
+    rng = np.random.default_rng(4)
+    csm = random_bench(rng, dims=THREE, snr=snr, noise_psd=np.ones(9))
+    averages = wishart(csm, 500, rng, n_draws=60)
+    _, choices = choose_dimension(
+        averages, np.linspace(1, 1.2, 60), dims=THREE, n_effective=500, neighbours=INDEPENDENT
+    )
+    assert [choice.n_factors for choice in choices] == [3 if snr else 0]
+    assert choices[0].accepted
+
+
+def test_a_singular_frequency_does_not_spoil_its_band() -> None:
+    rng = np.random.default_rng(5)
+    averages = wishart(
+        random_bench(rng, dims=THREE, snr=1e3, noise_psd=np.ones(9)), 500, rng, n_draws=20
+    )
+    averages[3] = averages[3, :, :1] @ averages[3, :1, :] / averages[3, 0, 0]
+    _, (choice,) = choose_dimension(
+        averages, np.linspace(1, 1.2, 20), dims=THREE, n_effective=500, neighbours=INDEPENDENT
+    )
+    assert choice.n_factors == 3
+    assert choice.test.n_frequencies == 19
+
+
+def test_a_dead_sensor_is_none() -> None:
+    """Four sensors of which one is dead are three: no room for further factors; two are refused."""
+    frequency = np.linspace(18, 22, 20)
+    csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
+    three = csm[:, :9, :9].copy()
+    csm[:, 9:, :] = csm[:, :, 9:] = 0
+    band = np.zeros(20, np.int64)
+    with_dead, (choice,) = choose_dimension(
+        csm, frequency, dims=(3,) * 4, n_effective=1080, band=band
+    )
+    without, (same,) = choose_dimension(three, frequency, dims=THREE, n_effective=1080, band=band)
+    np.testing.assert_array_equal(with_dead, without)
+    assert choice.test.degrees == same.test.degrees
+    assert choice.test.statistic == pytest.approx(same.test.statistic, rel=1e-6)
+    csm[:, 6:, :] = csm[:, :, 6:] = 0
+    with pytest.raises(InsufficientDataError, match="2 sensors have a signal of their own"):
+        choose_dimension(csm, frequency, dims=(3,) * 4, n_effective=1080)
+
+
+def test_channels_stay_with_their_like_when_one_is_dead() -> None:
+    """Channels x are twelve times noisier than y: who compares one sensor's y with x is misled."""
+    frequency = np.concatenate([np.linspace(0.95, 1.05, 24), 20 * np.linspace(0.95, 1.05, 24)])
+    band = np.repeat([0, 1], 24)
+    noise_psd = np.tile([12.0, 1, 1], 5)
+    csm = plane_waves(frequency, pentagon(), snr=400.0) + np.diag(noise_psd - 1)
+    averages = wishart(csm, 60, np.random.default_rng(4))[0]
+    averages[:, 0] = averages[:, :, 0] = 0
+    found = []
+    for unit in (1.0, 1e-10):  # the one in which a dead channel's stand-in has noise of one, or not
+        n_factors, (_, choice) = choose_dimension(
+            averages * unit, frequency, dims=FIVE, n_effective=60, band=band
+        )
+        result = maximum_likelihood(averages * unit, dims=FIVE, n_effective=60, n_factors=n_factors)
+        assert choice.n_factors > 3
+        found.append(np.append(result.noise_psd[band == 1][:, 1:].mean(axis=0) / unit, choice.cov))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+    # the median c.o.v. is 0.34; four standard errors of a mean over 24 frequencies
+    np.testing.assert_allclose(found[0][:-1], noise_psd[1:], rtol=4 * 0.34 / np.sqrt(24))
+    assert choice.cov < 0.4
+
+
+def test_bands_are_third_octaves_of_enough_frequencies() -> None:
+    frequency = np.arange(1001) / 10
+    number = bands(frequency)
+    assert number[0] == number[1] == 0
+    assert np.all(np.diff(number) >= 0)
+    counts = np.bincount(number)
+    assert counts.min() >= 8
+    first = frequency[np.flatnonzero(np.diff(number, prepend=-1))]
+    np.testing.assert_allclose(first[12:] / first[11:-1], 2 ** (1 / 3), rtol=0.03)
+    assert bands(np.array([0.0, 1.0])).tolist() == [0, 0]
+
+
+def test_refusals() -> None:
+    rng = np.random.default_rng(6)
+    averages = wishart(random_bench(rng, dims=THREE, snr=1, noise_psd=np.ones(9)), 50, rng)
+    with pytest.raises(InvalidMatrixError, match="frequency"):
+        choose_dimension(averages, np.zeros(3), dims=THREE, n_effective=50)
+    with pytest.raises(InvalidMatrixError, match="band"):
+        choose_dimension(
+            averages, np.ones(1), dims=THREE, n_effective=50, band=np.zeros(2, np.int64)
+        )
+    with pytest.raises(InsufficientDataError, match="averages"):
+        choose_dimension(averages, np.ones(1), dims=THREE, n_effective=9)
+    for n in (np.nan, np.inf, -1):
+        with pytest.raises(InsufficientDataError, match="finite number above zero"):
+            choose_dimension(averages, np.ones(1), dims=THREE, n_effective=n)
+    twice = np.tile(averages, (2, 1, 1))
+    for frequency in ([2.0, 1.0], [1.0, np.nan]):
+        with pytest.raises(InvalidMatrixError, match="rising"):
+            choose_dimension(twice, np.array(frequency), dims=THREE, n_effective=50)

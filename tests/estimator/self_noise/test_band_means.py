@@ -1,0 +1,87 @@
+"""The uncertainty of a band's mean is that of simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daq.results.band_summary import band_of
+from estimator.self_noise.band_means import (
+    NORMAL_95,
+    band_edges,
+    band_means,
+    bin_correlation,
+    log_edges,
+)
+from tests.tui.example_snapshot import SETTINGS, made_snapshot
+from tui.output.results import result_table, result_title
+
+
+@pytest.mark.parametrize(("name", "overlap"), [("hann", 0.5), ("rectangular", 0.0), ("hann", 0.75)])
+def test_cov_of_a_band_mean_is_that_of_simulated_periodograms(name: str, overlap: float) -> None:
+    rng = np.random.default_rng(5)
+    length, n_segments, n_runs = 64, 40, 1500
+    hop = round(length * (1 - overlap))
+    window = np.hanning(length + 1)[:-1] if name == "hann" else np.ones(length)
+    samples = rng.standard_normal((n_runs, length + hop * (n_segments - 1)))
+    segments = np.lib.stride_tricks.sliding_window_view(samples, length, axis=1)[:, ::hop]
+    psd = (np.abs(np.fft.rfft(segments * window)) ** 2).mean(axis=1)
+    edges = np.array([4, 28])
+    truth = psd[:, 4:28].mean(axis=1)
+    cov_of_bin = psd[:, 4:28].std(axis=0).mean() / truth.mean()
+
+    found = band_means(psd[0], np.full(33, cov_of_bin), edges, bin_correlation(window, hop))
+
+    # The standard deviation of n_runs draws is known to 1 / sqrt(2 n_runs) = 1.8 %.
+    assert found.spread[0] / found.mean[0] == pytest.approx(truth.std() / truth.mean(), rel=0.08)
+    assert found.mean[0] == pytest.approx(truth[0])
+
+
+def test_hann_bins_are_correlated_as_in_theory() -> None:
+    window = np.hanning(257)[:-1]
+    np.testing.assert_allclose(
+        bin_correlation(window, 256)[:4], [1, (2 / 3) ** 2, (1 / 6) ** 2, 0], atol=1e-12
+    )
+
+
+def test_bins_without_a_number_are_left_out_and_negative_means_stay_negative() -> None:
+    psd = np.array([1.0, np.nan, 3.0, -2.0, -4.0, np.nan])
+    cov = np.where(np.isfinite(psd), 0.1, np.nan)
+    uncorrelated = np.array([1.0, 0.0])
+    found = band_means(psd, cov, np.array([0, 3, 5, 6]), uncorrelated)
+    np.testing.assert_allclose(found.mean, [2.0, -3.0, np.nan])
+    spread = np.array([np.hypot(0.1, 0.3), np.hypot(0.2, 0.4)]) / 2
+    np.testing.assert_allclose(found.high[0], 2 * np.exp(NORMAL_95 * spread[0] / 2))
+    np.testing.assert_allclose(found.low[1], -3 - NORMAL_95 * spread[1])
+    assert np.isnan(found.high[2])
+
+
+def test_bands_leave_zero_frequency_and_nyquist_out() -> None:
+    frequency = np.linspace(0, 100, 1001)
+    assert band_edges(frequency, (0.01, 1000)).tolist() == [1, 1000]
+    assert frequency[slice(*band_edges(frequency, (1.0, 20.0)))][[0, -1]].tolist() == [1.0, 20.0]
+    edges = log_edges(frequency, 70)
+    assert edges[0] == 1
+    assert edges[-1] == 1000
+    assert np.all(np.diff(edges) > 0)
+    with pytest.raises(ValueError, match="no frequency between"):
+        band_edges(frequency, (120.0, 130.0))
+
+
+@pytest.mark.parametrize("asked", [(10.0, 98.0), None])
+def test_a_band_ends_where_nothing_can_be_said(asked: tuple[float, float] | None) -> None:
+    snapshot, settings = made_snapshot(), replace(SETTINGS, band=asked)
+    snapshot.csm[snapshot.frequency > 80] = np.nan  # resampled
+    assert band_of(settings, snapshot)[1] == 80
+    title = result_title(snapshot, settings)
+    assert "to 80 Hz" in title
+    assert ("(98 was asked for)" in title) == (asked is not None)
+    assert "?" not in list(result_table(snapshot, settings).columns[2].cells)
+
+
+def test_a_band_of_which_nothing_is_known_stays_what_it_is() -> None:
+    snapshot = made_snapshot()
+    snapshot.csm[snapshot.frequency > 80] = np.nan
+    assert band_of(replace(SETTINGS, band=(85.0, 95.0)), snapshot) == (85.0, 95.0)

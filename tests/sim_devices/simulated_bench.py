@@ -1,0 +1,82 @@
+"""A bench of simulated devices, and the sensors that connect to them."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from daq.bench.model import Bench, Channel, Sensor
+from daq.protocols.epson import commands
+from sim_devices.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sim_devices.server.launch import RunningDevice
+
+RATE = 200.0
+AXES = tuple({"name": axis, "sensitivity": commands.COUNTS_PER_UNIT} for axis in "xyz")
+TEMPERATURE = {"name": "temperature", "sensitivity": 1.0, "auxiliary": True}
+
+
+def scenario(names: Sequence[str], *, sampling_rate: float = RATE) -> Scenario:
+    """One white motion in three directions, sensors with little noise of their own."""
+    motion = {"spectra": [{"shape": "white", "level": 1e-6}] * 3}
+    sensors = {name: {"noise": {"shape": "white", "level": 1e-12}} for name in names}
+    return Scenario.from_dict({"motion": motion, "sensors": sensors}, sampling_rate=sampling_rate)
+
+
+def device(name: str, driver: str = "epson", **changes: Any) -> dict[str, Any]:  # noqa: ANN401
+    """One device of a specification."""
+    channels = [*AXES, TEMPERATURE] if driver == "epson" else list(AXES)
+    return {
+        "sensors": [name],
+        "driver": driver,
+        "port": "pty",
+        "sampling_rate": RATE,
+        "channels": {name: channels},
+        **changes,
+    }
+
+
+def spec(
+    *devices: dict[str, Any], speed: float = 1.0, age: float = 5.0, sampling_rate: float = RATE
+) -> dict[str, Any]:
+    """Specification of a world that began ``age`` seconds of world time ago."""
+    names = [name for one in devices for name in one["sensors"]]
+    return {
+        "epoch_ns": time.monotonic_ns() - round(age / speed * 1e9),
+        "speed": speed,
+        "scenario": scenario(names, sampling_rate=sampling_rate).to_dict(),
+        "devices": list(devices),
+    }
+
+
+def bench_of(
+    running: Sequence[RunningDevice],
+    tables: Sequence[dict[str, Any]],
+    **changes: Any,  # noqa: ANN401 -- whatever a bench holds
+) -> Bench:
+    """Return the bench of running devices, each beside its table."""
+    every = tuple(
+        sensor for one, table in zip(running, tables, strict=True) for sensor in sensors(one, table)
+    )
+    return Bench(name="simulated", sampling_rate=RATE, sensors=every, **changes)
+
+
+def sensors(running: RunningDevice, table: dict[str, Any], **changes: Any) -> list[Sensor]:  # noqa: ANN401
+    """Sensors of a bench file that connects to a running device."""
+    return [
+        Sensor(
+            **{
+                "name": name,
+                "driver": running.driver,
+                "port": running.port,
+                "sampling_rate": table["sampling_rate"],
+                "settings": running.settings,
+                "channels": tuple(Channel(**c) for c in table["channels"][name]),
+                **changes,
+            }
+        )
+        for name in running.sensors
+    ]

@@ -1,0 +1,270 @@
+"""The application: what it tells its recorder, what it says of a snapshot, how it looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from textual.widgets import Static
+
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.example_snapshot import (
+    SETTINGS,
+    ProgressCallback,
+    empty_snapshot,
+    growing,
+    made_now,
+    made_snapshot,
+    waiting_now,
+)
+from tui.application.app import HuddleApp
+from tui.application.messages import ErrorReported, RecordingOpened, SnapshotReady, StatusUpdated
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from textual.message import Message
+    from textual.pilot import Pilot
+
+NARROW, WIDE = (80, 24), (160, 45)
+
+
+async def shown(pilot: Pilot[None], app: HuddleApp, *messages: Message) -> None:
+    """Post messages and wait until they have been drawn."""
+    for message in messages:
+        app.post_message(message)
+    for _ in range(4):
+        await pilot.pause()
+
+
+def running(*, n_effective: float = 100.0) -> tuple[Message, Message]:
+    """Return what comes from a recording that grows."""
+    return StatusUpdated(made_now()), SnapshotReady(
+        made_snapshot(n_effective=n_effective), SETTINGS
+    )
+
+
+def ended() -> tuple[Message, Message]:
+    """Return what comes when it has ended."""
+    result = made_snapshot(n_effective=2000, closed=True)
+    return StatusUpdated(made_now(elapsed=2000.0, closed=True)), SnapshotReady(result, SETTINGS)
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5")
+
+
+# -------------------------------------------------------------------- messages first
+
+
+async def test_keys_tell_the_recorder(told: ProgressCallback, tmp_path: Path) -> None:
+    app, path = HuddleApp(told), tmp_path / "grows.h5"
+    with growing(path):
+        async with app.run_test(size=NARROW) as pilot:
+            await pilot.press("x", "m")
+            assert told.told == []  # nothing runs: nothing to stop or mark
+            await shown(pilot, app, RecordingOpened(path), *running())
+            await pilot.press("s")  # one runs already
+            await pilot.press("m", *"door", "enter")
+            await pilot.press("x", "escape")  # asked, and thought better of it
+            await pilot.press("x", "x")
+            for worker in [worker for worker in app.workers if worker.group == "control"]:
+                await worker.wait()
+    assert told.told == ["mark grows.h5 door", "stop grows.h5"]
+
+
+async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
+    told: ProgressCallback,
+) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW, notifications=True) as pilot:
+        await pilot.press("s")
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert told.told == ["start"]
+        assert "run.h5" in screen_text(app)  # the file is not there: followed, and told so
+        assert "cannot be read" in screen_text(app)
+
+
+async def test_a_running_recording_is_found_again(told: ProgressCallback, tmp_path: Path) -> None:
+    told.running = tmp_path / "old.h5"
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert "old.h5" in screen_text(app)
+
+
+async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        both = ("three-sensor", "three-channel")
+        assert app.choice.methods == both
+        for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
+            await pilot.press(key)
+            assert app.choice.channel == channel
+        title = app.query_one("#title", Static)
+        assert "C X" in str(title.render())
+        for methods in (("three-sensor",), ("three-channel",), both):
+            await pilot.press("e")
+            assert app.choice.methods == methods
+
+
+async def test_trouble_is_told(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW, notifications=True) as pilot:
+        await shown(pilot, app, ErrorReported("sensor B at /dev/ttyUSB1: no answer"))
+        assert "no answer" in screen_text(app)
+
+
+async def test_the_result_comes_by_itself_and_its_report_on_request(
+    told: ProgressCallback, tmp_path: Path
+) -> None:
+    app = HuddleApp(told, path=tmp_path / "run.h5")  # which is not there: nothing else comes
+    async with app.run_test(size=WIDE) as pilot:
+        await app.workers.wait_for_complete()
+        await shown(pilot, app, *running())
+        assert "95 %" not in screen_text(app)
+        await shown(pilot, app, *ended())
+        assert "noise, 95 %" in screen_text(app)
+        await pilot.press("w")
+        await app.workers.wait_for_complete()
+    assert told.told == ["report run.h5 2"]
+
+
+async def test_quitting_tells_the_recorder_nothing(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        await pilot.press("q")
+    assert told.told == []
+    assert app.return_code == 0
+
+
+# --------------------------------------------------------------------- then pictures
+
+
+@pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
+async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        await assert_looks_as_before(pilot, f"{name}-idle")
+        await shown(
+            pilot, app, StatusUpdated(waiting_now()), SnapshotReady(empty_snapshot(), SETTINGS)
+        )
+        await assert_looks_as_before(pilot, f"{name}-waiting")
+        await shown(pilot, app, *running())
+        await pilot.press("down")
+        await pilot.pause()
+        await assert_looks_as_before(pilot, f"{name}-running")
+        await pilot.press("c")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-clocks")
+        await pilot.press("c", "d")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-details")
+        await pilot.press("escape")
+        await shown(pilot, app, *ended())
+        await assert_looks_as_before(pilot, f"{name}-result")
+        await pilot.press("escape")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-ended")
+        assert screen_text(app).splitlines()[-1].endswith("←→↑↓ Select")  # the longest line of keys
+        await pilot.press("question_mark")
+        await pilot.pause()
+        await assert_looks_as_before(pilot, f"{name}-help")
+
+
+async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) -> None:
+    snapshot = made_snapshot()
+    noise = snapshot.results["three-sensor"]
+    psd, high = noise.noise_psd.copy(), noise.high.copy()
+    psd[20:60, 0] = -1e-13
+    changed = replace(noise, noise_psd=psd, high=high, cov=np.abs(noise.cov))
+    snapshot = replace(snapshot, results={"three-sensor": changed})
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        text = screen_text(app)
+    assert "40 of 199 values at or below zero" in text
+    assert "▾" in text.replace("(▾ marks", "")
+
+
+async def test_without_colours_everything_is_there(
+    told: ProgressCallback, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        text = screen_text(app)
+        await pilot.press("c")
+        await shown(pilot, app)
+        assert "clock drift" in screen_text(app)
+    for said in ("● live", "○ silent", "no effect on noise", "▲ C is silent", "three-channel"):
+        assert said in text
+
+
+async def test_the_worst_is_told_first_and_how_much_more_there_is(told: ProgressCallback) -> None:
+    now = made_now()
+    first, second, third = now.sensors
+    worse = replace(
+        now,
+        sensors=(
+            replace(first, clips=True),
+            replace(second, state="disconnected", since=75.0),
+            replace(third, state="live", stuck=("Y",)),
+        ),
+    )
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, StatusUpdated(worse), SnapshotReady(made_snapshot(), SETTINGS))
+        text = screen_text(app)
+        assert "▲ B is disconnected for 1:15: check cable and power" in text
+        assert "+2: d" in text
+        assert [word in text for word in ("▲ clips", "○ lost 1:15", "▲ Y still")] == [True] * 3
+        await pilot.resize_terminal(*WIDE)
+        await shown(pilot, app)
+        assert "C.Y stands still: no signal" in screen_text(app)
+
+
+@pytest.mark.parametrize("target", [0.05, None])
+async def test_how_far_a_test_is_that_ends_by_itself(
+    told: ProgressCallback, target: float | None
+) -> None:
+    settings = replace(SETTINGS, target_cov=target)
+    snapshot = replace(made_snapshot(), time_left=None if target is None else 260.0)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        live = tuple(replace(sensor, state="live") for sensor in made_now().sensors)
+        now = replace(made_now(), sensors=live, ends_in=100.0)
+        await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, settings))
+        line = str(app.query_one("#progress", Static).content)
+    assert line.endswith("ends in 2 min")
+    assert (" · target in 5 min · " in line) == (target is not None)
+    bar = line.split(maxsplit=1)[0]
+    share = bar.count("━") / len(bar)
+    assert share == pytest.approx(100 / (100 + 100), abs=1 / len(bar))  # what comes first
+
+
+async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(
+    told: ProgressCallback,
+) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        await pilot.press("question_mark")
+        await shown(pilot, app, *running(n_effective=500))
+        await pilot.resize_terminal(100, 40)
+        await pilot.pause()
+        await pilot.press("escape")
+        await pilot.pause()
+        assert "530 segments" in screen_text(app)

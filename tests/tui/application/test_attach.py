@@ -1,0 +1,82 @@
+"""The application on simulated wires: start, close, find again, mark, stop."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.loading import dump
+from daq.drivers.bench_file import load, parse
+from daq.estimation.settings import Settings
+from daq.recording.control import ask
+from daq.recording.reader import Recording
+from tests.tui.application.screen_text import screen_text
+from tui.application.app import HuddleApp
+from tui.commands.tui import BenchControls
+from tui.simulation.devices import simulated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from textual.pilot import Pilot
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Path]:
+    """Yield a bench file that reaches three simulated accelerometers."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    path = tmp_path / "bench.toml"
+    with simulated(parse(text), speed=8.0) as reachable:
+        path.write_text(dump(reachable), encoding="utf-8")
+        yield path
+
+
+async def until(pilot: Pilot[None], reached: Callable[[], bool]) -> None:
+    """Let the application run until something is the case, for half a minute at most."""
+    deadline = time.monotonic() + 30
+    while not reached():
+        assert time.monotonic() < deadline, screen_text(pilot.app)
+        await pilot.pause(0.05)
+
+
+async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: Path) -> None:
+    settings = replace(Settings.of(load(bench)), methods=("three-sensor", "three-channel"))
+    controls = BenchControls(bench, load(bench), settings)
+    first = HuddleApp(controls)
+    async with first.run_test(size=(80, 24)) as pilot:
+        await pilot.press("s")
+        await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 6)
+        await pilot.press("q")
+    (recorder,) = controls.started
+    assert not recorder.ended
+    assert ask(recorder.out, "status")
+
+    second = HuddleApp(BenchControls(bench, load(bench), settings))
+    async with second.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: second.snapshot is not None)
+        await pilot.press("m", *"here", "enter")
+        await until(pilot, lambda: all(w.group != "control" for w in second.workers))
+        await pilot.press("x", "x")
+        await until(pilot, lambda: second.snapshot is not None and second.snapshot.closed)
+        snapshot = second.snapshot
+        assert snapshot is not None
+        assert {"three-sensor", "three-channel"} <= set(snapshot.results)
+        await until(pilot, lambda: "No limits in the bench file" in screen_text(second))
+        await until(pilot, lambda: all(w.group != "follow" for w in second.workers))
+        await pilot.press("w")
+        await until(pilot, lambda: recorder.out.with_suffix(".html").exists())
+    recorder.wait()
+    controls.release()
+    with Recording.open(recorder.out) as recording:
+        assert recording.closed
+        marks = [event.text for event in recording.events if event.kind == "mark"]
+        assert [mark.split(" (")[0] for mark in marks] == ["here"]
+        assert {"three-sensor", "three-channel"} == set(recording.results())

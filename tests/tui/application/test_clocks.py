@@ -1,0 +1,140 @@
+"""What the application says of clocks: what is left, whether it matters, how they drift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from daq.drivers.bench_file import parse
+from daq.results.clock_effect import effect, effect_by_sensor
+from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
+from tui.application.clocks import clock_line, drift_lines, drift_title
+from tui.application.plot import TimeAxis
+from tui.commands.demo import compare
+from tui.report.evidence import clocks_section
+from tui.report.parts import Paragraph, Table
+from tui.simulation.devices import scenario_of
+
+
+def test_effect_is_the_share_of_the_band_s_noise() -> None:
+    snapshot = made_snapshot()
+    share = np.zeros_like(snapshot.data_psd)
+    share[2:41, 3] = 0.2  # the band is 1 to 20 Hz, in steps of 0.5 Hz
+    share[41:, 4] = 0.9  # above it
+    snapshot = replace(
+        snapshot, diagnostics={"synchronisation": {"noise_bias": share, "residual": {}}}
+    )
+    shares = effect(snapshot, SETTINGS)
+    np.testing.assert_allclose(shares, [0, 0, 0, 0.2, 0, 0, 0, 0, 0], atol=1e-12)
+
+
+def test_effect_is_not_known_where_no_frequency_tells() -> None:
+    snapshot = made_snapshot(clock_share=np.nan)
+    assert np.isnan(effect(snapshot, SETTINGS)).all()
+    assert set(map(np.isnan, effect_by_sensor(snapshot, SETTINGS).values())) == {True}
+
+
+@pytest.mark.parametrize(
+    ("share", "said", "style"),
+    [
+        (0.0004, "no effect on noise (<0.1 %)", "green"),
+        (0.004, "negligible, 0.4 % of the noise", "green"),
+        (0.03, "small, 3.0 % of the noise", "yellow"),
+        (0.22, "they matter here, 22 % of the noise", "bold #ff6b6b"),
+    ],
+)
+def test_words_and_colour_say_whether_clocks_matter(share: float, said: str, style: str) -> None:
+    line = clock_line(made_snapshot(clock_share=share), SETTINGS, width=100)
+    assert line.plain.endswith(f": {said}")
+    assert line.spans[-1].style == style
+
+
+def test_line_says_most_where_there_is_room() -> None:
+    snapshot = made_snapshot()
+    wide, narrow = (clock_line(snapshot, SETTINGS, width=w).plain for w in (120, 60))
+    assert "A +5.9, B −9.1, C +4.0 ppm, within 0.6 µs, by motion" in wide
+    assert "A" not in narrow
+    assert "within 0.6 µs" in narrow
+    assert len(clock_line(snapshot, SETTINGS, width=78).plain) <= 78
+
+
+def test_clocks_that_are_one_or_unknown() -> None:
+    snapshot = made_snapshot()
+    shared = tuple(replace(clock, source="clock of lab") for clock in snapshot.clocks)
+    one = clock_line(replace(snapshot, clocks=shared), SETTINGS, width=78)
+    assert one.plain == "clocks: all sensors share one"
+    unknown = clock_line(replace(snapshot, clocks=()), SETTINGS, width=78)
+    assert unknown.plain == "clocks: not known yet"
+    early = clock_line(replace(empty_snapshot(), diagnostics={}), SETTINGS, width=100)
+    assert early.plain.endswith("effect not known yet")
+
+
+def test_drift_is_what_a_constant_rate_leaves() -> None:
+    lines = drift_lines(made_snapshot(), chosen="B", n_points=200)
+    assert [line.label for line in lines] == ["A", "C", "B"]  # the chosen one on top
+    *straight, bent = lines
+    for line in straight:
+        assert np.abs(line.y).max() < 1e-6
+    assert bent.x[-1] == pytest.approx(59 / 60)
+    assert np.ptp(bent.y) == pytest.approx(20, rel=0.01)  # µs
+    assert len(drift_lines(made_snapshot(), chosen="B", n_points=20)[0].x) <= 30
+
+
+def test_drift_is_against_the_reference_where_motion_measures_it() -> None:
+    snapshot = made_snapshot()
+    late = snapshot.drift.copy()
+    late[:, 1:] += 100e-6 * np.sin(late[:, [0]])  # the host was, and took them all for late
+    swinging = replace(snapshot, drift=late)
+    for told, before in zip(
+        drift_lines(swinging, chosen="B", n_points=200),
+        drift_lines(snapshot, chosen="B", n_points=200),
+        strict=True,
+    ):
+        np.testing.assert_allclose(told.y, before.y, atol=1e-6)
+    assert "behind A," in drift_title(swinging)
+    alone = tuple(replace(clock, refined=False) for clock in snapshot.clocks)
+    by_arrivals = replace(swinging, clocks=alone)
+    assert "behind the computer," in drift_title(by_arrivals)
+    assert len(drift_title(by_arrivals)) <= 58  # of sixty columns
+    assert min(np.ptp(line.y) for line in drift_lines(by_arrivals, chosen="", n_points=60)) > 150
+
+
+@pytest.mark.parametrize("share", [0.004, 0.03, 0.07, 0.22])
+def test_report_and_application_judge_clocks_alike(share: float) -> None:
+    snapshot = made_snapshot(clock_share=share)
+    late = replace(snapshot.clocks[0], residual=7e-6)  # against the host
+    snapshot = replace(snapshot, clocks=(late, *snapshot.clocks[1:]))
+    section = clocks_section(snapshot, SETTINGS)
+    verdict = next(part for part in section.parts if isinstance(part, Paragraph))
+    colour = {"good": "green", "doubtful": "yellow", "bad": "bold #ff6b6b"}[verdict.tone]
+    assert clock_line(snapshot, SETTINGS, width=100).spans[-1].style == colour
+    (table,) = (part for part in section.parts if isinstance(part, Table))
+    left = table.header.index("left (µs rms)")
+    assert [row[left] for row in table.rows] == ["–", "0.40", "0.60"]
+    said = next(p.text for p in section.parts if isinstance(p, Paragraph) and "Drift" in p.text)
+    assert "that of A," in said
+
+
+@pytest.mark.parametrize(("share", "added"), [(0.0, 0.0), (0.1, 0.4), (3.0, 1.0)])
+def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    scenario = scenario_of(parse(text))
+    exact, ours = (
+        compare(made_snapshot(clock_share=each), SETTINGS, scenario) for each in (0.0, share)
+    )
+    noise = {(e.sensor, e.channel): e.noise_psd for e in exact if e.method == "three-sensor"}
+    for before, after in zip(exact, ours, strict=True):
+        wanted = added * noise[after.sensor, after.channel]  # by either method
+        assert before.low - after.low == pytest.approx(wanted, rel=1e-6, abs=1e-20)
+        assert after.high == before.high
+
+
+@pytest.mark.parametrize("minutes", [0.4, 1.7, 2.4, 14.0, 31.0, 240.0, 900.0, 6e3, 9e4])
+def test_labels_of_time_have_room_in_sixty_columns(minutes: float) -> None:
+    axis = TimeAxis()
+    ticks, labels = axis.get_ticks_and_labels(0.08, minutes)
+    assert 2 <= len(ticks) <= 6
+    assert sum(len(label) + 1 for label in labels) <= 49

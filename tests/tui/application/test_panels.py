@@ -1,0 +1,60 @@
+"""What the application says of a snapshot: how far the test is, what is wrong with a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.tui.example_snapshot import RATE, SETTINGS, made_now, made_snapshot
+from tui.application.panels import Choice, alerts, progress_line, sensor_table
+from tui.application.result_text import details
+from tui.output.console import console
+
+CHOICE = Choice(methods=("three-sensor",))
+
+
+def filled(since: dict[str, float]) -> int:
+    """Return the full cells of the bar once sensors have sent for so many seconds since."""
+    snapshot = replace(made_snapshot(n_effective=100), time_left=300.0)
+    before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
+    now = made_now(elapsed=100 + max(since.values()))
+    now = replace(
+        now,
+        sensors=tuple(
+            replace(s, n_samples=before[s.name] + round(RATE * since[s.name])) for s in now.sensors
+        ),
+    )
+    return progress_line(now, snapshot, SETTINGS, CHOICE, width=150).plain.count("━")
+
+
+def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -> None:
+    fresh = filled({"A": 0, "B": 0, "C": 0})
+    assert filled({"A": 100, "B": 101, "C": 102}) > fresh > 0
+    assert filled({"A": 3600, "B": 0, "C": 3600}) == fresh
+
+
+@pytest.mark.parametrize(
+    ("reject", "said"),
+    [(None, "are left out"), (True, "are left out"), (False, "are kept: do not")],
+)
+def test_what_becomes_of_clipped_segments_is_as_the_settings_say(
+    reject: bool | None, said: str
+) -> None:
+    now = made_now()
+    now = replace(now, sensors=(replace(now.sensors[0], clips=True),))
+    (alert,) = alerts(now, replace(SETTINGS, reject=reject))
+    assert said in alert.plain
+
+
+def test_counts_are_grouped_alike() -> None:
+    now = made_now()
+    much = replace(now.sensors[0], n_samples=113481, n_gaps=1, n_missing=13793)
+    now = replace(now, sensors=(much, *now.sensors[1:]))
+    table = sensor_table(now, made_snapshot(), SETTINGS, CHOICE, means=(), width=150)
+    screen = console()
+    with screen.capture() as said:
+        screen.print(table)
+        screen.print(details(now, None, None, trouble=""))
+    assert said.get().count("113\u202f481") == 1
+    assert said.get().count("13\u202f793") == 2

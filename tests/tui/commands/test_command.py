@@ -1,0 +1,396 @@
+"""The command: help, exit codes, what is loaded, and results on the real recording."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from sim_devices.world.paper_scenarios import SCENARIOS
+from tui.cli.main import app
+from tui.studies.reproduce import STUDIES
+
+ROOT = Path(__file__).parents[3]
+COMMANDS = (
+    "init",
+    "check",
+    "devices",
+    "demo",
+    "record",
+    "run",
+    "watch",
+    "simulate",
+    "import",
+    "estimate",
+    "report",
+    "tui",
+    "serve",
+    "repair",
+    "plan",
+    "reproduce",
+)
+
+
+def huddle(*arguments: str, code: int = 0) -> str:
+    """Run the command in this process; return its standard output."""
+    result = CliRunner().invoke(app, arguments, terminal_width=200)
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def modules_after(code: str) -> set[str]:
+    """Names of the modules loaded after running code in a new interpreter."""
+    code += "; import sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+# ------------------------------------------------------------------------------ help
+
+
+def test_help_names_every_command_and_is_quick() -> None:
+    spent = []
+    for _ in range(3):  # processor time, the best of three: others use this machine too
+        before = os.times()
+        done = subprocess.run(
+            [sys.executable, "-m", "tui", "--help"], capture_output=True, text=True, check=True
+        )
+        after = os.times()
+        spent.append(
+            after.children_user
+            + after.children_system
+            - before.children_user
+            - before.children_system
+        )
+    assert all(name in done.stdout for name in COMMANDS)
+    assert min(spent) < 0.3
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_examples(name: str) -> None:
+    text = huddle(name, "--help")
+    assert "Examples" in text
+    assert f"huddle {name} " in text or f"huddle {name}\n" in text
+
+
+def test_help_names_every_study_and_scenario() -> None:
+    said = {
+        name: set(re.findall(r"\w+", huddle(name, "--help"))) for name in ("reproduce", "simulate")
+    }
+    assert set(STUDIES) <= said["reproduce"]
+    assert set(SCENARIOS) <= said["simulate"]
+
+
+def test_help_loads_neither_arrays_nor_screens() -> None:
+    loaded = modules_after("import tui.cli.main")
+    assert not loaded & {"numpy", "scipy", "h5py", "textual", "pydantic", "serial", "matplotlib"}
+
+
+@pytest.mark.parametrize(
+    "module", ["tui.commands.record", "tui.commands.run", "tui.commands.estimate"]
+)
+def test_recording_and_estimating_never_load_textual(module: str) -> None:
+    loaded = modules_after(f"import {module}")
+    assert "h5py" in loaded
+    assert not {name for name in loaded if name.split(".")[0] in {"textual", "matplotlib"}}
+
+
+# ------------------------------------------------------------------------ exit codes
+
+
+def test_usage_is_exit_2(tmp_path: Path) -> None:
+    for arguments in (
+        ("estimate",),
+        ("estimate", "x.h5", "--overlap", "3"),
+        ("estimate", "x.h5", "--method", "magic"),
+        ("estimate", "x.h5", "--segment", "soon"),
+        ("fly",),
+    ):
+        huddle(*arguments, code=2)
+    bench = tmp_path / "bench.toml"
+    bench.write_text('name = "x"\nsampling_rat = 200\n')
+    result = CliRunner().invoke(app, ["check", str(bench)])
+    assert result.exit_code == 2
+    for said in ("bench.toml", "sampling_rat", "sampling_rate", "sensors"):
+        assert said in result.stderr
+    assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
+
+
+def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_text("not HDF5")
+    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "a.h5")])
+    assert result.exit_code == 3
+    assert "a.h5: not a huddle recording" in result.stderr
+    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "none.h5")])
+    assert result.exit_code == 3
+    assert "none.h5" in result.stderr
+    assert "Traceback" not in result.output
+
+
+def imported(tmp_path: Path) -> Path:
+    """Three sensors with a common motion, as a recording."""
+    rng = np.random.default_rng(5)
+    motion = rng.normal(size=(4000, 2))
+    sensors = {name: motion + 0.1 * rng.normal(size=(4000, 2)) for name in "ABC"}
+    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
+    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
+    huddle("import", str(source), "--out", str(out))
+    return out
+
+
+def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
+    file = str(imported(tmp_path))
+    result = CliRunner().invoke(app, ["estimate", file, "--segment", "1s", "--band", "60:70"])
+    assert result.exit_code == 2
+    assert "no frequency between 60 and 70 Hz" in result.stderr
+    assert not result.stdout
+
+
+def test_a_window_that_nobody_knows_is_exit_2(tmp_path: Path) -> None:
+    file = str(imported(tmp_path))
+    result = CliRunner().invoke(app, ["estimate", file, "--window", "hat"])
+    assert result.exit_code == 2
+    assert "--window 'hat'" in result.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="locales")
+def test_output_survives_a_terminal_that_knows_no_signs(tmp_path: Path) -> None:
+    file = str(imported(tmp_path))
+    done = subprocess.run(
+        [sys.executable, "-m", "tui", "estimate", file, "--segment", "1s"],
+        capture_output=True,
+        env=os.environ | {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
+        check=True,
+    )
+    assert "(counts)²/Hz" in done.stdout.decode("utf-8")
+
+
+# --------------------------------------------------------------------------- benches
+
+
+def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    before = bench.read_text(encoding="utf-8")
+    assert "the bench file is right" in huddle("check", str(bench), "--no-devices")
+    refused = CliRunner().invoke(app, ["init", "--out", str(bench)])
+    assert refused.exit_code == 2
+    assert "--force replaces it" in " ".join(refused.stderr.split())
+    assert bench.read_text(encoding="utf-8") == before
+
+
+def test_check_names_sensor_and_port_that_are_not_there(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    text = bench.read_text(encoding="utf-8").replace("/dev/ttyUSB", f"{tmp_path}/tty")
+    bench.write_text(text, encoding="utf-8")
+    result = CliRunner().invoke(app, ["check", str(bench), "--json", "-"])
+    assert result.exit_code == 3
+    for name, port in (("A", "tty0"), ("B", "tty1"), ("C", "tty2")):
+        assert any(name in line and port in line for line in result.stderr.splitlines())
+    assert len(json.loads(result.stdout)["errors"]) == 3
+
+
+def test_serve_lists_the_next_runs_and_wants_cron_lines(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    result = CliRunner().invoke(app, ["serve", str(bench), "--list"])
+    assert result.exit_code == 2
+    assert "schedule.cron" in result.stderr
+    with bench.open("a", encoding="utf-8") as lines:
+        lines.write('\n[schedule]\ncron = ["30 22 * * 1-5"]\ntime_zone = "Europe/Berlin"\n')
+    times = json.loads(huddle("serve", str(bench), "--list", "--json", "-"))["next"]
+    assert len(times) == 5
+    assert all("T22:30:00" in time for time in times)
+
+
+def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    found = json.loads(huddle("plan", str(bench), "--cov", "0.05", "--json", "-"))["methods"]
+    plans = {entry["method"]: entry for entry in found}
+    # √(2.5 / n) is the c.o.v. of equal, orthogonal channels: 1000 averages, 5 s apart under Hann.
+    assert plans["three-sensor"]["duration"] == pytest.approx(1003 * 5.0 * 1.06, rel=0.05)
+    assert max(map(abs, plans["three-sensor"]["bias"])) < 1e-3
+    assert max(plans["three-channel"]["bias"]) > 1
+    assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
+    shown = huddle("plan", str(bench), "--cov", "0.05")
+    assert "efficiency" in shown
+    assert "motion too weak" not in shown
+    assert "motion too weak" in huddle("plan", str(bench), "--snr", "1e-5")
+    for snr in ("inf", "1e30", "nan"):
+        refused = CliRunner().invoke(app, ["plan", str(bench), "--snr", snr])
+        assert refused.exit_code == 2
+
+
+def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
+    bench, out = str(tmp_path / "lab.toml"), str(tmp_path / "model.h5")
+    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    huddle("init", "--out", bench)
+    for command in (
+        ("check", bench, "--no-devices"),
+        ("plan", bench),
+        ("simulate", bench, "--out", out, "--duration", "25s"),
+        ("repair", out, "--check"),
+        ("estimate", out),
+    ):
+        document = json.loads(huddle(*command, "--json", "-"))
+        missing = [key for key in document if f"`{key}`" not in said]
+        assert not missing, command
+
+
+# --------------------------------------------------------------- the real recording
+
+PUBLISHED = (
+    "--segment", "409.6s", "--overlap", "0.125", "--window", "hann", "--detrend", "none",
+    "--no-correction", "--unit", "m/s²",
+)  # fmt: skip
+TABLE = {  # method.md: real part in dB re 1 (m/s²)²/Hz, bins at or below zero
+    ("XX.TST5.00", "BH0"): (-165.1383, 0),
+    ("XX.TST5.10", "BH0"): (-165.3101, 0),
+    ("XX.TST6.00", "BH0"): (-166.2117, 0),
+    ("XX.TST5.00", "BH1"): (-165.6237, 0),
+    ("XX.TST5.10", "BH1"): (-165.8338, 58),
+    ("XX.TST6.00", "BH1"): (-165.7667, 4),
+    ("XX.TST5.00", "BH2"): (-165.2734, 0),
+    ("XX.TST5.10", "BH2"): (-165.4332, 48),
+    ("XX.TST6.00", "BH2"): (-165.5282, 0),
+}
+COMPLEX_TABLE = {  # the published numbers: magnitude of the complex quotient
+    "BH0": (-165.0870, -165.2535, -166.1229),
+    "BH1": (-165.5604, -165.7494, -165.6986),
+    "BH2": (-165.2139, -165.3460, -165.4636),
+}
+
+
+@pytest.fixture(scope="module")
+def tst(usgs_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("obspy", reason="ObsPy is an extra")
+    out = tmp_path_factory.mktemp("usgs") / "tst.h5"
+    sources = sorted(str(path) for path in usgs_recording.glob("*.mseed"))
+    response = str(usgs_recording / "T-compact_Q330HR_BH_40")
+    huddle("import", *sources, "--response", response, "--out", str(out))
+    return out
+
+
+def result_of(path: Path, *options: str) -> dict[str, Any]:
+    """Run ``huddle estimate --json -``."""
+    found: dict[str, Any] = json.loads(huddle("estimate", str(path), *options, "--json", "-"))
+    return found
+
+
+def test_published_table_through_the_command(tst: Path) -> None:
+    document = result_of(tst, "--method", "three-channel", *PUBLISHED)
+    assert document["method"] == "three-channel"
+    frequency = np.array(document["frequency_hz"])
+    inside = (frequency >= 1 / 30) & (frequency <= 10)
+    assert inside.sum() == 4083
+    for channel in document["channels"]:
+        level, n_negative = TABLE[channel["sensor"], channel["channel"]]
+        psd = np.array(channel["noise_psd"], dtype=float)[inside]
+        assert np.mean(10 * np.log10(np.abs(psd))) == pytest.approx(level, abs=1e-3)
+        assert np.sum(psd <= 0) == n_negative
+
+
+def test_published_table_of_complex_magnitudes(tst: Path) -> None:
+    settings = Settings(
+        segment=409.6, overlap=0.125, detrend="none", methods=("three-channel",),
+        correct=False, unit="m/s²",
+    )  # fmt: skip
+    snapshot = estimate([tst], settings)
+    inside = (snapshot.frequency >= 1 / 30) & (snapshot.frequency <= 10)
+    csm = snapshot.csm[inside]
+    for place, levels in enumerate(COMPLEX_TABLE.values()):
+        for sensor, level in enumerate(levels):
+            i, j, k = (3 * ((sensor + step) % 3) + place for step in range(3))
+            noise = csm[:, i, i] - csm[:, i, j] * csm[:, k, i] / csm[:, k, j]
+            assert np.mean(10 * np.log10(np.abs(noise))) == pytest.approx(level, abs=1e-3)
+
+
+def test_three_sensor_removes_the_microseism_that_leaks_through_misalignment(tst: Path) -> None:
+    settings = Settings(
+        segment=409.6, detrend="none", methods=("three-channel", "three-sensor"), unit="m/s²"
+    )
+    snapshot = estimate([tst], settings)
+    (column,) = (
+        number
+        for number, label in enumerate(snapshot.channels)
+        if (label.sensor, label.channel) == ("XX.TST5.00", "BH1")
+    )
+    inside = (snapshot.frequency >= 0.2) & (snapshot.frequency <= 0.33)
+    leaking, clean = (
+        10 * math.log10(snapshot.results[method].noise_psd[inside, column].mean())
+        for method in settings.methods
+    )
+    assert leaking == pytest.approx(-161.9, abs=0.1)
+    assert clean == pytest.approx(-174.8, abs=0.2)
+    assert leaking - clean >= 12
+
+
+def test_all_methods_a_part_of_the_time_and_csv(tst: Path, tmp_path: Path) -> None:
+    csv = tmp_path / "curves.csv"
+    document = result_of(
+        tst, "--method", "all", "--segment", "60s", "--start", "2016-07-14T02:00",
+        "--end", "80min", "--csv", str(csv), "--band", "0.1:1",
+    )  # fmt: skip
+    methods = [entry["method"] for entry in document["results"]]
+    assert {"three-channel", "three-sensor", "maximum-likelihood"} <= set(methods)
+    assert document["results"][0]["segments"] == 39  # 20 minutes, one segment in 30 s
+    header, first = csv.read_text(encoding="utf-8").splitlines()[:2]
+    assert header.startswith("frequency (Hz),XX.TST5.00.BH0 data ((m/s)²/Hz)")
+    assert len(header.split(",")) == len(first.split(",")) == 1 + 9 * (1 + 4 * len(methods))
+
+
+def test_the_report_shows_the_angles_and_where_the_model_test_fails(
+    tst: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "result.json"
+    options = ("--segment", "102.4s", "--unit", "m/s²", "--json", str(out))
+    said = " ".join(huddle("estimate", str(tst), *options).split())
+    shown = [float(angle) for angle in re.findall(r"(\d\.\d+)°", said)]
+    assert shown == pytest.approx([2.242, 3.400, 1.158], abs=0.05)
+    assert re.search(r"model test fails at .* Hz \(\d", said)
+    found = json.loads(out.read_text(encoding="utf-8"))["diagnostics"]
+    failing = [band for band in found["bands"] if band["test"]["p_value"] < 0.01]
+    assert any(band["low"] < 0.3 < band["high"] for band in failing)  # the microseism
+    assert [pair["horizontal_deg"] for pair in found["responses"]] == pytest.approx(shown, abs=1e-3)
+    long = huddle("estimate", str(tst), *options, "--diagnostics")
+    assert "XX.TST5.00 → XX.TST5.10" in long
+
+
+def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -> None:
+    for options in (
+        ("--dimension", "2", "--method", "three-sensor"),
+        ("--dimension", "many"),
+        ("--gain", "Q=2"),
+        ("--gain", "XX.TST5.10"),
+        ("--gain", "XX.TST5.10=0"),
+        ("--unit", "kg"),
+    ):
+        huddle("estimate", str(tst), *options, code=2)
+
+
+def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
+    document = result_of(
+        tst, "--end", "2h", "--octaves", "--dimension", "auto", "--unit", "m/s²", "--reject"
+    )  # fmt: skip
+    assert document["method"] == "maximum-likelihood"
+    frequency = document["frequency_hz"]
+    assert frequency == sorted(frequency)
+    assert frequency[1] <= 0.01
+    assert frequency[-1] == 20.0
+    octaves = document["diagnostics"]["octaves"]
+    assert octaves[0]["segment"] > 100 * 0.99
+    assert all(octave["left_out"]["gap"] == 0 for octave in octaves)
+    assert len(document["diagnostics"]["dimension"]) >= len(octaves)

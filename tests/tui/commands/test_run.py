@@ -1,0 +1,250 @@
+"""A huddle test over simulated wires, through the command: live equals offline, kill -9, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.bench.loading import dump
+from daq.drivers.bench_file import parse
+from daq.recording.reader import Recording
+from daq.recording.repair import verify
+from tui.cli.main import app
+from tui.simulation.devices import simulated
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")
+
+SPEED = 8.0
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Yield a bench file that reaches three simulated accelerometers."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    path = tmp_path_factory.mktemp("bench") / "bench.toml"
+    with simulated(parse(text), speed=SPEED) as reachable:
+        path.write_text(dump(reachable), encoding="utf-8")
+        yield path
+
+
+def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tui", *arguments],
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Wait for a command; return exit code, standard output and standard error."""
+    out, err = process.communicate(timeout=110)
+    return process.returncode, out, err
+
+
+def wait_for_samples(path: Path, n_samples: int) -> None:
+    """Return when this many samples of every sensor are committed to a file, or to one below."""
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        for file in path.rglob("*.h5") if path.is_dir() else (path,):
+            if not file.exists():
+                continue
+            with Recording.open(file) as recording:
+                if min(sensor.n_samples for sensor in recording.sensors) >= n_samples:
+                    return
+        os.sched_yield()
+    pytest.fail(f"{path}: fewer than {n_samples} samples after 30 s")
+
+
+def estimate(path: Path, *options: str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["estimate", str(path), "--json", "-", *options])
+    assert result.exit_code == 0, result.output
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run.h5"
+    pdf = tmp_path / "run.pdf"
+    wanted = ("--duration", "14s", "--out", str(out), "--json", "-", "--report", str(pdf))
+    code, said, err = finished(start("run", str(bench), *wanted))
+    assert code == 0, err
+    assert pdf.read_bytes().startswith(b"%PDF-")
+    assert f"{pdf} written" in err
+    live, offline = json.loads(said), estimate(out)
+    assert live["segments"] == offline["segments"] >= 8
+    for ours, theirs in zip(live["channels"], offline["channels"], strict=True):
+        assert (ours["sensor"], ours["channel"]) == (theirs["sensor"], theirs["channel"])
+        for key in ("data_psd", "noise_psd", "noise_psd_low", "noise_psd_high", "cov"):
+            a, b = np.array(ours[key], dtype=float), np.array(theirs[key], dtype=float)
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+    with Recording.open(out) as recording:
+        assert recording.closed
+        arrays, attributes = recording.results()["three-sensor"]
+        assert attributes["segments"] == live["segments"]
+        noise = np.array([c["noise_psd"] for c in live["channels"]], dtype=float).T
+        np.testing.assert_allclose(arrays["noise_psd"], noise, rtol=1e-9)
+
+
+def test_kill_in_the_middle_loses_nothing_that_was_acknowledged(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "killed.h5"
+    process = start("run", str(bench), "--out", str(out), "--duration", "10min")
+    wait_for_samples(out, 2500)
+    with Recording.open(out) as recording:
+        acknowledged = [sensor.n_samples for sensor in recording.sensors]
+    (child,) = children_of(process.pid)
+    os.kill(child, signal.SIGKILL)
+    code, said, err = finished(process)
+    assert code == 3
+    assert "three-sensor" in said  # the result of what was recorded is shown all the same
+    said_of_it = " ".join(err.split())
+    assert "the recorder was killed (signal 9, SIGKILL)" in said_of_it
+    assert "huddle repair" in said_of_it
+    report = verify(out)
+    assert report.intact
+    assert not report.being_written
+    for sensor, n_samples in zip(report.sensors, acknowledged, strict=True):
+        assert sensor.n_samples >= n_samples
+    assert estimate(out)["segments"] >= 8
+
+
+def test_ctrl_c_stops_the_recorder_and_still_prints_the_result(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stopped.h5"
+    process = start("run", str(bench), "--out", str(out), "--duration", "10min")
+    wait_for_samples(out, 2500)
+    process.send_signal(signal.SIGINT)
+    code, said, err = finished(process)
+    assert code == 130, err
+    assert "three-sensor" in said
+    with Recording.open(out) as recording:
+        assert recording.closed
+        assert recording.events[-1].kind == "stopped"
+
+
+def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "until.h5"
+    with_report = tmp_path / "bench.toml"
+    text = bench.read_text(encoding="utf-8")
+    with_report.write_text(text.replace("[recording]", '[recording]\nreport = "html"'), "utf-8")
+    process = start("run", str(with_report), "--out", str(out), "--until-cov", "0.4", "--json", "-")
+    code, said, err = finished(process)
+    assert code == 0, err
+    document = json.loads(said)
+    inside = slice(4, 41)  # 2 to 20 Hz
+    cov = np.array([channel["cov"] for channel in document["channels"]], dtype=float)[:, inside]
+    # The last, complete look differs a little from the live one that ended the run.
+    assert np.median(cov, axis=1).max() <= 0.6
+    with Recording.open(out) as recording:
+        assert recording.events[-1].text != "duration reached"
+    assert "self-noise" in out.with_suffix(".html").read_text(encoding="utf-8")
+
+
+def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "record.h5"
+    code, said, err = finished(
+        start("record", str(bench), "--duration", "5s", "--out", str(out), "--json", "-")
+    )
+    assert code == 0, err
+    status = json.loads(said)
+    assert status["closed"]
+    for name in "ABC":
+        assert status["sensors"][name]["samples"] >= 900  # connecting takes part of the duration
+    with Recording.open(out) as recording:
+        assert recording.duration == 5
+    code, _, err = finished(start("record", str(bench), "--duration", "5s", "--out", str(out)))
+    assert code == 3
+    assert "exists already" in err
+
+
+def test_a_run_too_short_for_any_estimate_is_refused_before_it_begins(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "short.h5"
+    result = CliRunner().invoke(app, ["run", str(bench), "--duration", "3s", "--out", str(out)])
+    assert result.exit_code == 2
+    assert not out.exists()
+
+
+def test_a_recording_that_is_there_is_not_taken_for_the_new_one(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "old.h5"
+    out.write_bytes(b"last night")
+    result = CliRunner().invoke(app, ["run", str(bench), "--out", str(out)])
+    assert result.exit_code == 3
+    assert "exists already" in result.stderr
+    assert not result.stdout
+    assert out.read_bytes() == b"last night"
+
+
+def test_ports_that_are_not_there_are_named_and_exit_3(bench: Path, tmp_path: Path) -> None:
+    broken = parse(bench.read_text(encoding="utf-8"))
+    sensors = tuple(
+        sensor.model_copy(update={"port": f"{tmp_path}/none-{sensor.name}"})
+        for sensor in broken.sensors
+    )
+    path = tmp_path / "broken.toml"
+    path.write_text(dump(broken.model_copy(update={"sensors": sensors})), encoding="utf-8")
+    code, _, err = finished(start("run", str(path), "--out", str(tmp_path / "none.h5")))
+    assert code == 3
+    for name in "ABC":
+        assert f"none-{name}" in err
+
+
+def children_of(pid: int) -> list[int]:
+    """Process ids of the children of a process (Linux)."""
+    done = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=True
+    )
+    return [int(line) for line in done.stdout.split()]
+
+
+def test_check_finds_what_is_on_a_port(bench: Path) -> None:
+    port = parse(bench.read_text(encoding="utf-8")).sensors[0].port
+    code, said, err = finished(start("check", "--port", port, "--json", "-"))
+    assert code == 0, err
+    (device,) = json.loads(said)["devices"]
+    assert device["driver"] == "epson"
+    assert device["information"]["model"].startswith("A352")
+
+
+def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> None:
+    process = start("demo", "--speed", "8", "--json", "-", TMPDIR=str(tmp_path))
+    wait_for_samples(tmp_path, 2500)
+    process.send_signal(signal.SIGINT)
+    code, said, err = finished(process)
+    assert code == 130, err
+    assert len(json.loads(said)["channels"]) == 18
+
+
+def test_demo_shows_which_estimate_is_right() -> None:
+    code, said, err = finished(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
+    assert code == 0, err
+    channels = json.loads(said)["channels"]
+    covers = {
+        method: [entry["covers"] for entry in channels if entry["method"] == method]
+        for method in ("three-channel", "three-sensor")
+    }
+    assert len(covers["three-sensor"]) == 9
+    assert sum(covers["three-sensor"]) >= 8  # all nine at once in 95 % of runs
+    assert sum(covers["three-channel"]) <= 1
+    for entry in channels:
+        if entry["method"] == "three-channel" and entry["noise_psd"] > 0:
+            assert entry["noise_psd"] > 2 * entry["true_noise_psd"]

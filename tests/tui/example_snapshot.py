@@ -1,0 +1,212 @@
+"""A snapshot whose every number is known, and a stand for the application's controls."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.drivers.bench_file import parse
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import ChannelLabel, SensorState, Snapshot
+from daq.host_clock import SystemClock
+from daq.protocols.block import Event, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.monitor import RecordingStatus, SensorStatus
+from daq.recording.writer import RecordingWriter
+from daq.timing.clock_model import ClockState
+from estimator.methods import self_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+
+SETTINGS = Settings(
+    segment=2.0, methods=("three-sensor", "three-channel"), band=(1.0, 20.0), target_cov=0.05
+)
+SENSORS = ("A", "B", "C")
+CHANNELS = ("X", "Y", "Z")
+RATE = 200.0
+PPM, RESIDUALS = (5.9, -9.1, 4.0), (0.0, 0.4e-6, 0.6e-6)
+
+
+def rotation(degrees: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Turn about z."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def made_snapshot(
+    *, n_effective: float = 100.0, closed: bool = False, clock_share: float = 0.0004
+) -> Snapshot:
+    """Three sensors at 0, 5 and 9° in a motion of 1/f, each channel's noise at −120 dB and up."""
+    frequency: np.ndarray[tuple[int], np.dtype[np.float64]] = np.arange(201) * np.float64(0.5)
+    motion = 1e-9 / np.maximum(frequency, 0.5)
+    turned = np.vstack([rotation(angle) for angle in (0.0, 5.0, 9.0)])
+    csm = motion[:, None, None] * (turned @ np.diag([1.0, 1.5, 1.0]) @ turned.T)
+    csm = csm + np.diag(np.arange(1, 10) * 1e-12)
+    dims = (3, 3, 3)
+    n_samples = round(n_effective * 200)
+    return Snapshot(
+        frequency=frequency,
+        csm=csm.astype(np.complex128),
+        results={
+            method: self_noise(method, csm.astype(complex), dims=dims, n_effective=n_effective)
+            for method in SETTINGS.methods
+        },
+        refused={},
+        channels=tuple(ChannelLabel(s, c, "m/s²") for s in SENSORS for c in CHANNELS),
+        dims=dims,
+        unit="m/s²",
+        n_segments=round(n_effective * 1.06),
+        n_dropped=0,
+        n_effective=n_effective,
+        elapsed=n_effective * 1.0,
+        time_left=None if closed else 260.0,
+        start_utc_ns=1_795_230_000_000_000_000,
+        sensors=tuple(
+            SensorState(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
+            for name, n_gaps, last_seen in (("A", 0, 1000.0), ("B", 2, 1000.0), ("C", 0, 988.0))
+        ),
+        clocks=tuple(
+            ClockState(
+                name, "arrival times", 0.0, ppm, 0.02, 0.1, residual, 1, refined=residual > 0
+            )
+            for name, ppm, residual in zip(SENSORS, PPM, RESIDUALS, strict=True)
+        ),
+        drift=made_drift(),
+        closed=closed,
+        diagnostics={
+            "synchronisation": {
+                "residual": dict(zip(SENSORS, RESIDUALS, strict=True)),
+                "noise_bias": np.full((len(frequency), 9), clock_share),
+            }
+        },
+    )
+
+
+def made_drift() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Three clocks at constant rates, the second with a bend of 20 µs in the middle."""
+    at = np.arange(60.0)
+    bend = 20e-6 * np.sin(np.pi * at / 59)
+    drift: np.ndarray[tuple[int, int], np.dtype[np.float64]] = np.zeros((60, 4))
+    drift[:, 0] = at
+    drift[:, 1:] = -1e-6 * np.outer(at, PPM)
+    drift[:, 2] += bend
+    return drift
+
+
+def made_now(*, elapsed: float = 100.0, closed: bool = False) -> RecordingStatus:
+    """Three sensors: one live, one with two gaps, one silent for 12 s."""
+    begun = 1_795_230_000_000_000_000
+    return RecordingStatus(
+        elapsed=elapsed,
+        started_utc_ns=begun,
+        closed=closed,
+        sensors=(
+            SensorStatus("A", "/dev/ttyUSB0", RATE, 20000, 0, 0, "ended" if closed else "live"),
+            SensorStatus("B", "/dev/ttyUSB1", RATE, 20000, 2, 14, "ended" if closed else "live"),
+            SensorStatus("C", "/dev/ttyUSB2", RATE, 20000, 0, 0, "ended")
+            if closed
+            else SensorStatus("C", "/dev/ttyUSB2", RATE, 17600, 0, 0, "silent", since=12.0),
+        ),
+        events=(
+            Event("", "started", "3 sensors", HostTime(0, begun)),
+            Event("", "mark", "door slammed", HostTime(0, begun + 42_000_000_000)),
+        ),
+    )
+
+
+def waiting_now() -> RecordingStatus:
+    """Return the same bench before its first sample."""
+    now = made_now(elapsed=0.0)
+    return replace(
+        now, sensors=tuple(replace(s, n_samples=0, state="waiting") for s in now.sensors)
+    )
+
+
+def empty_snapshot() -> Snapshot:
+    """Return the same bench before its first segment."""
+    full = made_snapshot()
+    return replace(
+        full,
+        csm=np.full_like(full.csm, np.nan),
+        results={},
+        n_segments=0,
+        n_effective=0.0,
+        elapsed=0.0,
+        time_left=None,
+        sensors=tuple(replace(s, n_samples=0, last_seen=float("nan")) for s in full.sensors),
+    )
+
+
+@contextmanager
+def growing(path: Path, *, duration: float | None = None) -> Iterator[RecordingWriter]:
+    """Yield the writer of a recording of the demo's bench that nobody has closed."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    bench = parse(text)
+    sensors = [
+        SensorLayout(s.name, s.channels, bench.sampling_rate, dtype=np.dtype("<i4"), clock=s.name)
+        for s in bench.sensors
+    ]
+    writer = RecordingWriter.create(
+        path,
+        bench,
+        sensors=sensors,
+        created=SystemClock().now(),
+        attributes={} if duration is None else {"duration": duration},
+    )
+    writer.commit()
+    try:
+        yield writer
+    finally:
+        writer.abandon()
+
+
+@dataclass
+class ProgressCallback:
+    """Controls that write down what they are told."""
+
+    path: Path
+    settings: Settings | None = SETTINGS
+    name: str = "lab"
+    can_start: bool = True
+    bench: Bench | None = None
+    running: Path | None = None
+    told: list[str] = field(default_factory=list)
+
+    def description(self) -> str:
+        """Return what is shown without a recording."""
+        return "three sensors of lab"
+
+    def start(self) -> Path:
+        """Note it."""
+        self.told.append("start")
+        return self.path
+
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Note it."""
+        self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Note it."""
+        assert snapshot.closed
+        self.told.append(f"report {path.name} {settings.segment:g}")
+        return path.with_suffix(".html")
+
+    def find_running(self) -> Path | None:
+        """Return what was prepared."""
+        return self.running
+
+    def stop(self, path: Path) -> None:
+        """Note it."""
+        self.told.append(f"stop {path.name}")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Note it."""
+        self.told.append(f"mark {path.name} {text}")

@@ -1,0 +1,109 @@
+"""Where results go, and what is said when they cannot."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from daq.acquisition.block_writer import SensorStatus
+from daq.acquisition.recorder import Status
+from tui.cli.main import app
+from tui.commands.record import progress_line
+from tui.output.console import notices, progress, write_text
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="a device that is always full")
+@pytest.mark.parametrize("append", [False, True])
+def test_a_full_disk_is_told_with_the_file_s_name(append: bool) -> None:
+    with pytest.raises(OSError, match="No space left") as trouble:
+        write_text(str(FULL), "{}", append=append)
+    assert trouble.value.filename == str(FULL)
+
+
+def test_a_recorder_on_a_terminal_says_when_it_ends() -> None:
+    status = Status("a.h5", 20.0, {"A": SensorStatus("recording", 4000, 0, 0)})
+    assert progress_line(status) == "0:20  samples safe: A 4000"
+    assert progress_line(status, 100.0) == "0:20  samples safe: A 4000  ends in 80 s"
+
+
+def test_lines_are_appended(tmp_path: Path) -> None:
+    out = tmp_path / "lines.json"
+    for line in ("1\n", "2\n"):
+        write_text(str(out), line, append=True)
+    assert out.read_text(encoding="utf-8") == "1\n2\n"
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="a device that is always full")
+def test_trouble_that_cannot_be_told_is_trouble_all_the_same() -> None:
+    with FULL.open("w") as full:
+        command = [sys.executable, "-m", "tui", "estimate", "nothing.h5"]
+        assert subprocess.run(command, stderr=full, check=False).returncode == 3
+
+
+def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    notices.cache_clear()
+    with progress() as bar:
+        bar.advance(bar.add_task("segments", total=2.0))
+    notices().print("word " * 20)
+    said = capsys.readouterr().err
+    notices.cache_clear()
+    assert said == "word " * 20 + "\n"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("estimate", "nothing.h5", "--json"), ("estimate", "nothing.h5", "--csv"), ("demo", "--keep")],
+)
+def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(
+    command: tuple[str, ...],
+) -> None:
+    result = CliRunner().invoke(app, [*command, "nowhere/result"])
+    assert result.exit_code == 2
+    assert "there is no folder" in result.output
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--json", "-", "--csv", "-"), "which takes one result"),
+        (("--json", "."), "expected the name of a file"),
+    ],
+)
+def test_places_that_cannot_take_a_result_are_told_before_anything_is_measured(
+    options: tuple[str, ...], said: str
+) -> None:
+    result = CliRunner().invoke(app, ["estimate", "nothing.h5", *options])
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("arrays.npz", "huddle import arrays.npz --out arrays.h5"),
+        ("missing.toml", "huddle init -o missing.toml"),
+    ],
+)
+def test_the_application_says_what_to_do_with_other_files(source: str, said: str) -> None:
+    result = CliRunner().invoke(app, ["tui", source])
+    assert result.exit_code == 2
+    assert said in " ".join(result.output.split())
+
+
+def test_the_application_without_a_file_says_what_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lab.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["tui"])
+    assert result.exit_code == 2
+    assert "lab.toml" in result.output
+    assert "huddle init" in result.output

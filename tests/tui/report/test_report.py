@@ -1,0 +1,445 @@
+"""The calibration report: complete, the same each time, whole or not there, and safe to open."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.bench.loading import parse
+from daq.drivers.bench_file import load
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import Event, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks
+from tui.cli.main import app
+from tui.commands.tui import BenchControls
+from tui.report import drawing
+from tui.report.contents import report_of
+from tui.report.drift import without_line
+from tui.report.paper import pages
+from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
+from tui.report.source import sources
+from tui.report.writing import ReportError, write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daq.estimation.snapshot import Snapshot
+    from tui.report.parts import Part
+
+RATE, N_SAMPLES = 100.0, 6000
+ROOT = Path(__file__).parents[3]
+HOSTILE = "<script>alert(1)</script>".replace("/", "⁄") + " & $x^2 {{7*7}}"
+"""A name as a file from elsewhere may have it; bench files allow all but the slash."""
+BENCH = """
+name = "pier & <floor>"
+operator = "Ada <ada@lab>"
+location = "cellar"
+sampling_rate = 100.0
+{sensors}
+[[limits]]
+name = "data sheet"
+frequency = [1.0, 30.0]
+psd = [{psd}, {psd}]
+[estimate]
+segment = "1s"
+target_cov = 0.1
+band = [2.0, 20.0]
+[schedule]
+time_zone = "Europe/Berlin"
+"""
+SENSOR = """
+[[sensors]]
+name = '{name}'
+model = "M-1"
+serial_number = "SN-{number}"
+driver = "text"
+port = "/dev/tty{number}"
+channels = [
+    {{name = "X", sensitivity = 1e6, direction = "east"}}, {{name = "Y", sensitivity = 1e6}},
+]
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Reported:
+    """A recording, its estimate, and what was written of it."""
+
+    recording: Path
+    snapshot: Snapshot
+    settings: Settings
+    page: str
+    report: Report
+
+
+class Words(HTMLParser):
+    """The text of a page, and the tags it is made of."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note a tag."""
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+    def handle_data(self, data: str) -> None:
+        """Note text."""
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        """All of it, white space made even."""
+        return " ".join("".join(self.words).split())
+
+
+def record(
+    path: Path, *, psd: float = 4e-10, before_end: Callable[[], object] = lambda: None
+) -> Path:
+    """Four biaxial sensors: B misses samples, and Y of the last is dead."""
+    rng = np.random.default_rng(8)
+    motion = 4000 * rng.standard_normal((N_SAMPLES, 2))
+    sensors = {}
+    for number, name in enumerate(("A", "B", "C", HOSTILE)):
+        counts = motion + 100 * rng.standard_normal((N_SAMPLES, 2))
+        if name == HOSTILE:
+            counts[:, 1] = 0
+        gaps = ((1000, 1130), (4000, 4001)) if number == 1 else ()
+        sensors[name] = Sensor(counts.round().astype(np.int32), rate=RATE, gaps=gaps)
+    tables = "".join(SENSOR.format(name=n, number=i) for i, n in enumerate(sensors))
+    bench = parse(BENCH.format(sensors=tables, psd=psd), "bench.toml")
+    layouts = [
+        SensorLayout(
+            each.name, each.channels, RATE, np.dtype("<i4"), clock="one", model=each.model,
+            serial_number=each.serial_number, driver="text",
+        )
+        for each in bench.sensors
+    ]  # fmt: skip
+    writer = RecordingWriter.create(path, bench, sensors=layouts, created=ORIGIN)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            writer.append(block)
+        for second in range(60):
+            at = HostTime(ORIGIN.monotonic_ns + second * 10**9, ORIGIN.utc_ns + second * 10**9)
+            writer.event(Event(name, "checksum", "a frame was damaged", at))
+    writer.gap("B", 1000, 130, reason="cable pulled", estimated=True)
+    writer.gap("B", 4000, 1, reason="lost")
+    writer.commit()
+    before_end()
+    writer.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
+    folder = tmp_path_factory.mktemp("report")
+    recording = record(folder / "night.h5")
+    settings = Settings(segment=1.0, methods=("three-sensor",), band=(2.0, 20.0), target_cov=0.1)
+    snapshot = estimate([recording], settings)
+    out = folder / "night.html"
+    report = write(snapshot, out, recordings=[recording], settings=settings)
+    return Reported(recording, snapshot, settings, out.read_text(encoding="utf-8"), report)
+
+
+def test_the_demo_s_reports_outlive_its_folder(reported: Reported, tmp_path: Path) -> None:
+    settings, path = reported.settings, ROOT / "tui" / "resources" / "demo.toml"
+    controls = BenchControls(path, load(path), settings, reports=tmp_path)
+    out = controls.report(reported.recording, reported.snapshot, settings)
+    assert out == tmp_path / "night.html"
+    assert out.read_text(encoding="utf-8") == reported.page
+
+
+def words_of(part: Part) -> list[str]:
+    """Every text in a part of a report."""
+    match part:
+        case Paragraph():
+            return [part.text]
+        case Items():
+            return [entry.text for entry in part.entries]
+        case Facts():
+            return [word for row in part.rows for word in row]
+        case Table():
+            return [part.title, *part.header, *(word for row in part.rows for word in row)]
+        case Plot():
+            return [part.title]
+        case _:
+            return list(part.labels)
+
+
+def said(report: Report) -> list[str]:
+    """Every text in a report."""
+    words = [report.title, report.subtitle, report.verdict.text]
+    for section in report.sections:
+        words += [section.title, *(word for part in section.parts for word in words_of(part))]
+    return [" ".join(word.split()) for word in words if word]
+
+
+def tables(report: Report, section: str) -> list[Table]:
+    """Return the tables of a section."""
+    (found,) = [each for each in report.sections if each.title.startswith(section)]
+    return [part for part in found.parts if isinstance(part, Table)]
+
+
+# ---------------------------------------------------------------------------- contents
+
+
+def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) -> None:
+    text = Words(reported.page).text
+    digest = hashlib.sha256(reported.recording.read_bytes()).hexdigest()
+    for word in (
+        "pier & <floor>", "Ada <ada@lab>", "cellar", "night.h5", digest, "SN-0", "SN-2", "M-1",
+        "X (east), Y", "1000000", "2016-07-14 01:00:00 UTC", "2016-07-14 03:00:00 UTC+0200",
+        "Duration1m", "three-sensor", "1 s (100 samples)", "hann", "50 %", "Signature",
+        "Small-sample biasremoved",
+    ):  # fmt: skip
+        assert word in text
+
+
+def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
+    # 100 counts of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz, −97 dB
+    table, *_ = tables(reported.report, "Self-noise")
+    rows = {row[0]: row for row in table.rows}
+    assert float(rows["A.X"][2].replace("−", "-")) == pytest.approx(-96.99, abs=0.5)
+    low, high = (float(end.replace("−", "-")) for end in rows["A.X"][3].split(" … "))
+    assert low < -96.99 < high
+    assert float(rows["B.X"][7]) == pytest.approx(10 * np.log10(4000**2 / 100**2), abs=0.6)
+    assert rows[f"{HOSTILE}.Y"][1:3] == ("no signal", "?")
+
+
+def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path) -> None:
+    assert reported.report.verdict.text.startswith("PASS: all 7 channels meet data sheet.")
+    assert "Of 1 channel nothing can be said" in reported.report.verdict.text
+    (table,) = tables(reported.report, "Verdict")
+    rows = {row[0]: row for row in table.rows}
+    assert rows["A.X"][-1] == "pass"
+    assert float(rows["A.X"][5]) == pytest.approx(3, abs=1.5)
+    assert rows[f"{HOSTILE}.Y"][-1] == "nothing can be said"
+
+    failing = record(tmp_path / "noisy.h5", psd=1e-10)
+    result = CliRunner().invoke(app, ["report", str(failing), "--out", str(tmp_path / "n.html")])
+    assert result.exit_code == 1
+    assert "FAIL: 7 of 7 channels above data sheet" in " ".join(result.stdout.split())
+    assert "FAIL" in (tmp_path / "n.html").read_text(encoding="utf-8")
+
+
+def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
+    reported: Reported,
+) -> None:
+    settings = replace(reported.settings, methods=("all",))
+    report = report_of(
+        estimate([reported.recording], settings), settings, sources([reported.recording])
+    )
+    table, _, methods = tables(report, "Self-noise")
+    assert "by the three-sensor method" in table.title
+    assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
+    assert report.verdict.text.startswith("PASS: all 7 channels")
+
+
+def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
+    (table,) = tables(reported.report, "What happened")
+    assert [row[0] for row in table.rows] == sorted(row[0] for row in table.rows)
+    assert len(table.rows) == 5  # 240 events of four sensors and two gaps
+    words = [row[3] for row in table.rows]
+    assert sum("a frame was damaged (60 of this kind, until 01:00:59)" in w for w in words) == 4
+    (gaps,) = [row for row in table.rows if row[2] == "gap"]
+    assert gaps[3].startswith("about 130 samples missing (1.3 s): cable pulled (2 of this kind")
+    assert gaps[0] == "2016-07-14 01:00:09"  # the block before sample 1000 was received
+    assert "segments left out where a sensor has a gap" in " ".join(said(reported.report))
+
+
+def test_alignment_clocks_and_model_test_are_there(reported: Reported) -> None:
+    text = Words(reported.page).text
+    assert "Alignment of the sensors" in text
+    assert "Model test" in text
+    (clocks,) = tables(reported.report, "Clocks")
+    assert [row[0] for row in clocks.rows] == ["A", "B", "C", HOSTILE]
+
+
+def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
+    recording, out = tmp_path / "live.h5", tmp_path / "live.html"
+
+    def report() -> None:
+        result = CliRunner().invoke(app, ["report", str(recording)])
+        assert result.exit_code == 0, result.output
+
+    record(recording, before_end=report)
+    text = Words(out.read_text(encoding="utf-8")).text
+    assert "Still running, preliminary. PASS" in text
+    assert "none: the file is still being written" in text
+
+
+def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
+    recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
+    record(recording, before_end=lambda: shutil.copyfile(recording, copy))
+    snapshot = estimate([copy], reported.settings)
+    report = report_of(snapshot, reported.settings, sources([copy]))
+    assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
+    assert hashlib.sha256(copy.read_bytes()).hexdigest() in said(report)
+
+
+def test_where_the_motion_is_not_shared_the_report_says_so(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    motion, other = 4000 * rng.standard_normal((2, N_SAMPLES, 1))
+    source = tmp_path / "a.npz"
+    sensors = {
+        name: (motion + share * other + 100 * rng.standard_normal((N_SAMPLES, 1)))
+        for name, share in (("A", 0.0), ("B", 0.2), ("C", 0.0), ("D", 0.2))
+    }
+    np.savez(source, sampling_rate=RATE, **sensors)
+    runner = CliRunner()
+    recording = str(tmp_path / "a.h5")
+    assert runner.invoke(app, ["import", str(source), "--out", recording]).exit_code == 0
+    result = runner.invoke(app, ["report", recording, "--segment", "1s"])
+    assert result.exit_code == 0, result.output
+    text = Words((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    assert re.search(r"The test fails at [\d.]+–50 Hz \(statistic \d+", text)
+    assert "Measured, not judged: there are no limits in the bench file." in text
+
+
+def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
+    seconds = np.arange(0.0, 100.0)
+    delay = 3e-3 - 20e-6 * seconds
+    wander = 2e-6 * np.sin(seconds / 10)
+    delay[60:] += 0.4
+    left = without_line(seconds, delay + wander)
+    assert np.flatnonzero(np.isnan(left)).tolist() == [60]
+    line = np.polyfit(seconds, wander, 1)
+    assert np.nanmax(np.abs(left)) < 4e-6
+    whole = without_line(seconds, 3e-3 - 20e-6 * seconds + wander)
+    np.testing.assert_allclose(whole, wander - np.polyval(line, seconds), atol=1e-12)
+
+
+# ------------------------------------------------------------------------------- files
+
+
+def test_the_same_recording_gives_the_same_files(reported: Reported, tmp_path: Path) -> None:
+    for name in ("a.html", "a.pdf", "b.pdf"):
+        write(
+            reported.snapshot, tmp_path / name, recordings=[reported.recording],
+            settings=reported.settings,
+        )  # fmt: skip
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == reported.page
+    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF-")
+
+
+def test_the_page_needs_nothing_else_and_runs_nothing(reported: Reported) -> None:
+    words = Words(reported.page)
+    assert not words.tags & {"script", "link", "img", "iframe", "object", "embed", "base", "form"}
+    assert not {name for name in words.attributes if name.startswith("on")}
+    assert not words.attributes & {"src", "srcset", "href", "action"}
+    assert set(re.findall(r"https?://[^\s\"<]+", reported.page)) <= {
+        "http://www.w3.org/1999/xlink", "http://www.w3.org/2000/svg",
+    }  # fmt: skip
+    references = set(re.findall(r'xlink:href="([^"]*)"|url\(([^)]*)\)', reported.page))
+    assert all((one or other).startswith("#") for one, other in references)
+
+
+def test_foreign_names_are_text_and_nothing_else(reported: Reported) -> None:
+    assert HOSTILE in Words(reported.page).text
+    assert "<script" not in reported.page.lower()
+    assert "&lt;script&gt;" in reported.page
+
+
+def test_paper_says_all_that_the_page_says(reported: Reported) -> None:
+    with drawing.look():
+        paper = pages(reported.report)
+    whole = "".join(text.get_text() for page in paper for text in page.texts)
+    letters = "".join(whole.split())
+    page = "".join(Words(reported.page).text.split())
+    for word in said(reported.report):
+        assert "".join(word.split()) in page
+        for piece in word.split():  # lines are broken between words, cells stand side by side
+            assert piece in letters
+    assert f"{len(paper)} / {len(paper)}" in whole
+    for sheet in paper:
+        for text in sheet.texts:
+            assert 0 < text.get_position()[1] < 1
+
+
+def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
+    out = tmp_path / "old.html"
+    out.write_text("the old one", encoding="utf-8")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))  # as a disk that is full
+    try:
+        with pytest.raises(ReportError, match=r"old.html: the report cannot be written \(File too"):
+            write(
+                reported.snapshot, out, recordings=[reported.recording], settings=reported.settings
+            )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert out.read_text(encoding="utf-8") == "the old one"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize(
+    ("out", "said"), [("report.doc", r"\.html or \.pdf"), ("none/report.pdf", "no folder")]
+)
+def test_a_wrong_name_is_refused_before_anything_is_done(
+    reported: Reported, out: str, said: str, tmp_path: Path
+) -> None:
+    arguments = ["report", str(reported.recording), "--out", str(tmp_path / out)]
+    result = CliRunner().invoke(app, arguments, terminal_width=300)
+    assert result.exit_code == 2
+    assert re.search(said, result.stderr)
+
+
+def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> None:
+    other = record(tmp_path / "second.h5")
+    files = [reported.recording, other]
+    snapshot = estimate(files, reported.settings)
+    report = report_of(snapshot, reported.settings, sources(files))
+    text = " ".join(said(report))
+    assert "night.h5" in text
+    assert "second.h5" in text
+    assert f"{2 * reported.snapshot.n_segments} segments used" in text
+
+
+def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    motion = 4000 * rng.standard_normal((2000, 1))
+    source, recording = tmp_path / "a.npz", tmp_path / "a.h5"
+    sensors = {f"S{i:02}": motion + 100 * rng.standard_normal((2000, 1)) for i in range(15)}
+    np.savez(source, sampling_rate=RATE, **sensors)  # type: ignore[arg-type]  # names of arrays
+    runner = CliRunner()
+    assert runner.invoke(app, ["import", str(source), "--out", str(recording)]).exit_code == 0
+    settings = replace(reported.settings, methods=("maximum-likelihood", "three-sensor"))
+    snapshot = estimate([recording], settings)
+    report = report_of(snapshot, settings, sources([recording]))
+    plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
+    assert sum(len(plot.panels) for plot in plots) == 15 + 1
+    with drawing.look():
+        for page in pages(report):
+            page.draw_without_rendering()
+            for text in page.texts:
+                box = text.get_window_extent()
+                assert page.bbox.x0 <= box.x0
+                assert box.x1 <= page.bbox.x1
+
+
+def test_matplotlib_is_loaded_by_a_report_only() -> None:
+    code = (
+        "import sys, tui.commands.report, tui.commands.run, tui.commands.estimate;"
+        "print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "jinja2"} & set(done.stdout.split())

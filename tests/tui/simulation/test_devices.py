@@ -1,0 +1,52 @@
+"""``huddle devices`` and ``huddle demo``: simulated devices, and nothing left of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from daq.drivers.bench_file import parse
+from tui.cli.main import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM kills there")
+def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
+    folder, bench = tmp_path / "there", tmp_path / "bench.toml"
+    folder.mkdir()
+    bench.write_bytes(resources.files("tui.resources").joinpath("bench.toml").read_bytes())
+    out = str(tmp_path / "simulated.toml")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tui", "devices", str(bench), "--json", "-", "--out", out],
+        env=os.environ | {"TMPDIR": str(folder)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        assert process.stdout is not None
+        assert set(json.loads(process.stdout.readline())["ports"]) == {"A", "B", "C"}
+        assert list(folder.iterdir())
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 130
+    assert not list(folder.iterdir())
+
+
+def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    bench = parse(text)
+    assert (bench.recording.duration, bench.speed) == (300.0, 4.0)
+    said = " ".join(CliRunner().invoke(app, ["demo", "--help"]).output.replace("│", " ").split())
+    assert "5min where not given" in said
+    assert "4 where not given" in said
+    assert "bench file" not in said

@@ -1,0 +1,317 @@
+"""What the application shows of a snapshot, as text and curves; no Textual here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from daq.results.band_summary import band_of, channel_means, correlation_of, decibels, reached_cov
+from estimator.self_noise.result import Flag
+from tui.application.curves import data_curve, noise_curve
+from tui.output.formatting import clock_time, roughly, several, time_left
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus, SensorStatus
+    from estimator.self_noise.band_means import BandMeans
+    from tui.application.curves import Curve
+
+DATA_STYLE = "#7d8799"
+STYLES = {
+    "three-sensor": ("#4cc9f0", "#1d6f8c", "●"),
+    "three-channel": ("#f4a261", "#8a5a34", "×"),
+    "maximum-likelihood": ("#c297ff", "#5f4890", "◆"),
+    "two-channel": ("#e9d86b", "#7f7638", "+"),
+}
+"""Colours of each method, of its curve and of its 95 % band, and what marks the curve."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What the technician looks at: a channel, methods by name, or clocks in place of noise."""
+
+    channel: int = 0
+    methods: tuple[str, ...] = ()
+    clocks: bool = False
+
+
+def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: int) -> list[Curve]:
+    """Return the curves of the chosen channel: its data below, the chosen estimates above."""
+    if snapshot.n_segments == 0:
+        return []
+    column, frequency = choice.channel, snapshot.frequency
+    shown = [
+        data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
+    ]
+    correlation = correlation_of(settings)
+    for method in choice.methods:
+        if method not in snapshot.results:
+            continue
+        noise = snapshot.results[method]
+        style, band_style, marker = STYLES[method]
+        shown.append(
+            noise_curve(
+                frequency,
+                noise.noise_psd[:, column],
+                noise.cov[:, column],
+                correlation=correlation,
+                n_points=n_points,
+                label=method,
+                style=style,
+                band_style=band_style,
+                marker=marker,
+            )
+        )
+    return shown
+
+
+def plot_title(snapshot: Snapshot, choice: Choice) -> str:
+    """Return what the plot shows, with its unit."""
+    label = snapshot.channels[choice.channel]
+    return f"{label.sensor} {label.channel}   power spectral density re 1 ({snapshot.unit})²/Hz"
+
+
+def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
+    """Return the mean noise of every channel by the first chosen method; empty before there is."""
+    method = next((m for m in choice.methods[:1] if m in snapshot.results), None)
+    if method is None:
+        return ()
+    band = band_of(settings, snapshot)
+    return channel_means(snapshot.results[method], snapshot.frequency, settings, band)
+
+
+def sensor_table(
+    now: RecordingStatus,
+    snapshot: Snapshot,
+    settings: Settings,
+    choice: Choice,
+    *,
+    means: Sequence[BandMeans],
+    width: int,
+) -> Table:
+    """Return a row per sensor: how it is, and the noise of each of its channels in the band.
+
+    What there is no room for is left out: rates first, then numbers of samples, then of gaps.
+    """
+    band = band_of(settings, snapshot)
+    of_sensor = _columns_of(snapshot)
+    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
+    columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
+    columns["state"] = [state(sensor) for sensor in now.sensors]
+    columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
+    columns["samples"] = [Text(grouped(s.n_samples)) for s in now.sensors]
+    columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
+    for number in range(max(snapshot.dims)):
+        title = titles[number] if number < len(titles) else " " * number
+        columns[title] = [
+            _channel_noise(snapshot, mine[number], means, chosen=mine[number] == choice.channel)
+            if number < len(mine := of_sensor.get(sensor.name, []))
+            else Text("")
+            for sensor in now.sensors
+        ]
+    for unneeded in ("Hz", "samples", "gaps"):
+        if _width(columns) > width:
+            del columns[unneeded]
+    if _width(columns) > width:
+        for title in list(columns)[2:]:
+            columns[title] = [cell.split("±")[0] for cell in columns[title]]
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
+    for title in columns:
+        right = title in {"Hz", "samples", "gaps"}
+        table.add_column(title, justify="right" if right else "left", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
+    return table
+
+
+def _width(columns: dict[str, list[Text]]) -> int:
+    widest = (max(len(title), *map(len, cells)) for title, cells in columns.items())
+    return sum(widest) + len(columns)
+
+
+def _gaps(sensor: SensorStatus) -> Text:
+    if not sensor.n_gaps:
+        return Text("0")
+    return Text(f"{grouped(sensor.n_gaps)} ({grouped(sensor.n_missing)})", "yellow")
+
+
+def grouped(count: int) -> str:
+    """Return a count in groups of three digits."""
+    return f"{count:,}".replace(",", "\u202f")
+
+
+def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
+    columns: dict[str, list[int]] = {}
+    for column, label in enumerate(snapshot.channels):
+        columns.setdefault(label.sensor, []).append(column)
+    return columns
+
+
+def state(sensor: SensorStatus) -> Text:
+    """Return how a sensor is, in a word or two."""
+    word = {"disconnected": "lost"}.get(sensor.state, sensor.state)
+    if sensor.is_lost:
+        late = sensor.state == "late"
+        return Text(f"○ {word} {clock_time(sensor.since)}", "yellow" if late else "bold #ff6b6b")
+    if sensor.state == "waiting":
+        return Text("○ waiting", "yellow")
+    if sensor.stuck:
+        return Text(f"▲ {' '.join(sensor.stuck)} still", "bold #ff6b6b")
+    if sensor.clips:
+        return Text("▲ clips", "bold #ff6b6b")
+    return Text("■ ended", "#9aa5b8") if word == "ended" else Text("● live", "green")
+
+
+def _channel_noise(
+    snapshot: Snapshot, column: int, means: Sequence[BandMeans], *, chosen: bool
+) -> Text:
+    name = snapshot.channels[column].channel
+    value, style = "…", ""
+    if said := _flagged(snapshot, column):
+        value, style = said, "bold #ff6b6b"
+    elif means:
+        mean, high = float(means[column].mean[0]), float(means[column].high[0])
+        if mean > 0:
+            error = decibels(high) - decibels(mean)
+            value = f"{decibels(mean):.1f}±" + (f"{error:.1f}" if error >= 0.05 else "<.1")
+        elif not math.isnan(mean):
+            value = "below 0"
+    text = Text(f"{name} {value}".replace("-", "−"), style)
+    if chosen:
+        text.stylize("reverse")
+    return text
+
+
+def _flagged(snapshot: Snapshot, column: int) -> str:
+    """Say why most frequencies of a channel have no noise; nothing where they do."""
+    words = {
+        Flag.DEAD_CHANNEL: "no signal",
+        Flag.DUPLICATE: "a copy",
+        Flag.NOT_FINITE: "no number",
+        Flag.INVALID: "no number",
+        Flag.NO_COUNTERPART: "unmatched",
+    }
+    for noise in snapshot.results.values():
+        flags = noise.flags[1:-1, column]
+        for flag, word in words.items():
+            if 2 * np.count_nonzero(flags & flag) > flags.size:
+                return word
+    return ""
+
+
+def progress_line(
+    now: RecordingStatus, snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int
+) -> Text:
+    """Return how far the test is: a bar where its end is known, segments, c.o.v., time left."""
+    cov, target = math.nan, settings.target_cov
+    if choice.methods and choice.methods[0] in snapshot.results:
+        cov = reached_cov(snapshot, settings, choice.methods[0])
+    waits = [sensor.name for sensor in now.sensors if sensor.is_lost] if not now.closed else []
+    if snapshot.n_segments == 0:
+        text = f"waits for the first {settings.segment:g} s segment"
+        if snapshot.n_dropped:
+            text += f" without gaps; {snapshot.n_dropped} left out"
+        return Text(text, "#9aa5b8")
+    parts = [several(snapshot.n_segments, "segment")]
+    if snapshot.n_dropped:
+        parts.append(f"{snapshot.n_dropped} left out")
+    if not math.isnan(cov):
+        parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
+    left = snapshot.time_left
+    if left is not None:
+        left = max(0.0, left - _gone_on(now, snapshot))
+    if snapshot.closed:
+        if target is not None:
+            parts.append("target reached" if cov <= target else "target not reached")
+    elif waits:
+        parts.append(f"waits for {', '.join(waits)}")
+    elif target is not None:
+        parts.append("target reached" if cov <= target else _until_target(left, now))
+    if now.ends_in is not None:
+        parts.append(f"ends in {roughly(now.ends_in)}")
+    left = min((each for each in (left, now.ends_in) if each is not None), default=None)
+    text = " · ".join(parts)
+    line = Text()
+    room = width - len(text) - 3
+    if left is not None and not snapshot.closed and room >= 6:
+        done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
+        filled = round(done * room)
+        line.append("━" * filled, "#4cc9f0")
+        line.append("╌" * (room - filled), "#4a556b")
+        line.append("  ")
+    line.append(text)
+    return line
+
+
+def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
+    """Return seconds that all sensors have sent since the snapshot: none while one is lost."""
+    before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
+    new = ((s.n_samples - before[s.name]) / s.sampling_rate for s in now.sensors)
+    return max(0.0, min(new))
+
+
+def _until_target(left: float | None, now: RecordingStatus) -> str:
+    """Return how long the target still takes; of a run that ends, what it is that takes so long."""
+    return f"target in {roughly(left)}" if left and now.ends_in is not None else time_left(left)
+
+
+def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
+    """Return what is wrong with which sensor, and what to do; the worst first."""
+    found: list[tuple[int, str]] = []
+    for sensor in now.sensors:
+        if sensor.is_lost:
+            found.append((2 if sensor.state == "late" else 1, _what_to_do(sensor, now)))
+        elif sensor.stuck:
+            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.stuck)
+            found.append((3, f"{channels} stands still: no signal; check the cable to it"))
+        elif sensor.clips:
+            text = f"{sensor.name} is at the end of its range: segments with that are "
+            kept = settings is not None and settings.reject is False
+            found.append((4, text + ("kept: do not trust its noise" if kept else "left out")))
+        if sensor.was_stuck:
+            channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
+            found.append((5, f"{channels} stood still for a while: do not trust its noise"))
+    styles = {2: "yellow", 4: "yellow", 5: "yellow"}
+    return [Text(f"▲ {text}", styles.get(rank, "bold #ff6b6b")) for rank, text in sorted(found)]
+
+
+def _what_to_do(sensor: SensorStatus, now: RecordingStatus) -> str:
+    name, ago = sensor.name, clock_time(sensor.since)
+    if now.closed:
+        return f"{name} was lost {ago} before the end: {sensor.why}"
+    again = "retried by itself"
+    return {
+        "late": f"{name} is late: no block for {ago}",
+        "stalled": f"{name} sends nothing for {ago}: check power and cable; {again}",
+        "disconnected": f"{name} is disconnected for {ago}: check cable and power; {again}",
+        "refused": f"{name} is refused: {sensor.why}",
+        "silent": f"{name} is silent for {ago}: check power and cable",
+    }[sensor.state]
+
+
+def advice(snapshot: Snapshot, choice: Choice) -> Text:
+    """Return one line on what to know about what is shown."""
+    refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
+    if refused:
+        return Text(refused[0], "yellow")
+    for method in choice.methods:
+        noise = snapshot.results.get(method)
+        if noise is None:
+            continue
+        values = noise.noise_psd[1:-1, choice.channel]
+        negative = int(np.sum(values <= 0))
+        if negative:
+            return Text(
+                f"{method}: {negative} of {values.size} values at or below zero (▾ marks the "
+                "upper bound)",
+                "yellow",
+            )
+    return Text("")

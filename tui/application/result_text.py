@@ -1,0 +1,196 @@
+"""What the application says when a test is over, and the details at any time; no Textual here."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from daq.results.band_summary import band_of, channel_means, reached_cov
+from daq.results.limits import exceeded
+from estimator.self_noise.band_means import band_edges
+from tui.application.panels import alerts, grouped, state
+from tui.output.diagnostics import details as diagnosis_details
+from tui.output.diagnostics import summary
+from tui.output.formatting import clock_time, level, level_with_error, utc
+from tui.output.results import left_out, limit_line, remarks
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rich.console import RenderableType
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
+    from estimator.self_noise.band_means import FloatArray
+
+LATEST_EVENTS = 200
+MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
+
+
+def result(
+    now: RecordingStatus | None,
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    bench: Bench | None,
+    path: Path | None,
+) -> RenderableType:
+    """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
+    parts: list[RenderableType] = [*_verdict(snapshot, settings, bench)]
+    wrong = [] if now is None else alerts(now, settings)
+    parts += ["", *wrong] if wrong else []
+    parts.append("")
+    if snapshot.results:
+        parts += [_channels(snapshot, settings), ""]
+    parts += [_item(line) for line in (*remarks(snapshot), *summary(snapshot))]
+    if path is not None:
+        parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
+    return Group(*parts)
+
+
+def _verdict(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> Iterator[Text]:
+    if not snapshot.results:
+        yield Text("No result: nothing can be said of the sensors' noise.", BAD)
+        for method, why in snapshot.refused.items():
+            yield Text(f"{method}: {why}", BAD)
+        return
+    failures = exceeded(bench, snapshot, settings)
+    if failures:
+        yield Text("✗ FAILED: not every channel meets the limits", BAD)
+        yield from (Text(f"  {limit_line(failure)}", BAD) for failure in failures)
+    elif bench is not None and bench.limits:
+        names = ", ".join(limit.name for limit in bench.limits)
+        yield Text(f"✓ PASSED: every channel meets {names}", "bold green")
+    else:
+        yield Text("No limits in the bench file: neither passed nor failed.", MUTED)
+    cov, target = reached_cov(snapshot, settings), settings.target_cov
+    if target is not None and not math.isnan(cov):
+        reached = cov <= target
+        text = f"{'✓' if reached else '✗'} c.o.v. {cov:.3f}, target {target:g}"
+        if not reached:
+            seconds = snapshot.elapsed * (cov / target) ** 2
+            text += f": would have taken {clock_time(seconds)} in all"
+        yield Text(text, "green" if reached else "yellow")
+
+
+def _channels(snapshot: Snapshot, settings: Settings) -> Table:
+    method, noise = next(iter(snapshot.results.items()))
+    band = band_of(settings, snapshot)
+    inside = slice(*band_edges(snapshot.frequency, band))
+    data = np.average(
+        snapshot.data_psd[inside], axis=0, weights=np.gradient(snapshot.frequency)[inside]
+    )
+    means = channel_means(noise, snapshot.frequency, settings, band)
+    cov = reached_cov_by_channel(snapshot, settings, method)
+    table = Table(
+        box=None,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        header_style=f"bold {MUTED}",
+        title=f"{method}, mean over {band[0]:.3g}–{band[1]:.3g} Hz, dB re 1 ({snapshot.unit})²/Hz",
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("channel", no_wrap=True)
+    for title in ("data", "noise, 95 %", "from", "to", "c.o.v."):
+        table.add_column(title, justify="right", no_wrap=True)
+    for column, label in enumerate(snapshot.channels):
+        mean = means[column]
+        low, high = float(mean.low[0]), float(mean.high[0])
+        table.add_row(
+            Text(f"{label.sensor}.{label.channel}", "bold"),
+            level(float(data[column])),
+            level_with_error(float(mean.mean[0]), high),
+            level(low),
+            level(high),
+            "?" if math.isnan(cov[column]) else f"{cov[column]:.3f}",
+        )
+    return table
+
+
+def details(
+    now: RecordingStatus, snapshot: Snapshot | None, settings: Settings | None, *, trouble: str
+) -> RenderableType:
+    """Return everything that is known of a test: sensors, segments, diagnosis, events."""
+    parts: list[RenderableType] = [Text(trouble, BAD), ""] if trouble else []
+    parts += [Text(f"sensors, since {utc(now.started_utc_ns)}", HEADER), _sensors(now)]
+    if snapshot is not None and settings is not None:
+        parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
+        parts += [_item(f"{method}: {why}") for method, why in snapshot.refused.items()]
+        parts += ["", Text("diagnosis", HEADER)]
+        if "bands" in snapshot.diagnostics:
+            parts += diagnosis_details(snapshot)
+        else:
+            parts.append(Text("made from the whole recording, when it has ended", MUTED))
+    parts += ["", Text("events, latest first", HEADER), _events(now)]
+    return Group(*parts)
+
+
+def _sensors(now: RecordingStatus) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
+    for title in ("sensor", "state", "gaps", "missing", "clipped"):
+        table.add_column(title, no_wrap=True)
+    table.add_column("port", overflow="fold")
+    for sensor in now.sensors:
+        table.add_row(
+            Text(sensor.name, "bold"),
+            state(sensor),
+            grouped(sensor.n_gaps),
+            f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
+            f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
+            sensor.port,
+        )
+    return table
+
+
+def _segments(snapshot: Snapshot, settings: Settings) -> Text:
+    text = (
+        f"{snapshot.n_segments} of {settings.segment:g} s ({settings.window}, "
+        f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"
+    )
+    if snapshot.n_dropped:
+        text += f"; {snapshot.n_dropped} left out{left_out(snapshot)}"
+    return Text(text)
+
+
+def _events(now: RecordingStatus) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
+    table.add_column(justify="right", style=MUTED, no_wrap=True)
+    for _ in range(2):
+        table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    shown = now.events[-LATEST_EVENTS:]
+    for event in reversed(shown):
+        at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
+        style = "bold #f4a261" if event.kind == "mark" else ""
+        table.add_row(clock_time(at), event.sensor, Text(event.kind, style), Text(event.text))
+    if len(shown) < len(now.events):
+        table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
+    return table
+
+
+def reached_cov_by_channel(snapshot: Snapshot, settings: Settings, method: str) -> list[float]:
+    """Return the c.o.v. per frequency of every channel, median in the band."""
+    low, high = band_of(settings, snapshot)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    return [_median(column) for column in snapshot.results[method].cov[inside].T]
+
+
+def _median(values: FloatArray) -> float:
+    known = sorted(float(value) for value in values if math.isfinite(value))
+    return known[len(known) // 2] if known else math.nan
+
+
+def _item(text: str) -> Table:
+    """Return a paragraph of a list."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    table.add_row(Text("·", MUTED), Text(text))
+    return table

@@ -1,0 +1,154 @@
+"""``tui``, ``run``, ``record``, ``watch``, ``serve``."""
+
+# ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tui.cli.examples import examples
+from tui.cli.options import (
+    BandOption,
+    BenchArgument,
+    CsvOption,
+    DiagnosticsOption,
+    DimensionOption,
+    DurationOption,
+    FileArgument,
+    GainOption,
+    JsonOption,
+    MethodOption,
+    OctavesOption,
+    OutOption,
+    RejectOption,
+    UnitOption,
+    factors,
+    frequencies,
+    gains,
+)
+
+
+@examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
+def tui(
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="BENCH", help="Bench file, or a recording to look at."),
+    ] = None,
+    *,
+    method: MethodOption = None,
+) -> None:
+    """Open the application: start, watch and stop a huddle test.
+
+    Closing it does not stop a recording; opening it again finds it.
+    """
+    if source is None:
+        there = sorted(path.name for path in Path().glob("*.toml"))
+        here = f"; in this folder: {', '.join(there)}" if there else ""
+        raise typer.BadParameter(
+            f"expected a bench file (huddle init writes one) or a recording{here}; without either,"
+            " huddle demo shows a bench at work"
+        )
+    from tui.commands.tui import open_application
+
+    open_application(source, method=method)
+
+
+@examples(
+    "huddle run lab.toml --duration 3h",
+    "huddle run lab.toml --until-cov 0.05 --band 1:20",
+    "huddle run lab.toml -d 20min --json result.json --report result.pdf",
+)
+def run(
+    bench: BenchArgument,
+    *,
+    duration: DurationOption = None,
+    until_cov: Annotated[
+        float | None,
+        typer.Option(
+            "--until-cov",
+            min=0.001,
+            max=1.0,
+            metavar="COV",
+            help="Stop when the noise is known this well: its coefficient of variation.",
+        ),
+    ] = None,
+    out: OutOption = None,
+    method: MethodOption = None,
+    unit: UnitOption = None,
+    band: BandOption = None,
+    reject: RejectOption = None,
+    octaves: OctavesOption = None,
+    dimension: DimensionOption = None,
+    gain: GainOption = None,
+    diagnostics: DiagnosticsOption = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report", metavar="FILE", help="Write the calibration report: .html or .pdf."
+        ),
+    ] = None,
+    json: JsonOption = None,
+    csv: CsvOption = None,
+) -> None:
+    """Run one huddle test without a screen: record, estimate live, print the result.
+
+    The recorder is a process of its own; the estimate follows its file.
+    Ctrl-C stops the recorder and still prints the result.
+    """
+    from tui.commands.run import run_test
+
+    run_test(
+        bench,
+        duration=duration,
+        until_cov=until_cov,
+        out=out,
+        method=method,
+        unit=unit,
+        band=frequencies(band),
+        reject=reject,
+        octaves=octaves,
+        dimension=factors(dimension),
+        gains=gains(gain),
+        diagnostics=diagnostics,
+        report=report,
+        json=json,
+        csv=csv,
+    )
+
+
+@examples("huddle record lab.toml --duration 3h --out night.h5")
+def record(
+    bench: BenchArgument,
+    *,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Record, and nothing else, until the duration is over or Ctrl-C."""
+    from tui.commands.record import record_bench
+
+    record_bench(bench, duration=duration, out=out, json=json)
+
+
+@examples("huddle watch night.h5", "huddle watch night.h5 --json -   (a line of JSON each update)")
+def watch(file: FileArgument, *, method: MethodOption = None, json: JsonOption = None) -> None:
+    """Look on while another process writes a recording."""
+    from tui.commands.watch import watch_recording
+
+    watch_recording(file, method=method, json=json)
+
+
+@examples("huddle serve lab.toml", "huddle serve lab.toml --list")
+def serve(
+    bench: BenchArgument,
+    *,
+    show: Annotated[
+        bool, typer.Option("--list", help="Show when the next runs start, and exit.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Run huddle tests at the times that the bench file's cron lines give, until Ctrl-C."""
+    from tui.commands.serve import serve_bench
+
+    serve_bench(bench, show=show, json=json)

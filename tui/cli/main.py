@@ -1,0 +1,177 @@
+"""The ``huddle`` command: its subcommands, and the one place where errors become exit codes.
+
+What a subcommand needs is imported when it runs; so ``huddle --help`` loads neither numpy nor
+HDF5, and ``huddle record`` never loads Textual.
+
+====  ==========================================================
+exit  meaning
+====  ==========================================================
+0     done
+1     a limit was not met
+2     the command line or the bench file is wrong
+3     a device or a file is in trouble
+130   interrupted
+====  ==========================================================
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import traceback
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+from tui.cli import acquisition, recordings, setup, studies
+from tui.cli.examples import EXAMPLES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+USAGE, TROUBLE, INTERRUPTED = 2, 3, 130
+
+
+_OTHERS = (("estimator.errors", "EstimatorError"), ("sim_devices.errors", "ServeError"))
+"""Roots of errors that are trouble as well, where their module has been loaded at all."""
+
+
+_WRONG_USE = {"ScenarioError", "BandError"}
+
+
+class HuddleGroup(TyperGroup):
+    """Runs a subcommand and turns what it raises into a message and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - the context is the library's own
+        """Run the subcommand."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+        except BrokenPipeError:  # | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except Exception as error:
+            if isinstance(error, (typer.Exit, typer.Abort)) or hasattr(error, "show"):
+                raise  # the library's own: usage errors show themselves
+            code = exit_code(error)
+            if code is None:
+                traceback.print_exc()
+                typer.echo("huddle: this is a fault in huddle itself; please report it", err=True)
+                raise typer.Exit(TROUBLE) from None
+            with suppress(OSError):  # where that goes to a file, its disk may be full as well
+                for line in messages(error):
+                    typer.echo(f"huddle: {line}", err=True)
+            raise typer.Exit(code) from None
+
+
+def exit_code(error: BaseException) -> int | None:
+    """Return the exit code of an error; None for one that we did not foresee."""
+    from daq.errors import BenchFileError, HuddleError, WrongSettingError  # noqa: PLC0415 - seldom needed
+
+    if isinstance(error, BaseExceptionGroup):
+        codes = [exit_code(inner) for inner in error.exceptions]
+        return None if None in codes else max(code for code in codes if code is not None)
+    if type(error).__name__ == "RecorderFailedError":
+        return int(getattr(error, "code", TROUBLE))
+    wrong_use = isinstance(error, (BenchFileError, WrongSettingError))
+    if wrong_use or type(error).__name__ in _WRONG_USE:
+        return USAGE
+    if isinstance(error, (HuddleError, OSError)):
+        return TROUBLE
+    for module, name in _OTHERS:
+        loaded = sys.modules.get(module)
+        if loaded is not None and isinstance(error, getattr(loaded, name)):
+            return TROUBLE
+    return None
+
+
+def messages(error: BaseException) -> Iterator[str]:
+    """Yield what went wrong, line by line."""
+    if isinstance(error, BaseExceptionGroup):
+        for inner in error.exceptions:
+            yield from messages(inner)
+    elif isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
+        yield ": ".join(str(part) for part in (error.filename, error.strerror) if part)
+    else:
+        yield from (str(error) or type(error).__name__).splitlines()
+
+
+app = typer.Typer(
+    name="huddle",
+    cls=HuddleGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=(
+        "Self-noise of accelerometers that stand side by side: read them over their wires, "
+        "record, estimate - however they happen to point.\n\n"
+        "No hardware at hand? [b]huddle demo[/b] runs a whole test on a simulated bench."
+    ),
+)
+
+_PANELS = {
+    "On the bench": (
+        setup.init,
+        setup.check,
+        setup.plan,
+        acquisition.tui,
+        acquisition.run,
+        acquisition.record,
+        acquisition.watch,
+        acquisition.serve,
+    ),
+    "Recordings": (
+        recordings.estimate,
+        recordings.report,
+        recordings.import_,
+        recordings.repair,
+    ),
+    "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),
+}
+for _panel, _commands in _PANELS.items():
+    for _command in _commands:
+        _epilog = "\n\n".join(("[b]Examples[/b]", *EXAMPLES[_command.__name__]))
+        app.command(_command.__name__.rstrip("_"), rich_help_panel=_panel, epilog=_epilog)(_command)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        typer.echo(f"huddle {version('huddle-bench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Show the version and exit."
+    ),
+) -> None:
+    del version
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command and exit with its code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # files and pipes hold UTF-8 everywhere
+            stream.reconfigure(
+                encoding=stream.encoding if stream.isatty() else "utf-8", errors="replace"
+            )
+    try:
+        app(arguments)
+    except SystemExit as ended:
+        if ended.code == TROUBLE and "h5py" in sys.modules:
+            # HDF5 can crash on exit after a full disk; all files of ours are closed by now.
+            with suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(TROUBLE)
+        raise
+    raise SystemExit(0)

@@ -1,0 +1,243 @@
+"""Opens the application on a bench or on a recording."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.table import Table
+
+from daq.acquisition.recorder import recording_path
+from daq.drivers.bench_file import load
+from daq.errors import BenchFileError, HuddleError
+from daq.estimation.settings import Settings
+from daq.host_clock import SystemClock
+from daq.recording.control import ask
+from daq.recording.reader import Recording
+from tui.application.app import HuddleApp
+from tui.commands.estimate import chosen
+from tui.commands.run import finish_recording
+from tui.output.console import notices
+from tui.runs.find_running import running_recording
+from tui.runs.recorder_process import RecorderProcess
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench
+    from daq.estimation.snapshot import Snapshot
+
+ALWAYS = ("three-sensor", "three-channel")
+"""Estimates that cost little: shown beside the bench's own, for comparison."""
+FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
+"""Endings of files that are to be imported first."""
+
+
+@dataclass
+class BenchControls:
+    """Controls of a bench file: recorders are started as processes of their own."""
+
+    path: Path
+    bench: Bench
+    settings: Settings
+    can_start: bool = True
+    reports: Path | None = None
+    """Folder of reports; None: beside their recordings."""
+    started: list[RecorderProcess] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The bench's name."""
+        return self.bench.name
+
+    def description(self) -> Table:
+        """Return the sensors that will be recorded."""
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold #9aa5b8")
+        for column in ("sensor", "model", "driver", "port", "channels"):
+            table.add_column(column, no_wrap=True)
+        for sensor in self.bench.sensors:
+            channels = " ".join(channel.name for channel in sensor.channels)
+            table.add_row(sensor.name, sensor.model, sensor.driver, sensor.port, channels)
+        return table
+
+    def start(self) -> Path:
+        """Start a recorder; returns its file once that is there."""
+        out = recording_path(self.bench, SystemClock().now())
+        recorder = RecorderProcess(self.path, out, duration=self.bench.recording.duration)
+        self.started.append(recorder)
+        recorder.wait_for_file()
+        return out
+
+    def find_running(self) -> Path | None:
+        """Return the file of a recorder of this bench that runs already."""
+        return running_recording(self.bench)
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder of a file to stop."""
+        ask(path, "stop")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder of a file to record a remark."""
+        ask(path, "mark", text)
+
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Write the result into the recording, unless somebody has done so."""
+        with Recording.open(path) as recording:
+            if recording.results():
+                return
+        finish_recording(path, snapshot)
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report."""
+        return _report(path, snapshot, settings, folder=self.reports)
+
+    def release(self) -> None:
+        """Forget the recorders; they go on."""
+        for recorder in self.started:
+            recorder.close()
+
+
+@dataclass(frozen=True)
+class RecordingControls:
+    """Controls of a recording that is looked at: it can be stopped and marked while it grows."""
+
+    path: Path
+    settings: Settings
+    bench: Bench | None = None
+    can_start: bool = False
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.stem
+
+    def description(self) -> str:
+        """Return what to show until the first snapshot is there."""
+        return "opening …"
+
+    def start(self) -> Path:
+        """Refuse."""
+        raise HuddleError("this is a recording; huddle tui BENCH starts one")
+
+    def find_running(self) -> Path:
+        """Return the recording itself."""
+        return self.path
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder to stop."""
+        ask(path, "stop")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder to record a remark."""
+        ask(path, "mark", text)
+
+    def keep(self, path: Path, snapshot: Snapshot) -> None:
+        """Leave that to who records."""
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report beside the recording."""
+        return _report(path, snapshot, settings)
+
+
+def _report(
+    path: Path, snapshot: Snapshot, settings: Settings, *, folder: Path | None = None
+) -> Path:
+    from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
+
+    out = (folder or path.parent) / f"{path.stem}.html"
+    write(snapshot, out, recordings=[path], settings=settings)
+    return out
+
+
+def open_application(source: Path, *, method: str | None) -> None:
+    """Open the application on a bench file, or on a recording (``.h5``).
+
+    Raises
+    ------
+    BenchFileError
+        It is neither, or a bench file with faults.
+    typer.BadParameter
+        There is no terminal.
+    """
+    if source.suffix.lower() in {".h5", ".hdf5"}:
+        open_recording(source, method=method)
+    elif source.suffix.lower() in FOREIGN:
+        raise BenchFileError(
+            f"{source}: neither a bench file (.toml) nor a recording (.h5); make a recording of it"
+            f" first: huddle import {source} --out {source.with_suffix('.h5')}"
+        )
+    elif not source.exists():
+        raise BenchFileError(
+            f"{source}: there is no such file; write a bench file with huddle init -o {source}, or"
+            " see one at work with huddle demo"
+        )
+    else:
+        open_bench(source, methods=None if method is None else (str(method),))
+
+
+def open_bench(path: Path, *, methods: tuple[str, ...] | None = None) -> None:
+    """Open the application on a bench file."""
+    bench = load(path)
+    settings = Settings.of(bench)
+    settings = replace(settings, methods=methods or _beside(settings.methods))
+    controls = BenchControls(path, bench, settings)
+    try:
+        _run(HuddleApp(controls), again=path)
+    finally:
+        controls.release()
+
+
+def _run(app: HuddleApp, *, again: Path) -> None:
+    """Run it; say afterwards where a recording lies, and that it goes on."""
+    if not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
+        raise typer.BadParameter(
+            "the application needs a terminal; huddle watch RECORDING and huddle run BENCH do"
+            " without"
+        )
+    app.run()
+    if app.path is None:
+        return
+    if app.recording:
+        notices().print(
+            f"The recording goes on: {app.path}\nLook at it again, or stop it: huddle tui {again}",
+            soft_wrap=True,
+            markup=False,
+        )
+    else:
+        notices().print(f"recording: {app.path}", soft_wrap=True, markup=False)
+
+
+def show_demo(path: Path, settings: Settings) -> Path | None:
+    """Open the application on a simulated bench, recording at once; stop with the application.
+
+    Returns
+    -------
+    Path or None
+        The last recording, closed.
+    """
+    # The demo's recording goes when the demo ends; what has been asked for stays.
+    controls = BenchControls(path, load(path), settings, reports=Path.cwd())
+    try:
+        HuddleApp(controls, start=True).run()
+        for recorder in controls.started:
+            recorder.stop()
+    finally:
+        controls.release()
+    return controls.started[-1].out if controls.started else None
+
+
+def open_recording(path: Path, *, method: str | None = None) -> None:
+    """Open the application on a recording, growing or closed."""
+    with Recording.open(path) as recording:
+        bench = recording.bench
+        settings = chosen(Settings.of(bench), method=method)
+    if method is None:
+        settings = replace(settings, methods=_beside(settings.methods))
+    _run(HuddleApp(RecordingControls(path, settings, bench), path=path), again=path)
+
+
+def _beside(methods: tuple[str, ...]) -> tuple[str, ...]:
+    if "all" in methods:
+        return methods
+    return tuple(dict.fromkeys((*methods, *ALWAYS)))

@@ -1,0 +1,1 @@
+"""Results as tables, sentences, JSON and CSV. Sentences are made here and nowhere else."""

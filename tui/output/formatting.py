@@ -1,0 +1,71 @@
+"""Numbers and times as people read them."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+
+from daq.results.band_summary import decibels
+
+
+def utc(ns: int) -> str:
+    """Return an instant as ISO 8601 to the millisecond."""
+    whole, rest = divmod(ns, 1_000_000_000)
+    moment = datetime.fromtimestamp(whole, tz=UTC)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z"
+
+
+def clock_time(seconds: float) -> str:
+    """Return a length of time as h:mm:ss, or m:ss below an hour."""
+    whole = max(0, math.floor(seconds + 0.5))
+    hours, rest = divmod(whole, 3600)
+    minutes, left = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{left:02d}" if hours else f"{minutes}:{left:02d}"
+
+
+def time_left(seconds: float | None) -> str:
+    """Return how long something still takes, roughly."""
+    if seconds is None or not math.isfinite(seconds):
+        return "time left unknown"
+    return f"{roughly(seconds)} left" if seconds > 0 else "done"
+
+
+def roughly(seconds: float) -> str:
+    """Return a length of time in its largest unit, rounded up."""
+    for limit, unit, size in ((90, "s", 1), (5400, "min", 60), (172800, "h", 3600)):
+        if seconds < limit:
+            return f"{math.ceil(seconds / size)} {unit}"
+    return f"{math.ceil(seconds / 86400)} days"
+
+
+def level(psd: float) -> str:
+    """Return a PSD in dB, and say so where it has none."""
+    if math.isnan(psd):
+        return "?"
+    return "below 0" if psd <= 0 else signed(decibels(psd), ".2f")
+
+
+def level_with_error(psd: float, high: float) -> str:
+    """Return a PSD in dB with half the width of its 95 % interval."""
+    if not (psd > 0 and high > psd):
+        return level(psd)
+    return f"{level(psd)} ±{decibels(high) - decibels(psd):.2f}"
+
+
+def interval(low: float, high: float) -> str:
+    """Return an interval of PSD in dB."""
+    if math.isnan(high):
+        return ""
+    if high <= 0:
+        return ""
+    return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
+
+
+def signed(value: float, spec: str) -> str:
+    """Return a number with the minus sign of typography."""
+    return f"{value:{spec}}".replace("-", "−")
+
+
+def several(count: int, one: str, more: str | None = None) -> str:
+    """Return a count with its noun."""
+    return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")

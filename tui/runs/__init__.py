@@ -1,0 +1,1 @@
+"""Recorder processes: started, found, stopped; Ctrl-C deferred."""

@@ -1,0 +1,163 @@
+"""The recorder as a process of its own: start it, reach it, and know how it ended.
+
+It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. What
+it says on standard error goes to a file without a name, which outlives us too.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError, RecordingError
+from daq.recording.control import ask
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+POLL = 0.05
+STOP_TIMEOUT = 30.0
+
+
+class RecorderFailedError(HuddleError):
+    """The recorder ended in trouble; ``code`` is its exit code and the message what it said."""
+
+    def __init__(self, said: str, code: int) -> None:
+        super().__init__(said)
+        self.code = code
+
+
+class RecorderProcess:
+    """One ``huddle record``.
+
+    Parameters
+    ----------
+    bench_path : Path
+    out : Path
+        Recording it writes; must not exist.
+    duration : float, optional
+        In seconds; until it is told to stop, if not given.
+
+    Raises
+    ------
+    RecordingError
+        If there is a recording already: it would be taken for the new one.
+    """
+
+    def __init__(self, bench_path: Path, out: Path, *, duration: float | None = None) -> None:
+        if out.exists():
+            raise RecordingError(f"{out}: exists already; expected a new file")
+        self.out = out
+        self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
+        arguments = [sys.executable, "-m", "tui", "record", str(bench_path), "--out", str(out)]
+        if duration is not None:
+            arguments += ["--duration", repr(duration)]
+        self._process = subprocess.Popen(
+            arguments,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            **_own_session(),
+        )
+
+    def close(self) -> None:
+        """Forget the process; it goes on."""
+        self._said.close()
+        self._process.returncode = self._process.poll() or 0  # it may outlive us: that is meant
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone."""
+        return self._process.poll() is not None
+
+    def wait_for_file(self) -> None:
+        """Return when the recording is there to be followed.
+
+        Raises
+        ------
+        RecorderFailedError
+            The recorder ended before.
+        """
+        while not self.out.exists():
+            if self.ended and not self.out.exists():
+                self.check()
+                raise RecorderFailedError(f"{self.out}: the recorder ended without a recording", 3)
+            time.sleep(POLL)
+
+    def check(self) -> None:
+        """Raise what made the recorder fail, if it ended so.
+
+        Raises
+        ------
+        RecorderFailedError
+            With what it said.
+        """
+        code = self._process.poll()
+        if code in {None, 0}:
+            return
+        self._said.seek(0)
+        lines = [line.removeprefix("huddle: ").rstrip() for line in self._said]
+        said = "\n".join(line for line in lines if line) or self._how_it_ended(code)
+        raise RecorderFailedError(said, code if code in {2, 3} else 3)
+
+    def _how_it_ended(self, code: int) -> str:
+        if code > 0:
+            return f"the recorder ended with exit code {code} and said nothing"
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = "unknown"
+        return (
+            f"the recorder was killed (signal {-code}, {name}); what it had acknowledged is safe: "
+            f"huddle repair {self.out} checks it, huddle estimate reads it; start anew to go on"
+        )
+
+    def interrupt(self) -> None:
+        """Ask it to stop by a signal, where the control channel does not answer."""
+        if sys.platform == "win32":
+            self._process.send_signal(signal.CTRL_BREAK_EVENT)
+        else:
+            self._process.send_signal(signal.SIGINT)
+
+    def stop(self) -> None:
+        """Stop it and wait until it has closed its file."""
+        self.request_stop()
+        self.wait()
+
+    def ends_within(self, timeout: float) -> bool:
+        """Wait this long (s), or until the process is gone; return whether it is."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout)
+        return self.ended
+
+    def request_stop(self) -> None:
+        """Ask it to stop: over the control channel, or by a signal where that does not answer."""
+        if self.ended:
+            return
+        try:
+            ask(self.out, "stop")
+        except HuddleError:
+            with suppress(OSError):
+                self.interrupt()
+
+    def wait(self, timeout: float = STOP_TIMEOUT) -> None:
+        """Wait until it has ended; kill it if it does not."""
+        if not self.ends_within(timeout):
+            self._process.kill()
+            self._process.wait()
+
+
+def _own_session() -> dict[str, Any]:
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"start_new_session": True}

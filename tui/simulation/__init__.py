@@ -1,0 +1,1 @@
+"""Simulated benches and simulated recordings for the command."""

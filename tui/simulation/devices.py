@@ -1,0 +1,229 @@
+"""A bench's devices, simulated: the specification for their processes, and how to reach them."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+import tomllib
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from daq.bench.loading import dump
+from daq.drivers.bench_file import load, parse
+from daq.errors import BenchFileError
+from sim_devices.errors import ScenarioError
+from sim_devices.faults import check
+from sim_devices.faults import parse as parse_faults
+from sim_devices.server.launch import start
+from sim_devices.world.scenario import Scenario
+from tui.output.console import console, notices, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from daq.bench.model import Bench, Sensor
+    from sim_devices.server.launch import RunningDevice
+
+HEAD_START_NS = 200_000_000
+"""World time 0 lies this far ahead, so that every process is there when it begins."""
+
+
+def scenario_of(bench: Bench) -> Scenario:
+    """Return the world a bench's ``[simulation]`` table describes.
+
+    Raises
+    ------
+    BenchFileError
+        It has none, or one that does not fit its sensors.
+    """
+    source = bench.source or "bench"
+    if not bench.simulation:
+        raise BenchFileError(
+            f"{source}: simulation: is missing; expected a table with motion and sensors "
+            "(huddle init writes one)"
+        )
+    scenario = Scenario.from_dict(bench.simulation, sampling_rate=bench.sampling_rate)
+    for sensor in bench.sensors:
+        if sensor.name not in scenario.names:
+            raise BenchFileError(
+                f"{source}: simulation.sensors.{sensor.name}: is missing; "
+                "expected a table for every sensor"
+            )
+        if scenario.n_channels(sensor.name) != sensor.n_main_channels:
+            raise BenchFileError(
+                f"{source}: simulation.sensors.{sensor.name}: has "
+                f"{scenario.n_channels(sensor.name)} channels; expected {sensor.n_main_channels}, "
+                "one for each channel that is not auxiliary"
+            )
+    return scenario
+
+
+def specification(bench: Bench, *, speed: float, log: Path | None = None) -> dict[str, Any]:
+    """Return what ``sim_devices.server.serve`` needs to serve every port of a bench.
+
+    Each fault that strikes and all that is sent is noted in ``log``.
+    """
+    scenario = scenario_of(bench).to_dict()
+    faults = bench.simulation.get("faults", [])
+    _check_faults(bench, faults, f"{bench.source or 'bench'}: simulation")
+    for sensor in bench.sensors:
+        scenario["sensors"][sensor.name]["sampling_rate"] = sensor.sampling_rate
+    return {
+        "epoch_ns": time.monotonic_ns() + HEAD_START_NS,
+        "speed": speed,
+        "scenario": scenario,
+        "faults": faults,
+        "fault_log": str(log) if log else None,
+        "sent_log": str(log) if log else None,
+        "devices": [_device(sensors) for sensors in bench.ports().values()],
+    }
+
+
+def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
+    first = sensors[0]
+    return {
+        "sensors": [sensor.name for sensor in sensors],
+        "driver": first.driver,
+        "port": _kind(first.port),
+        "number": _number(first.port),
+        "sampling_rate": first.sampling_rate,
+        "settings": first.settings,
+        "sensor_settings": {sensor.name: sensor.settings for sensor in sensors},
+        "model": first.model,
+        "serial_number": first.serial_number,
+        "channels": {
+            sensor.name: [
+                {
+                    "name": channel.name,
+                    "sensitivity": channel.sensitivity,
+                    "auxiliary": channel.auxiliary,
+                }
+                for channel in sensor.channels
+            ]
+            for sensor in sensors
+        },
+    }
+
+
+def _kind(port: str) -> str:
+    """Return the kind of wire a simulated device is to be served on, after its port's address."""
+    scheme, _, rest = port.partition("://")
+    if rest:
+        return "udp" if scheme == "udp" else "tcp"
+    return "tcp" if sys.platform == "win32" else "pty"
+
+
+def _number(port: str) -> int:
+    """Return the number of a port on this machine, which a simulated device can have; else 0."""
+    parts = urlsplit(port)
+    try:
+        number = parts.port
+    except ValueError:
+        number = None
+    return number or 0 if parts.hostname in {"127.0.0.1", "localhost"} else 0
+
+
+@contextmanager
+def simulated(bench: Bench, *, speed: float, log: Path | None = None) -> Iterator[Bench]:
+    """Serve a bench's devices while the context lasts; yields a bench that connects to them."""
+    with start(specification(bench, speed=speed, log=log)) as running:
+        yield connected(bench, running, speed=speed)
+
+
+def connected(bench: Bench, running: Sequence[RunningDevice], *, speed: float) -> Bench:
+    """Return the bench with the ports and settings of devices that run."""
+    of_sensor = {name: device for device in running for name in device.sensors}
+    sensors = tuple(
+        sensor.model_copy(
+            update={
+                "port": of_sensor[sensor.name].port,
+                "settings": sensor.settings | of_sensor[sensor.name].settings,
+            }
+        )
+        for sensor in bench.sensors
+    )
+    simulation = bench.simulation | {"speed": speed}
+    changed = bench.model_copy(update={"sensors": sensors, "simulation": simulation})
+    return parse(dump(changed), str(bench.source or "simulated"))
+
+
+def with_faults(bench: Bench, path: Path) -> Bench:
+    """Return the bench with the fault script of a TOML file (see ``sim_devices.faults``).
+
+    Raises
+    ------
+    BenchFileError
+        With every fault of the script.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or error
+        raise BenchFileError(f"{path}: cannot be read: {reason}; expected a fault script") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BenchFileError(
+            f"{path}: {error}; expected a fault script, a TOML file of [[faults]]"
+        ) from None
+    unknown = ", ".join(sorted(table.keys() - {"faults"}))
+    if unknown:
+        raise BenchFileError(f"{path}: {unknown}: there is no such key; expected [[faults]]")
+    script = table.get("faults", [])
+    _check_faults(bench, script, str(path))
+    return bench.model_copy(update={"simulation": bench.simulation | {"faults": script}})
+
+
+def _check_faults(bench: Bench, script: object, source: str) -> None:
+    """Check that a fault script is one, and strikes what the bench has."""
+    try:
+        check(
+            parse_faults(script), {sensor.name: sensor.n_main_channels for sensor in bench.sensors}
+        )
+    except ScenarioError as error:
+        lines = str(error).splitlines()
+        raise BenchFileError("\n".join(f"{source}: {line}" for line in lines)) from error
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C while the context lasts: what has been started is ended."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def serve_devices(
+    path: Path,
+    *,
+    speed: float | None,
+    faults: Path | None,
+    log: Path | None,
+    out: Path | None,
+    json: str | None,
+) -> None:
+    """Serve a bench's devices until SIGINT or SIGTERM, and tell how to reach them."""
+    bench = load(path)
+    if faults is not None:
+        bench = with_faults(bench, faults)
+    speed = bench.speed if speed is None else speed
+    with _terminated_as_interrupted(), simulated(bench, speed=speed, log=log) as reachable:
+        text = dump(reachable)
+        if out is not None:
+            out.write_text(text, encoding="utf-8")
+        elif json is None:
+            console().print(text, markup=False, soft_wrap=True)
+        write_json(
+            json,
+            {"speed": speed, "ports": {sensor.name: sensor.port for sensor in reachable.sensors}},
+        )
+        notices().print(
+            f"{len(bench.sensors)} sensors served at {speed:g} × life"
+            + (f"; huddle run {out} connects to them" if out else "")
+            + ". Ctrl-C ends it."
+        )
+        while True:
+            time.sleep(3600)

@@ -1,0 +1,250 @@
+"""A recording straight from the model: no devices, no wires, as fast as it can be computed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.model import Bench, Channel, Sensor
+from daq.drivers.bench_file import load
+from daq.drivers.registry import driver_type
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+from sim_devices.errors import ScenarioError
+from sim_devices.world import paper_scenarios
+from sim_devices.world.tables import SensorClock
+from sim_devices.world.world import World
+from tui.output.console import for_people, progress, write_json
+from tui.simulation.devices import scenario_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from sim_devices.world.scenario import Scenario
+
+    FloatArray = NDArray[np.float64]
+
+DEFAULT_DURATION = 600.0
+BLOCK_SECONDS = 1.0
+CHUNK_SECONDS = 10.0
+SIMULATED = "simulated"
+"""The driver a recording names that never saw a wire."""
+HEADROOM = 30.0
+"""Full scale of a named scenario's counts over the rms of what a channel reads."""
+DIRECTIONS = ("X", "Y", "Z")
+
+
+def simulate(scenario: Scenario, duration: float) -> dict[str, FloatArray]:
+    """Simulate what every sensor reads from its first sample on.
+
+    Parameters
+    ----------
+    scenario
+        What moves, and which sensors feel it.
+    duration
+        In seconds.
+
+    Returns
+    -------
+    dict of float64 arrays, shape (n_samples, n_channels)
+        In m/s², by sensor.
+    """
+    world = World(scenario)
+    return {
+        name: world.samples(name, 0, round(duration * model.sampling_rate))
+        for name, model in scenario.sensors.items()
+    }
+
+
+def simulate_recording(
+    scenario: str, *, out: Path, duration: float | None, json: str | None
+) -> None:
+    """Write a recording of a scenario, given by its name or by a bench file.
+
+    Raises
+    ------
+    ScenarioError
+        There is neither a scenario nor a file of this name.
+    BenchFileError
+        The bench file has no simulation, or one that does not fit it.
+    RecordingError
+        The recording exists or cannot be written.
+    """
+    bench, described = _described(scenario)
+    seconds = duration or bench.recording.duration or DEFAULT_DURATION
+    with progress() as bar:
+        task = bar.add_task("simulating", total=seconds)
+        write(
+            out,
+            bench,
+            described,
+            duration=seconds,
+            simulated=lambda s: bar.update(task, completed=s),
+        )
+    for_people(json).print(f"{out}: {seconds:g} s of {', '.join(described.names)}, simulated")
+    write_json(
+        json,
+        {
+            "file": str(out),
+            "scenario": described.to_dict(),
+            "duration": seconds,
+            "sampling_rate": {
+                name: model.sampling_rate for name, model in described.sensors.items()
+            },
+        },
+    )
+
+
+def write(
+    out: Path,
+    bench: Bench,
+    scenario: Scenario,
+    *,
+    duration: float,
+    simulated: Callable[[float], None] | None = None,
+) -> None:
+    """Write a recording whose blocks were received as their last samples were taken.
+
+    Parameters
+    ----------
+    out
+        Must not exist.
+    bench
+        Gives sensitivities; its sensors have no auxiliary channels.
+    scenario
+        Holds every sensor of the bench.
+    duration
+        In seconds.
+    simulated
+        Told how many seconds are done.
+    """
+    world = World(scenario)
+    layouts = {sensor.name: _layout(sensor, scenario) for sensor in bench.sensors}
+    start = HostTime(time.monotonic_ns(), time.time_ns())
+    writer = RecordingWriter.create(
+        out,
+        bench,
+        sensors=tuple(layouts.values()),
+        created=start,
+        attributes={"origin": SIMULATED},
+        chunk_seconds=CHUNK_SECONDS,
+    )
+    try:
+        writer.event(Event("", "started", "simulated", start))
+        for first in np.arange(0.0, duration, CHUNK_SECONDS):
+            last = min(first + CHUNK_SECONDS, duration)
+            for layout in layouts.values():
+                rows = [round(at * layout.sampling_rate) for at in (first, last)]
+                for block in _blocks(world, layout, start=start, first=rows[0], last=rows[1]):
+                    writer.append(block)
+            if simulated is not None:
+                simulated(last)
+        writer.event(Event("", "stopped", "simulated", _after(start, duration)))
+        writer.close()
+    except BaseException:
+        writer.abandon()
+        out.unlink(missing_ok=True)
+        raise
+
+
+def _blocks(
+    world: World, layout: SensorLayout, *, start: HostTime, first: int, last: int
+) -> Iterator[Block]:
+    """Simulate samples `first` to `last` of one sensor, as the blocks a driver would make."""
+    sensitivity = np.array([channel.sensitivity for channel in layout.channels])
+    counts = world.samples(layout.name, first, last - first) * sensitivity
+    if np.issubdtype(layout.dtype, np.integer):
+        limits = np.iinfo(layout.dtype)
+        counts = np.clip(np.rint(counts), limits.min, limits.max)
+    instants = world.sample_times(layout.name, first, last - first)
+    n_block = max(1, round(BLOCK_SECONDS * layout.sampling_rate))
+    for row in range(0, last - first, n_block):
+        part = counts[row : row + n_block]
+        yield Block(
+            sensor=layout.name,
+            first_sample=first + row,
+            counts=part.astype(layout.dtype),
+            received=_after(start, float(instants[row + len(part) - 1])),
+            flags=BlockFlag.NONE if first + row else BlockFlag.CLOCK_RESTART,
+        )
+
+
+def _described(scenario: str) -> tuple[Bench, Scenario]:
+    """Return a bench without auxiliary channels, and the world of its sensors."""
+    path = Path(scenario)
+    if not path.exists():
+        if scenario not in paper_scenarios.SCENARIOS:
+            raise ScenarioError(
+                f"{scenario!r} is neither a file nor a scenario; expected a bench file, or one of"
+                f" {', '.join(paper_scenarios.SCENARIOS)}"
+            )
+        world = paper_scenarios.named(scenario)
+        return bench_of(scenario, world), world
+    bench = load(path)
+    sensors = tuple(
+        sensor.model_copy(update={"channels": tuple(c for c in sensor.channels if not c.auxiliary)})
+        for sensor in bench.sensors
+    )
+    return bench.model_copy(update={"sensors": sensors}), scenario_of(bench)
+
+
+def bench_of(name: str, scenario: Scenario) -> Bench:
+    """Return a bench for a scenario: sensitivities leave headroom over motion and noise."""
+    sensors = []
+    for sensor, model in scenario.sensors.items():
+        full_scale = HEADROOM * _rms(scenario, sensor).max()
+        sensitivity = 10.0 ** np.floor(np.log10(2**31 / full_scale))
+        sensors.append(
+            Sensor(
+                name=sensor,
+                model=SIMULATED,
+                driver=SIMULATED,
+                port=SIMULATED,
+                sampling_rate=model.sampling_rate,
+                channels=tuple(
+                    Channel(name=DIRECTIONS[number], sensitivity=float(sensitivity))
+                    for number in range(scenario.n_channels(sensor))
+                ),
+            )
+        )
+    rate = min(model.sampling_rate for model in scenario.sensors.values())
+    return Bench(
+        name=name, sampling_rate=rate, sensors=tuple(sensors), simulation=scenario.to_dict()
+    )
+
+
+def _rms(scenario: Scenario, sensor: str) -> FloatArray:
+    """Root mean square of what each channel reads, in m/s²."""
+    step = 0.05
+    frequency = np.arange(step, scenario.sensors[sensor].sampling_rate / 2, step)
+    csm = World(scenario).true_csm((sensor,), frequency)
+    return np.asarray(np.sqrt(np.einsum("fcc->c", csm).real * step))
+
+
+def _layout(sensor: Sensor, scenario: Scenario) -> SensorLayout:
+    shared = scenario.sensors[sensor.name].clock == SensorClock()
+    counts: np.dtype[np.generic] = np.dtype(np.int32)
+    if sensor.driver != SIMULATED:
+        counts = driver_type(sensor.driver).counts_dtype(sensor)
+    return SensorLayout(
+        name=sensor.name,
+        channels=sensor.channels,
+        sampling_rate=sensor.sampling_rate,
+        dtype=counts,
+        clock="world" if shared else sensor.name,
+        model=sensor.model,
+        serial_number=sensor.serial_number,
+        driver=sensor.driver,
+        port=sensor.port,
+    )
+
+
+def _after(start: HostTime, seconds: float) -> HostTime:
+    elapsed = round(seconds * 1e9)
+    return HostTime(start.monotonic_ns + elapsed, start.utc_ns + elapsed)

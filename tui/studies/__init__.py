@@ -1,0 +1,1 @@
+"""The paper's figures reproduced: simulated, estimated, judged by theory."""

@@ -1,0 +1,351 @@
+"""Recordings of free-running sensors, straight from the model, and the study of their clocks."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from daq.bench.model import Channel
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.world import World
+from tui.studies.study import Curve, Panel, Point, Series, Study
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.snapshot import Snapshot
+    from tui.studies.study import ProgressCallback
+
+    FloatArray = NDArray[np.float64]
+
+ORIGIN = HostTime(5_000_000_000_000, 1_790_000_000_000_000_000)
+SENSITIVITY = 1e8  # counts per m/s²: quantisation 60 dB under the noise
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """How long after its last sample a block arrives.
+
+    ``exponential``: `shortest` plus an exponential with mean `spread`. ``batching``: at the next
+    poll of a USB adapter, every `spread` seconds, plus `shortest` and 50 µs of jitter.
+    """
+
+    kind: Literal["exponential", "batching"] = "exponential"
+    spread: float = 1e-3
+    shortest: float = 4e-4
+
+    def arrivals(self, instants: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return when blocks arrive whose last samples were taken at `instants`, in order."""
+        if self.kind == "exponential":
+            arrival = instants + self.shortest + rng.exponential(self.spread, len(instants))
+        else:
+            phase = rng.uniform(0, self.spread)
+            arrival = np.ceil((instants - phase) / self.spread) * self.spread + phase
+            arrival = arrival + self.shortest + rng.exponential(5e-5, len(instants))
+        return np.maximum.accumulate(arrival)
+
+
+def synthesise(
+    path: str | Path,
+    scenario: Scenario,
+    *,
+    duration: float,
+    latency: Latency | None = None,
+    block: float = 0.1,
+    seed: int = 1,
+    instants: bool = False,
+    utc: Mapping[str, float] | None = None,
+) -> Path:
+    """Write the recording that a bench of this scenario would have given.
+
+    Parameters
+    ----------
+    path : path
+    scenario : Scenario
+    duration : float
+        Seconds of world time.
+    latency : Latency, optional
+        Exponential by default.
+    block : float
+        Seconds of samples a block holds.
+    seed : int
+        Of the latencies.
+    instants : bool
+        Store when each sample was really taken, as no device could.
+    utc : mapping of str to float, optional
+        Sensors that state UTC themselves, and by how many seconds the host's is behind theirs.
+    """
+    latency = latency or Latency()
+    layouts = [
+        SensorLayout(
+            name=name,
+            channels=tuple(
+                Channel(name="xyz"[number], sensitivity=SENSITIVITY)
+                for number in range(scenario.n_channels(name))
+            ),
+            sampling_rate=scenario.sensors[name].sampling_rate,
+            dtype=np.dtype(np.int32),
+            clock=name,
+        )
+        for name in scenario.names
+    ]
+    writer = RecordingWriter.create(path, sensors=layouts, created=ORIGIN, chunk_seconds=10.0)
+    rng = np.random.default_rng(seed)
+    world = World(scenario)
+    for layout in layouts:
+        begin = scenario.sensors[layout.name].clock.offset
+        length = max(1, round(block * layout.sampling_rate))
+        n_blocks = int((duration - begin) * layout.sampling_rate) // length
+        ends = world.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
+        arrivals = latency.arrivals(ends, rng)
+        for each in _blocks(world, layout, length=length, arrivals=arrivals, instants=instants):
+            if utc and layout.name in utc:
+                taken = float(world.sample_times(layout.name, each.first_sample, 1)[0])
+                stated = ORIGIN.utc_ns + round((taken + utc[layout.name]) * 1e9)
+                writer.append(
+                    replace(each, flags=each.flags | BlockFlag.DEVICE_UTC, device_counter=stated)
+                )
+            else:
+                writer.append(each)
+    writer.close()
+    return Path(path)
+
+
+def _blocks(
+    world: World, layout: SensorLayout, *, length: int, arrivals: FloatArray, instants: bool
+) -> Iterator[Block]:
+    """Yield the blocks of one sensor, each `length` samples, that arrive then (world seconds)."""
+    arrivals_ns = np.round(arrivals * 1e9).astype(np.int64).tolist()
+    at_once = max(1, 20_000 // length)
+    for first in range(0, len(arrivals_ns), at_once):
+        some = arrivals_ns[first : first + at_once]
+        samples = world.samples(layout.name, first * length, len(some) * length)
+        counts = np.round(samples * SENSITIVITY).astype(np.int32)
+        times = world.sample_times(layout.name, first * length, len(counts))
+        taken = ORIGIN.monotonic_ns + np.round(times * 1e9).astype(np.int64)
+        for number, arrival in enumerate(some):
+            rows = slice(number * length, (number + 1) * length)
+            yield Block(
+                layout.name,
+                (first + number) * length,
+                counts[rows],
+                HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
+                flags=BlockFlag.NONE if first + number else BlockFlag.CLOCK_RESTART,
+                instants_ns=taken[rows] if instants else None,
+            )
+
+
+def free_running(
+    *, n_dims: int = 2, snr: float = 1e4, duration: float = 3600.0, seed: int = 1
+) -> Scenario:
+    """Return three misaligned sensors with clocks 0, +15 and -20 ppm, wandering, one stepping.
+
+    Motion is white with ``S_y = 1.5 S_x``; noise is white, `snr` below the weakest direction.
+    Clocks wander 0.2 ppm over an hour, and the second settles 2 ppm away in the middle.
+    """
+    level = 1e-9
+    table: dict[str, Any] = {
+        "seed": seed,
+        "motion": {
+            "spectra": [
+                {"shape": "white", "level": level * factor} for factor in (1.0, 1.5, 1.2)[:n_dims]
+            ]
+        },
+        "sensors": {},
+    }
+    turns = ((0.0, 0.0, 0.0), (10.0, 4.0, -3.0), (-7.0, 2.0, 5.0))
+    clocks: tuple[dict[str, Any], ...] = (
+        {"ppm": 0.0, "wander": 0.2},
+        {
+            "ppm": 15.0,
+            "wander": 0.2,
+            "offset": 0.0321,
+            "step": {"time": duration / 2, "ppm": 2.0, "time_constant": 60.0},
+        },
+        {"ppm": -20.0, "wander": 0.2, "offset": 0.0573},
+    )
+    for name, turn, clock in zip("ABC", turns, clocks, strict=True):
+        table["sensors"][name] = {
+            "rotation": {1: 0.0, 2: turn[0], 3: turn}[n_dims],
+            "noise": {"shape": "white", "level": level / snr},
+            "clock": clock,
+        }
+    return Scenario.from_dict(table, sampling_rate=200.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one way of taking the clocks gives.
+
+    Attributes
+    ----------
+    clocks : str
+    bias : float64, shape (n_bands, n_channels)
+        Mean of estimate over truth, less one.
+    against_oracle : float64, shape (n_bands, n_channels)
+        Mean of estimate over the estimate with true clocks, less one.
+    cov : float64, shape (n_channels,)
+        Coefficient of variation seen: scatter of estimate over truth between frequencies.
+    residual_us : float64, shape (n_sensors - 1,)
+        What is left between each clock and the first sensor's, in µs rms about its mean; NaN where
+        nothing was aligned.
+    """
+
+    clocks: str
+    bias: FloatArray
+    against_oracle: FloatArray
+    cov: FloatArray
+    residual_us: FloatArray
+
+
+BANDS = (0.5, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 75.0, 85.0, 90.0)
+"""Edges in Hz of the bands of the study, up to 0.45 of 200 Hz."""
+
+
+def study(
+    directory: Path,
+    *,
+    n_dims: int = 2,
+    snr: float = 1e4,
+    duration: float = 3600.0,
+    latency: Latency | None = None,
+    seed: int = 1,
+) -> list[Row]:
+    """Estimate one simulated huddle test with its clocks taken in four ways.
+
+    The same samples are recorded as they would arrive (estimated at face value, by arrival times,
+    and refined), and with the true instant of every sample (the oracle).
+
+    Parameters
+    ----------
+    directory : Path
+        For the recordings, some 20 MB an hour each.
+    n_dims, snr, duration, latency, seed
+        As `free_running` and `synthesise` take them.
+    """
+    scenario = free_running(n_dims=n_dims, snr=snr, duration=duration, seed=seed)
+    settings = Settings()
+    made: dict[str, Any] = {"duration": duration, "latency": latency, "seed": seed}
+    arrived = synthesise(directory / "arrived.h5", scenario, **made)
+    oracle = synthesise(directory / "oracle.h5", scenario, instants=True, **made)
+    snapshots = {
+        "face value": estimate([arrived], replace(settings, clocks="nominal")),
+        "arrival times": estimate([arrived], replace(settings, clocks="arrivals")),
+        "refined": estimate([arrived], settings),
+        "oracle": estimate([oracle], settings),
+    }
+    return [
+        _row(clocks, snapshot, snapshots["oracle"], scenario)
+        for clocks, snapshot in snapshots.items()
+    ]
+
+
+def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) -> Row:
+    psd = snapshot.results["three-sensor"].noise_psd
+    columns = [(name, r) for name in scenario.names for r in range(scenario.n_channels(name))]
+    frequency = snapshot.frequency
+    truth = np.stack([scenario.true_noise_psd(*c, frequency) for c in columns], axis=1)
+    bands = [(frequency >= a) & (frequency < b) for a, b in itertools.pairwise(BANDS)]
+    reference = oracle.results["three-sensor"].noise_psd
+    usable = (frequency >= BANDS[0]) & (frequency < BANDS[-1])
+    return Row(
+        clocks,
+        bias=np.stack([(psd[band] / truth[band]).mean(axis=0) - 1 for band in bands]),
+        against_oracle=np.stack(
+            [psd[band].mean(axis=0) / reference[band].mean(axis=0) - 1 for band in bands]
+        ),
+        cov=np.asarray((psd / truth)[usable].std(axis=0)),
+        residual_us=residuals(snapshot, scenario) * 1e6,
+    )
+
+
+def clocks(told: ProgressCallback, *, length: float = 1.0) -> Study:
+    """Study what free-running clocks do to the three-sensor estimate, and what is left of it.
+
+    Parameters
+    ----------
+    told
+        Takes progress.
+    length
+        Share of an hour to simulate.
+    """
+    cases = [
+        (n_dims, latency)
+        for n_dims in (2, 3)
+        for latency in (Latency(), Latency("batching", 16e-3))
+    ]
+    panels = []
+    for number, (n_dims, latency) in enumerate(cases):
+        kind = {2: "biaxial", 3: "triaxial"}[n_dims]
+        title = f"{kind}, {latency.kind} latency of {latency.spread * 1e3:g} ms"
+        told(f"clocks: {title}", number / len(cases))
+        with tempfile.TemporaryDirectory() as folder:
+            rows = study(
+                Path(folder), n_dims=n_dims, duration=3600 * length, latency=latency, seed=1
+            )
+        panels.append(_panel(title, {row.clocks: row for row in rows}, length))
+    return Study("clocks", "Free-running clocks at SNR 1e4", tuple(panels))
+
+
+def _panel(title: str, rows: dict[str, Row], length: float) -> Panel:
+    edges = np.array(BANDS)
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    settings = Settings()
+    # Independent values in a band: a Hann window leaves one in 1.94 frequencies; three sensors.
+    independent = 3 * np.diff(edges) * settings.segment / 1.94
+    refined = rows["refined"]
+    error = refined.cov.mean() / np.sqrt(independent)
+    points = tuple(
+        Point(*values, allowed=0.02)
+        for values in zip(
+            middle.tolist(),
+            refined.bias.mean(axis=1).tolist(),
+            [0.0] * len(middle),
+            error.tolist(),
+            strict=True,
+        )
+    )
+    left = f"{refined.residual_us.max():.2g} µs left" + ("" if length == 1 else f", {length:g} h")
+    return Panel(
+        f"{title} ({left})",
+        "frequency (Hz)",
+        "bias",
+        series=(Series("clocks refined", "three-sensor", "bias", points),),
+        curves=tuple(
+            Curve(clocks, middle, rows[clocks].bias.mean(axis=1), style)
+            for clocks, style in (("arrival times", "--"), ("oracle", ":"))
+        ),
+        log="x",
+    )
+
+
+def residuals(snapshot: Snapshot, scenario: Scenario) -> FloatArray:
+    """Return what is left between each clock and the first sensor's, in seconds rms.
+
+    A constant delay is left out: the method does not mind it, and only instruments with equal
+    responses would allow to tell it from their own.
+    """
+    start = (snapshot.start_utc_ns - ORIGIN.utc_ns) * 1e-9
+    seconds = start + snapshot.drift[:, 0]
+    errors = []
+    world = World(scenario)
+    for name, delay in zip(scenario.names, snapshot.drift[:, 1:].T, strict=True):
+        index = (seconds - delay) * scenario.sensors[name].sampling_rate
+        whole = np.floor(index).astype(np.int64)
+        times = world.sample_times(name, 0, int(whole.max()) + 2)
+        true = times[whole] + (index - whole) * (times[whole + 1] - times[whole])
+        errors.append(seconds - true)
+    relative = np.stack(errors[1:]) - errors[0]
+    return np.asarray((relative - relative.mean(axis=1, keepdims=True)).std(axis=1))

@@ -1,0 +1,350 @@
+"""The laboratory set-ups: five triaxial sensors side by side, Table 1 and Fig. 14.
+
+Segments are 10 s with a Hann window and half overlap: the paper's rectangular ones would leak the
+motion at the structure's modes into bins where it is ten thousand times weaker. Theory is (13)
+and (30) with the cross-spectra of the field, as such segments see them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.likelihood.dimension import choose_dimension
+from estimator.methods import self_noise
+from estimator.self_noise.band_means import bin_correlation
+from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
+from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.windows import get_window
+from sim_devices.world import paper_scenarios
+from sim_devices.world.world import World
+from tui.studies.study import Curve, Panel, Point, Series, Study
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from sim_devices.world.scenario import Scenario
+    from tui.studies.study import ProgressCallback
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+HANN = WelchSettings(
+    sampling_rate=paper_scenarios.SAMPLING_RATE, segment_length=2000, overlap=0.5, window="hann"
+)
+DURATION = 3 * 3600.0
+SHOWN = slice(5, 901)
+"""0.5 to 90 Hz."""
+BANDS = ((2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, 80.0))
+WAVE_BANDS = (*BANDS[:4], (45.0, 55.0))
+CHUNK_SIZE, PIECES = 4000, 12
+"""Samples simulated at a time, and how many times before they are transformed."""
+FINE = 8
+"""Points of the true spectrum per bin, where the window smooths it."""
+REACH = 3
+"""Bins to each side from which a Hann window takes power."""
+PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
+BIAS_LABEL = "fractional bias (1)"
+BIAS = {"three-channel": three_channel_bias, "three-sensor": three_sensor_bias}
+STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C2-"}
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A scenario's cross-spectral matrix, and what it would be without statistical error.
+
+    That is `motion` (n_freqs, n_channels, n_channels) and `noise` (n_freqs, n_channels) on its
+    diagonal.
+    """
+
+    scenario: Scenario
+    csm: ComplexArray
+    motion: ComplexArray
+    noise: FloatArray
+    n_effective: float
+
+    def of(self, sensors: tuple[str, ...]) -> Measured:
+        """Return the part that belongs to some sensors, in their order."""
+        first = {name: 3 * number for number, name in enumerate(self.scenario.names)}
+        used = np.concatenate([first[name] + np.arange(3) for name in sensors])
+        square = np.ix_(np.arange(len(self.csm)), used, used)
+        return replace(
+            self, csm=self.csm[square], motion=self.motion[square], noise=self.noise[:, used]
+        )
+
+
+class Laboratory:
+    """The set-ups' cross-spectral matrices, simulated when first wanted."""
+
+    def __init__(self, told: ProgressCallback, *, length: float = 1.0) -> None:
+        self._told = told
+        self._duration = DURATION * length
+        self._measured: dict[str, Measured] = {}
+
+    def measured(self, name: str) -> Measured:
+        """Simulate a named scenario at the paper's length, and transform what its sensors read."""
+        if name not in self._measured:
+            self._measured[name] = measure(
+                paper_scenarios.named(name),
+                duration=self._duration,
+                told=lambda share: self._told(f"{name}: five triaxial sensors", share),
+            )
+        return self._measured[name]
+
+
+def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None]) -> Measured:
+    """Simulate triaxial sensors for a duration in seconds, and transform what they read."""
+    world = World(scenario)
+    spectra = CrossSpectra(HANN, 3 * len(scenario.names))
+    length, hop = HANN.segment_length, HANN.hop
+    n_samples = round(duration * HANN.sampling_rate)
+    kept: list[FloatArray] = []
+    for first in range(0, n_samples, CHUNK_SIZE):
+        n = min(CHUNK_SIZE, n_samples - first)
+        # all sensors in turn: they share the waves' spectra, and only the last two are kept
+        samples = [world.samples(name, first, n) for name in scenario.names]
+        kept.append(np.concatenate(samples, axis=1))
+        if len(kept) == PIECES or first + n == n_samples:
+            together = np.concatenate(kept)
+            starts = np.arange(0, len(together) - length + 1, hop)
+            spectra.add(together, starts)
+            kept = [together[len(starts) * hop :]]
+            told((first + n) / n_samples)
+    return Measured(
+        scenario=scenario,
+        csm=spectra.csm()[SHOWN],
+        motion=smoothed(lambda f: world.motion_csm(scenario.names, f), HANN)[SHOWN],
+        noise=smoothed(lambda f: true_noise(scenario, scenario.names, f), HANN)[SHOWN].real,
+        n_effective=spectra.n_effective,
+    )
+
+
+def smoothed(
+    spectrum: Callable[[FloatArray], FloatArray | ComplexArray], settings: WelchSettings
+) -> ComplexArray:
+    """Spectrum that windowed segments have on average.
+
+    Parameters
+    ----------
+    spectrum
+        From frequency in Hz, shape (n,), to the true spectrum, shape (n, ...).
+    settings
+        Of the segments.
+
+    Returns
+    -------
+    complex128, shape (n_freqs, ...)
+        The true spectrum, smoothed by the power of the window's transform.
+    """
+    window = get_window(settings.window, settings.segment_length)
+    offsets = np.arange(-REACH * FINE, REACH * FINE + 1) / FINE
+    turns = np.outer(offsets, np.arange(settings.segment_length)) / settings.segment_length
+    weights = np.abs(np.exp(-2j * np.pi * turns) @ window) ** 2
+    weights /= weights.sum()
+    bin_width = settings.sampling_rate / settings.segment_length
+    total = np.zeros((), dtype=complex)
+    for offset, weight in zip(offsets, weights, strict=True):
+        frequency = settings.frequencies + offset * bin_width
+        part = spectrum(np.abs(frequency))
+        part[frequency < 0] = part[frequency < 0].conj()
+        total = total + weight * part
+    return np.asarray(total)
+
+
+def true_noise(scenario: Scenario, sensors: tuple[str, ...], frequency: FloatArray) -> FloatArray:
+    """Return the true noise PSD of the sensors' channels, shape (n_freqs, n_channels)."""
+    return np.transpose(
+        [
+            scenario.true_noise_psd(sensor, channel, frequency)
+            for sensor in sensors
+            for channel in range(scenario.n_channels(sensor))
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of some channels, shapes (n_freqs, n_channels): estimated, and what it should be."""
+
+    method: str
+    estimate: FloatArray
+    limit: FloatArray
+    deviation: FloatArray
+    truth: FloatArray
+
+
+def estimate(
+    measured: Measured, sensors: tuple[str, ...], method: str, *, n_channels: int = 1
+) -> Noise:
+    """Estimate the noise of the leading channels of some sensors.
+
+    Theory expects (13) or (30) with the motion's true cross-spectra.
+    """
+    part, dims, n = measured.of(sensors), (3,) * len(sensors), measured.n_effective
+    truth = true_noise(measured.scenario, sensors, HANN.frequencies[SHOWN])
+    found = self_noise(method, part.csm, dims=dims, n_effective=n)
+    channel = np.arange(sum(dims))
+    expected = part.motion.copy()
+    expected[:, channel, channel] += part.noise
+    predicted = self_noise(method, expected, dims=dims, n_effective=n)
+    limit = part.noise + truth * BIAS[method](part.motion, truth, dims=dims)
+    return Noise(
+        method=method,
+        estimate=found.noise_psd[:, :n_channels],
+        limit=limit[:, :n_channels],
+        deviation=(predicted.cov * np.abs(predicted.noise_psd))[:, :n_channels],
+        truth=truth[:, :n_channels],
+    )
+
+
+def estimate_any_dimension(measured: Measured, *, n_channels: int) -> Noise:
+    """Estimate by maximum likelihood, with as many dimensions of motion as the test asks for.
+
+    Theory expects the true noise, though only as far as the motion has no further dimensions.
+    """
+    sensors = measured.scenario.names[::-1]  # the one in the middle comes first
+    dims, n = (3,) * len(sensors), measured.n_effective
+    csm = measured.of(sensors).csm
+    n_factors, _ = choose_dimension(csm, HANN.frequencies[SHOWN], dims=dims, n_effective=n)
+    found = self_noise("maximum-likelihood", csm, dims=dims, n_effective=n, n_factors=n_factors)
+    truth = true_noise(measured.scenario, sensors, HANN.frequencies[SHOWN])[:, :n_channels]
+    cov = np.where(np.isfinite(found.cov), found.cov, 1.0)[:, :n_channels]  # at zero: one
+    return Noise("maximum-likelihood", found.noise_psd[:, :n_channels], truth, cov * truth, truth)
+
+
+def band_series(
+    noise: Noise,
+    *,
+    label: str,
+    bands: tuple[tuple[float, float], ...] = BANDS,
+    allowed: Callable[[float], float] = lambda _: 0.0,
+) -> Series:
+    """Mean fractional bias over each band and all channels, beside its limit.
+
+    The error is as if the channels' estimates were wrong all in the same way, as they are where
+    the motion is what they share.
+    """
+    frequency = HANN.frequencies[SHOWN]
+    correlation = bin_correlation(get_window(HANN.window, HANN.segment_length), HANN.hop)
+    both_sides = np.concatenate([correlation[:0:-1], correlation])
+    points = []
+    for low, high in bands:
+        band = (frequency >= low) & (frequency < high)
+        truth = noise.truth[band]
+        variance = [
+            np.convolve(spread, both_sides, "same") @ spread
+            for spread in (noise.deviation[band] / truth).T
+        ]
+        centre = float(np.sqrt(low * high))
+        points.append(
+            Point(
+                x=centre,
+                measured=float(np.mean(noise.estimate[band] / truth - 1)),
+                theory=float(np.mean(noise.limit[band] / truth - 1)),
+                error=float(np.mean(np.sqrt(variance)) / band.sum()),
+                allowed=allowed(high),
+            )
+        )
+    return Series(label, noise.method, "bias", tuple(points))
+
+
+def _spectra(title: str, record: Curve, noises: tuple[Noise, ...]) -> Panel:
+    """Draw a record and the noise of its first channel."""
+    frequency = HANN.frequencies[SHOWN]
+    estimates = [(noise.method, noise.estimate, STYLES[noise.method]) for noise in noises]
+    curves = [
+        Curve(label, frequency, np.where(psd[:, 0] > 0, psd[:, 0], np.nan), style)
+        for label, psd, style in (*estimates, ("true noise", noises[0].truth, "r-"))
+    ]
+    return Panel(title, FREQUENCY_LABEL, PSD_LABEL, curves=(record, *curves), log="xy")
+
+
+def _record(measured: Measured, sensor: str) -> Curve:
+    power = measured.of((sensor,)).csm[:, 0, 0].real
+    return Curve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
+
+
+def _biases(title: str, *series: Series) -> Panel:
+    return Panel(title, FREQUENCY_LABEL, BIAS_LABEL, series=series, log="x")
+
+
+def case(laboratory: Laboratory, number: str) -> tuple[Panel, Panel]:
+    """Spectra of one case of Table 1, and the bias of both methods by band."""
+    setup, sensors = paper_scenarios.CASES[number]
+    measured = laboratory.measured(setup)
+    noises = tuple(
+        estimate(measured, sensors, method) for method in ("three-channel", "three-sensor")
+    )
+    label = f"case {number} ({', '.join(sensors)})"
+    return (
+        _spectra(label, _record(measured, sensors[0]), noises),
+        _biases(f"{label}: bias", *(band_series(noise, label=label) for noise in noises)),
+    )
+
+
+def setup1(laboratory: Laboratory) -> Study:
+    """Cases 0, 1 and 2 of Table 1 (Figs. 7 and 10, a to c)."""
+    panels = tuple(panel for number in "012" for panel in case(laboratory, number))
+    return Study("setup1", "Set-up 1: A and B turned by 60°", panels)
+
+
+def setup2(laboratory: Laboratory) -> Study:
+    """Case 3 of Table 1 (Figs. 7d and 10d)."""
+    return Study("setup2", "Set-up 2: A, B and E all turned", case(laboratory, "3"))
+
+
+def fig14(laboratory: Laboratory) -> Study:
+    """Wider triangles, where coherence fails; and what all five sensors make of it."""
+    measured = laboratory.measured("setup1")
+    record = _record(measured, "E")
+    panels: list[Panel] = []
+    for letter, sensors in (("a", ("E", "A", "C")), ("b", ("E", "A", "D"))):
+        noise = estimate(measured, sensors, "three-sensor")
+        label = f"({letter}) {', '.join(sensors)}"
+        panels += [
+            _spectra(label, record, (noise,)),
+            _biases(f"{label}: bias", band_series(noise, label=label)),
+        ]
+    noise = estimate_any_dimension(measured, n_channels=1)
+    label = "all five"
+    panels += [
+        _spectra(label, record, (noise,)),
+        _biases(f"{label}: bias", band_series(noise, label=label, allowed=_goal)),
+    ]
+    return Study("fig14", "Wider triangles are less coherent; five sensors know", tuple(panels))
+
+
+def waves(laboratory: Laboratory) -> Study:
+    """Five sensors of any direction where the motion is far from coherent: beyond the paper."""
+    measured = laboratory.measured("waves")
+    triangle = estimate(measured, ("E", "C", "D"), "three-sensor", n_channels=3)
+    five = estimate_any_dimension(measured, n_channels=15)
+    return Study(
+        "waves",
+        "Waves at 150 m/s, SNR 1000: three sensors, and five",
+        (
+            _spectra("E", _record(measured, "E"), (triangle, five)),
+            _biases(
+                "bias",
+                band_series(triangle, label="E, C, D", bands=WAVE_BANDS),
+                band_series(five, label="all five", bands=WAVE_BANDS, allowed=_goal),
+            ),
+        ),
+    )
+
+
+def _goal(high: float) -> float:
+    """Bias that is left to the five sensors: 5 % to 20 Hz, 20 % above."""
+    return 0.05 if high <= 20 else 0.2
+
+
+LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
+    "setup1": setup1,
+    "setup2": setup2,
+    "fig14": fig14,
+    "waves": waves,
+}

@@ -1,0 +1,193 @@
+"""``huddle reproduce``: the paper's figures from our model and estimators, beside the theory."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import typer
+from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from sim_devices.errors import ScenarioError
+from tui.output.console import check_places, for_people, progress, write_json
+from tui.studies.clocks import clocks
+from tui.studies.laboratory import LABORATORY, Laboratory
+from tui.studies.numerical import NUMERICAL, Ingredients
+from tui.studies.study import TOLERANCE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from rich.console import Console
+
+    from tui.studies.study import ProgressCallback, Series, Study
+
+CLOCKS = "clocks"
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS)
+ALL = "all"
+DEFAULT_FOLDER = Path("reproduced")
+
+
+def reproduce(
+    names: Sequence[str], *, told: ProgressCallback, length: float = 1.0
+) -> Iterator[Study]:
+    """Carry out studies, one by one.
+
+    Parameters
+    ----------
+    names
+        Of `STUDIES`; ``all``, or none at all, stands for every one.
+    told
+        Takes progress.
+    length
+        Share of the paper's length to simulate.
+
+    Raises
+    ------
+    ScenarioError
+        If there is no study of a name, before anything is simulated.
+    """
+    unknown = [name for name in names if name not in {*STUDIES, ALL}]
+    if unknown:
+        raise ScenarioError(
+            f"no study {', '.join(map(repr, unknown))}; expected {', '.join(STUDIES)} or {ALL}"
+        )
+    wanted = STUDIES if ALL in names or not names else tuple(dict.fromkeys(names))
+    return _studies(wanted, told, length)
+
+
+def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> Iterator[Study]:
+    ingredients, laboratory = Ingredients(told, length=length), Laboratory(told, length=length)
+    for name in names:
+        if name == CLOCKS:
+            yield clocks(told, length=length)
+        elif name in NUMERICAL:
+            yield NUMERICAL[name](ingredients)
+        else:
+            yield LABORATORY[name](laboratory)
+
+
+def run(
+    names: Sequence[str],
+    *,
+    out: Path | None = None,
+    json: str | None = None,
+    length: float = 1.0,
+) -> bool:
+    """Carry out studies; write figures, print the table, and say whether all agree with theory.
+
+    Parameters
+    ----------
+    names
+        As `reproduce` takes them.
+    out
+        Folder for the figures, a PNG and an SVG each; made if it is not there.
+    json
+        File for every point, or ``-``.
+    length
+        Share of the paper's length to simulate.
+
+    Raises
+    ------
+    typer.BadParameter
+        If there is no place for figures or points, before anything is simulated.
+    """
+    check_places(json)
+    folder = DEFAULT_FOLDER if out is None else out
+    started = time.monotonic()
+    studies: list[Study] = []
+    files: list[Path] = []
+    with _Progress() as told:
+        wanted = reproduce(names, told=told, length=length)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise typer.BadParameter(
+                f"--out {folder}: {error.strerror}; expected a folder"
+            ) from None
+        for study in wanted:
+            from tui.studies.figures import save  # noqa: PLC0415 - matplotlib takes a second
+
+            told(f"{study.name}: figure", 1.0)
+            files += save(study, folder)
+            studies.append(study)
+    elapsed = time.monotonic() - started
+    agrees = all(study.agrees for study in studies)
+    write_json(
+        json,
+        {
+            "agrees": agrees,
+            "tolerance": TOLERANCE,
+            "length": length,
+            "elapsed": elapsed,
+            "figures": [str(file) for file in files],
+            "studies": [study.as_json() for study in studies],
+        },
+    )
+    _print(for_people(json), studies, folder, elapsed)
+    return agrees
+
+
+class _Progress:
+    """A bar for what is being simulated, with the time left."""
+
+    def __init__(self) -> None:
+        self._bar = progress(
+            *Progress.get_default_columns()[:-1],
+            TimeRemainingColumn(),
+            TextColumn("left,"),
+            TimeElapsedColumn(),
+        )
+        self._task = self._bar.add_task("", total=1.0)
+        self._what = ""
+
+    def __enter__(self) -> ProgressCallback:
+        self._bar.start()
+        return self._tell
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def _tell(self, what: str, share: float) -> None:
+        if what != self._what:
+            self._what = what
+            self._bar.reset(self._task, description=what, total=1.0)
+        self._bar.update(self._task, completed=share)
+
+
+def _print(console: Console, studies: list[Study], folder: Path, elapsed: float) -> None:
+    table = Table(box=None, pad_edge=False, padding=(0, 1))
+    table.add_column("")
+    for heading in ("", "at", "measured", "theory", "off"):
+        table.add_column(heading, justify="right")
+    for study in studies:
+        table.add_row(f"[b]{study.name}[/b]  {study.title}")
+        for panel, series in study.series():
+            letter = panel.title[:4] if panel.title.startswith("(") else ""
+            label = series.title.removeprefix(letter)
+            table.add_row(f"  {letter}{label}", series.quantity, *_row(series))
+    console.print(table)
+    deviations = np.concatenate([study.deviations for study in studies])
+    console.print(
+        f"\nEach row shows the point of a curve where theory expects most, ± one standard error;"
+        f" 'off' is the curve's furthest point, in standard errors. Where no theory is exact,"
+        f" it says what may be missed besides."
+        f"\n{np.sum(np.abs(deviations) <= TOLERANCE)} of {deviations.size} points are within"
+        f" {TOLERANCE:g} standard errors of theory (rms {np.sqrt(np.mean(deviations**2)):.2f})."
+        f" Figures in {folder}; {elapsed:.0f} s."
+    )
+
+
+def _row(series: Series) -> tuple[str, ...]:
+    point, worst = series.telling, series.worst
+    off = f"{worst.deviation:+.1f}"
+    return (
+        f"{point.x:.3g}",
+        f"{point.measured:.4g} ± {point.error:.1g}",
+        (f"{point.theory:.4g}" if abs(point.theory) > 1e-9 else "0")
+        + (f" ± {point.allowed:g}" if point.allowed else ""),
+        off if worst.agrees else f"[red]{off} NO[/red]",
+    )
