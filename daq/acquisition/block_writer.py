@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from daq.acquisition.connection import SensorLost
 from daq.acquisition.sample_index import Gap, SampleIndexer
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -120,7 +120,7 @@ class BlockWriter:
         for (name, kind), alike in self._alike.items():
             for event in alike.left_out(Event(name, kind, "", now)):
                 self._writer.event(event)
-        self._writer.event(Event("", "stopped", reason, now))
+        self._writer.event(Event("", EventKind.STOPPED, reason, now))
         return self._writer.close()
 
     def abandon(self) -> None:
@@ -189,7 +189,7 @@ class BlockWriter:
         if at.monotonic_ns - sensor.said_ns >= _SAY_INTERVAL_NS:
             sensor.said_ns = at.monotonic_ns
             text = f"{sensor.repeated} samples so far came again and were recorded once"
-            self._writer.event(Event(block.sensor, "resynchronised", text, at))
+            self._writer.event(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
 
     def _gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
         sensor.missing += gap.missing

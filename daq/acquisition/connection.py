@@ -18,7 +18,7 @@ from daq.acquisition.device_identity import require
 from daq.acquisition.stall_detector import StallDetector
 from daq.drivers.interface import Resuming
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
@@ -173,7 +173,7 @@ class Connection:
             text = f"the driver did not leave the device within {LEAVE_TIMEOUT:g} s"
             for name in self.names:
                 with contextlib.suppress(asyncio.QueueFull):
-                    queue.put_nowait(Event(name, "status", text, self._clock.now()))
+                    queue.put_nowait(Event(name, EventKind.STATUS, text, self._clock.now()))
 
     async def _say(self, failure: Exception, queue: asyncio.Queue[Item]) -> str:
         """Record that the device is lost, and why; return the kind of the event."""
@@ -189,10 +189,10 @@ class Connection:
         def say(name: str, stage: Stage, seconds: float) -> bool:
             now = self._clock.now()
             text = f"no block for {seconds:.2g} s"
-            event = Event(name, "late", f"{text}, two of its block periods", now)
+            event = Event(name, EventKind.LATE, f"{text}, two of its block periods", now)
             if stage == "lost":
                 # One of several on a port: its driver looks after it; here it is said.
-                event = Event(name, "stalled", f"{text}; others on the port go on", now)
+                event = Event(name, EventKind.STALLED, f"{text}; others on the port go on", now)
             try:
                 queue.put_nowait(SensorLost(stage, event))
             except asyncio.QueueFull:
@@ -236,7 +236,7 @@ class Connection:
         text = f"the computer was suspended for {now - before:.3g} s"
         if block.device_counter is None and block.instants_ns is None:
             raise NoAnswerError(f"{self.port}: {text}")
-        await queue.put(Event(block.sensor, "status", text, self._clock.now()))
+        await queue.put(Event(block.sensor, EventKind.STATUS, text, self._clock.now()))
         return now
 
     def _check_identity(self, session: Session) -> None:
@@ -258,10 +258,10 @@ class Connection:
         now = self._clock.now()
         found = next((i for i in session.information if i.sensor == name), None)
         if found is not None and found.trouble:
-            return SensorLost("lost", Event(name, "stalled", found.trouble, now))
+            return SensorLost("lost", Event(name, EventKind.STALLED, found.trouble, now))
         parts = (found.model, found.serial_number, found.firmware) if found else ()
         text = " ".join(("on", self.port, *(part for part in parts if part)))
-        return Event(name, "connected", text, now)
+        return Event(name, EventKind.CONNECTED, text, now)
 
 
 async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:

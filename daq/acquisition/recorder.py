@@ -27,7 +27,7 @@ from daq.acquisition.connection import LEAVE_TIMEOUT, Connection
 from daq.drivers.registry import driver_type
 from daq.errors import DeviceError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Event
+from daq.protocols.block import Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.recording import control
 from daq.recording.file_format import SensorLayout
@@ -210,7 +210,7 @@ class _Recorder:
             tasks.remove(task)
             text = f"the driver on {task.get_name()} does not end; it was left alone"
             with contextlib.suppress(asyncio.QueueFull):
-                self._queue.put_nowait(Event("", "status", text, self._clock.now()))
+                self._queue.put_nowait(Event("", EventKind.STATUS, text, self._clock.now()))
 
     async def _all_connected(self, connections: list[Connection]) -> bool:
         stopped = asyncio.ensure_future(self._stop.wait())
@@ -258,7 +258,7 @@ class _Recorder:
             control=address,
             attributes={} if duration is None else {"duration": duration},
         )
-        writer.event(Event("", "started", f"{len(ordered)} sensors", self._started))
+        writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
 
     async def _write(
@@ -336,7 +336,7 @@ class _Recorder:
             self._reason = "stopped by command"
             self._stop.set()
         elif command == "mark":
-            await self._queue.put(Event("", "mark", text, self._clock.now()))
+            await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
         return self._status.to_dict()
 
 

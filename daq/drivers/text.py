@@ -29,7 +29,7 @@ from pydantic import (
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import only
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.text.decoder import TextDecoder
 from daq.protocols.text.format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
 from daq.transport.ports import open_port
@@ -172,7 +172,7 @@ class _DatagramSource:
         for host in sorted(self._stream.strangers - self._told):
             self._told.add(host)
             text = f"datagrams from {host} are left out: another device sends to this port"
-            found.append(Event(self._sensor, "status", text, at))
+            found.append(Event(self._sensor, EventKind.STATUS, text, at))
         return found
 
     async def send(self, payload: bytes) -> None:

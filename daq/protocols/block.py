@@ -15,7 +15,7 @@ carries a counter the length of a gap is exact; where it does not, the block say
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntFlag
+from enum import IntFlag, StrEnum
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -94,16 +94,64 @@ class Block:
         return self.first_sample + self.n_samples
 
 
+class EventKind(StrEnum):
+    """What kind of event happened; the values are the strings that a recording holds."""
+
+    STARTED = "started"
+    """The run began."""
+    STOPPED = "stopped"
+    """The run ended, or a server announced that it shuts down."""
+    MARK = "mark"
+    """A person's remark, with the time at which it was made."""
+    CONNECTED = "connected"
+    """A device was connected, or answers again."""
+    DISCONNECTED = "disconnected"
+    """The connection to a device ended."""
+    LATE = "late"
+    """No block arrived for two block periods. Recorded only if the sensor is lost afterwards."""
+    STALLED = "stalled"
+    """The port is open, but no samples or no replies arrive."""
+    REFUSED = "refused"
+    """A device, a stream or a reply is not the one that the bench file names, or says no."""
+    RESYNCHRONISED = "resynchronised"
+    """Bytes or packets were skipped, lost or repeated; decoding continued after them."""
+    CHECKSUM = "checksum"
+    """A wrong checksum, or data that cannot be read."""
+    RESET = "reset"
+    """The device's counter or clock started again."""
+    OVERFLOW = "overflow"
+    """A buffer in the device overflowed and samples were lost there."""
+    STATUS = "status"
+    """The device, its driver or the recorder reports its condition."""
+
+    @classmethod
+    def of(cls, text: str) -> EventKind | str:
+        """Return the kind of this name; the text itself where no kind has it.
+
+        Newer programs and drivers from elsewhere may record kinds that this program does not know.
+        """
+        try:
+            return cls(text)
+        except ValueError:
+            return text
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """Something that happened to a sensor (or, with an empty name, to the run).
 
-    ``kind`` is one of a small vocabulary: ``connected``, ``disconnected``, ``late``, ``stalled``,
-    ``resynchronised``, ``checksum``, ``reset``, ``overflow``, ``status``, ``mark``, ``started``,
-    ``stopped``, ``refused``. ``text`` says it in words, in at most 200 bytes.
+    Attributes
+    ----------
+    sensor : str
+    kind : EventKind or str
+        A text only where it is none of `EventKind`: newer programs and drivers from elsewhere have
+        their own.
+    text : str
+        For people, at most 200 bytes. Programs decide by `kind`, never by this text.
+    received : HostTime
     """
 
     sensor: str
-    kind: str
+    kind: EventKind | str
     text: str
     received: HostTime

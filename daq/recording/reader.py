@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.bench.loading import parse
 from daq.errors import BenchFileError, NotARecordingError, RecordingError
-from daq.protocols.block import Event, HostTime
+from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording import file_format
 from daq.recording.block_table import BlockTable
 from daq.recording.chunk_reader import ChunkedRows
@@ -241,7 +241,7 @@ class Recording:
         return tuple(
             Event(
                 sensor=row["sensor"].decode(),
-                kind=row["kind"].decode(),
+                kind=EventKind.of(row["kind"].decode()),
                 text=row["text"].decode(),
                 received=HostTime(int(row["monotonic_ns"]), int(row["utc_ns"])),
             )

@@ -21,6 +21,7 @@ import numpy as np
 
 from daq.errors import RecordingError
 from daq.host_clock import SystemClock
+from daq.protocols.block import EventKind
 from daq.recording import file_format
 from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording, SensorRecord
@@ -178,9 +179,13 @@ def _cut_to_committed(file: h5py.File, report: Report) -> None:
 
 def _add_last_events(file: h5py.File, report: Report, now: HostTime) -> None:
     """Say in the file what happened to it, and that it is closed."""
-    lines = [("", "stopped", "the recorder was killed; closed by repair")]
+    lines = [("", EventKind.STOPPED, "the recorder was killed; closed by repair")]
     lines += [
-        (sensor.name, "checksum", f"{len(sensor.bad_blocks)} damaged blocks, first at row {row}")
+        (
+            sensor.name,
+            EventKind.CHECKSUM,
+            f"{len(sensor.bad_blocks)} damaged blocks, first at row {row}",
+        )
         for sensor in report.sensors
         for row in sensor.bad_blocks[:1]
     ]

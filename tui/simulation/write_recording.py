@@ -11,7 +11,7 @@ import numpy as np
 from daq.bench.model import Bench, Channel, Sensor
 from daq.drivers.bench_file import load
 from daq.drivers.registry import driver_type
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 from sim_devices.errors import ScenarioError
@@ -136,7 +136,7 @@ def write(
         chunk_seconds=CHUNK_SECONDS,
     )
     try:
-        writer.event(Event("", "started", "simulated", start))
+        writer.event(Event("", EventKind.STARTED, "simulated", start))
         for first in np.arange(0.0, duration, CHUNK_SECONDS):
             last = min(first + CHUNK_SECONDS, duration)
             for layout in layouts.values():
@@ -145,7 +145,7 @@ def write(
                     writer.append(block)
             if simulated is not None:
                 simulated(last)
-        writer.event(Event("", "stopped", "simulated", _after(start, duration)))
+        writer.event(Event("", EventKind.STOPPED, "simulated", _after(start, duration)))
         writer.close()
     except BaseException:
         writer.abandon()

@@ -29,7 +29,7 @@ from daq.drivers.guralp.settings import GuralpSettings
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import require_address, require_alike
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp.gcf import component, serial_number
 
 if TYPE_CHECKING:
@@ -96,8 +96,8 @@ class GuralpSession:
             self._identify(first.sensor)
         except WrongDeviceError as error:
             self._refused.add(first.sensor)
-            return Event(first.sensor, "refused", str(error)[:200], first.received)
-        return Event(first.sensor, "connected", "its streams come now", first.received)
+            return Event(first.sensor, EventKind.REFUSED, str(error)[:200], first.received)
+        return Event(first.sensor, EventKind.CONNECTED, "its streams come now", first.received)
 
 
 class GuralpDriver:

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Protocol
 
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp import scream
 from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.protocols.guralp.gcf import BLOCK_SIZE
@@ -132,10 +132,10 @@ class _UdpLink:
             text = f"no recovery of lost packets over TCP, again in {self._delay:g} s: {why}"
             self._retry_ns = at.monotonic_ns + round(self._delay * 1e9)
             self._delay = min(2 * self._delay, LONGEST_RETRY)
-            return [*found, Event(self._name, "status", text[:200], at)]
+            return [*found, Event(self._name, EventKind.STATUS, text[:200], at)]
         if self._retry_ns is not None:
             text = "lost packets are recovered over TCP again"
-            found.append(Event(self._name, "status", text, at))
+            found.append(Event(self._name, EventKind.STATUS, text, at))
         self._retry_ns, self._delay = None, FIRST_RETRY
         return found
 

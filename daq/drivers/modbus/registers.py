@@ -21,7 +21,7 @@ from daq.drivers.interface import DeviceInformation
 from daq.drivers.modbus.bus import ModbusBus, RefusedError, Reply, open_bus
 from daq.drivers.port_rules import require_address, require_alike
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, Event
+from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.modbus import registers as protocol
 from daq.protocols.modbus.registers import (
@@ -200,10 +200,10 @@ class _Poller:
             if error.code in GATEWAY_CODES:
                 found = self._unanswered(str(error))
             else:
-                found = self._event("refused", str(error))
+                found = self._event(EventKind.REFUSED, str(error))
         except RemoteProtocolError as error:
             await bus.settle()
-            found = self._event("resynchronised", str(error))
+            found = self._event(EventKind.RESYNCHRONISED, str(error))
         else:
             self._failures = 0
         self._schedule()
@@ -221,11 +221,11 @@ class _Poller:
         except WrongDeviceError as error:
             self._failures += 1
             self._give_up()
-            return self._event("refused", str(error))
+            return self._event(EventKind.REFUSED, str(error))
         text = f"answers again, after {self._failures} requests without a reply"
         self.is_gone, self._failures, self._delay = False, 0, FIRST_RETRY
         self.due_ns = float(self._clock.now().monotonic_ns)
-        return [Event(self.sensor, "connected", text, self._clock.now())]
+        return [Event(self.sensor, EventKind.CONNECTED, text, self._clock.now())]
 
     def _give_up(self) -> None:
         self.is_gone = True
@@ -234,9 +234,9 @@ class _Poller:
 
     def _unanswered(self, text: str) -> list[Block | Event]:
         self._failures += 1
-        return self._event("stalled", text)
+        return self._event(EventKind.STALLED, text)
 
-    def _event(self, kind: str, text: str) -> list[Block | Event]:
+    def _event(self, kind: EventKind, text: str) -> list[Block | Event]:
         now = self._clock.now()
         self._n_wrong[kind] += 1
         counted = f"{text.encode()[:180].decode(errors='ignore')} ({self._n_wrong[kind]} so far)"

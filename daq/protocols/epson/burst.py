@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, word_sums
 from daq.protocols.framing import PIECE, BoolArray, OctetArray, find_frames
 from daq.protocols.plural import several
@@ -33,6 +33,12 @@ LEAST_FOLLOWING = 3
 """Bursts in a row by which a stream is known again."""
 REPORT_INTERVAL_NS = 1_000_000_000
 """Least host time between two events of one kind."""
+_REPORTS = {
+    "checksum": (EventKind.CHECKSUM, "frame", "with a wrong checksum"),
+    "skipped": (EventKind.RESYNCHRONISED, "byte", "skipped between frames"),
+    "repeated": (EventKind.RESYNCHRONISED, "frame", "came twice"),
+}
+"""What is counted, and the event that reports it."""
 
 
 class BurstDecoder:
@@ -74,7 +80,7 @@ class BurstDecoder:
         self._lost_frames = 0  # without COUNT: frames since the last one that were no frames
         self._next = 0  # without COUNT: index of the next frame
         self._error = False
-        self._counts = dict.fromkeys(("checksum", "resynchronised", "repeated"), 0)
+        self._counts = dict.fromkeys(_REPORTS, 0)
         self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
 
     @property
@@ -145,7 +151,7 @@ class BurstDecoder:
         starts = {start for start, _ in runs}
         bad = sum(1 for end in ends[looks].tolist() if end not in starts)
         self._counts["checksum"] += bad
-        self._counts["resynchronised"] += max(0, skipped - bad * self._size)
+        self._counts["skipped"] += max(0, skipped - bad * self._size)
         self._lost_frames += max(1, round(skipped / self._size))
 
     def _blocks(self, frames: NDArray[np.void], at: HostTime) -> list[Block | Event]:
@@ -164,7 +170,7 @@ class BurstDecoder:
         for run in runs:
             if run.restarted:
                 text = f"COUNT began anew; missing: about {several(run.missing, 'sample')}"
-                found.append(Event(self._sensor, "reset", text, at))
+                found.append(Event(self._sensor, EventKind.RESET, text, at))
             found.append(self._block(run, counts[run.start : run.stop], at))
         return found
 
@@ -193,19 +199,13 @@ class BurstDecoder:
         if not changed:
             return []
         text = "the device reports an error" if error else "the device reports no error any more"
-        return [Event(self._sensor, "status", text, at)]
+        return [Event(self._sensor, EventKind.STATUS, text, at)]
 
     def _report(self, at: HostTime) -> list[Event]:
-        said = {
-            "checksum": ("frame", "with a wrong checksum"),
-            "resynchronised": ("byte", "skipped between frames"),
-            "repeated": ("frame", "came twice"),
-        }
         events = []
-        for kind, n in self._counts.items():
-            if n and at.monotonic_ns - self._reported[kind] >= REPORT_INTERVAL_NS:
-                self._counts[kind] = 0
-                self._reported[kind] = at.monotonic_ns
-                kind_of_event = "resynchronised" if kind == "repeated" else kind
-                events.append(Event(self._sensor, kind_of_event, several(n, *said[kind]), at))
+        for name, (kind, noun, what) in _REPORTS.items():
+            n = self._counts[name]
+            if n and at.monotonic_ns - self._reported[name] >= REPORT_INTERVAL_NS:
+                self._counts[name], self._reported[name] = 0, at.monotonic_ns
+                events.append(Event(self._sensor, kind, several(n, noun, what), at))
         return events

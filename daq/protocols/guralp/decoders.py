@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daq.protocols.block import Block, Event, HostTime
+from daq.protocols.block import Block, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.guralp.brp import MAX_SIZE, Anew, Damaged, Frame, Lost, Receiver, Skipped
 from daq.protocols.guralp.gcf import decode_block
@@ -53,18 +53,20 @@ class SerialDecoder:
                 case Frame(_, block):
                     found += self._frame(block, at)
                 case Damaged(sequence):
-                    found.append(Event(self._name, "checksum", f"block {sequence} was damaged", at))
+                    found.append(
+                        Event(self._name, EventKind.CHECKSUM, f"block {sequence} was damaged", at)
+                    )
                     self.streams.lost("damaged block")
                 case Lost(sequence, n_frames):
                     text = f"{several(n_frames, 'block')} from number {sequence} did not come again"
-                    found.append(Event(self._name, "resynchronised", text, at))
+                    found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
                     self.streams.lost("lost block")
                 case Anew(sequence, due):
                     text = f"the digitizer numbers anew: block {sequence} came, {due} was due"
-                    found.append(Event(self._name, "reset", text, at))
+                    found.append(Event(self._name, EventKind.RESET, text, at))
                     self.streams.lost("digitizer restarted")
                 case Skipped(n_bytes, start):
-                    found.append(Event(self._name, "status", _told(n_bytes, start), at))
+                    found.append(Event(self._name, EventKind.STATUS, _told(n_bytes, start), at))
         return found
 
     def take_replies(self) -> bytes:
@@ -75,7 +77,7 @@ class SerialDecoder:
         try:
             block = decode_block(data)
         except RemoteProtocolError as error:
-            yield Event(self._name, "checksum", cut(str(error)), at)
+            yield Event(self._name, EventKind.CHECKSUM, cut(str(error)), at)
             return
         yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
 
@@ -122,7 +124,9 @@ class ScreamDecoder:
                 found += self._packet(item, at)
             else:
                 found.append(
-                    Event(self._name, "resynchronised", f"skipped {several(item, 'byte')}", at)
+                    Event(
+                        self._name, EventKind.RESYNCHRONISED, f"skipped {several(item, 'byte')}", at
+                    )
                 )
         return found
 
@@ -132,11 +136,11 @@ class ScreamDecoder:
         if text == ACKNOWLEDGED:
             return []
         if text == NO_SERVER:
-            return [Event(self._name, "stopped", "the Scream server shuts down", at)]
+            return [Event(self._name, EventKind.STOPPED, "the Scream server shuts down", at)]
         try:
             return list(self._packet(decode_packet(data), at))
         except RemoteProtocolError as error:
-            return [Event(self._name, "resynchronised", cut(str(error)), at)]
+            return [Event(self._name, EventKind.RESYNCHRONISED, cut(str(error)), at)]
 
     def not_available(self, sequence: int) -> None:
         """Note that the server no longer has this packet."""
@@ -154,7 +158,7 @@ class ScreamDecoder:
             self._next = (sequence + 1) % 65536
             self.streams.lost("server restarted")
             text = f"the server numbers anew: packet {sequence} came, {due} was due"
-            yield Event(self._name, "reset", text, at)
+            yield Event(self._name, EventKind.RESET, text, at)
         elif ahead < 32768:
             yield from self._advance(due, ahead, at)
             self._next = (sequence + 1) % 65536
@@ -164,7 +168,9 @@ class ScreamDecoder:
     def _advance(self, due: int, ahead: int, at: HostTime) -> Iterator[Event]:
         if ahead:
             self.streams.lost("lost packet")
-            yield Event(self._name, "resynchronised", several(ahead, "packet", "missing"), at)
+            yield Event(
+                self._name, EventKind.RESYNCHRONISED, several(ahead, "packet", "missing"), at
+            )
         aged = {number: since + 1 for number, since in self._missing.items()}
         if ahead <= self.MOST_MISSING:  # more than that is no disorder on the way
             aged |= {(due + i) % 65536: 0 for i in range(ahead)}

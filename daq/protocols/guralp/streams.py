@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.guralp.gcf import SampleBlock, StatusBlock, serial_number
 
 if TYPE_CHECKING:
@@ -106,13 +106,13 @@ class _Sensor:
             self.system = block.system.text
         if block.sampling_rate != self._rate:
             text = f"{block.stream_id} came at {block.sampling_rate} Hz; expected {self._rate} Hz"
-            yield Event(self._name, "refused", text, at)
+            yield Event(self._name, EventKind.REFUSED, text, at)
             return
         index = round((block.start_ns - self._origin_ns) * self._rate / _NS)
         jumped = self._jump(index, at)
         if jumped:
             text = f"the time of {block.stream_id} jumped by {float(jumped / self._rate):.0f} s"
-            yield Event(self._name, "reset", text, at)
+            yield Event(self._name, EventKind.RESET, text, at)
             index -= jumped
             self._origin_ns = block.start_ns - round(index * _NS / self._rate)
             self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
@@ -123,7 +123,7 @@ class _Sensor:
         stream.add(index, block.counts, taken_to=self._taken_to)
         if len(stream.pending) > MAX_PENDING:
             text = f"dropped a block of {block.stream_id}: another stream does not come"
-            yield Event(self._name, "overflow", text, at)
+            yield Event(self._name, EventKind.OVERFLOW, text, at)
             stream.pending.popleft()
 
     def _jump(self, index: int, at: HostTime) -> int:
@@ -268,7 +268,7 @@ class Streams:
             yield self._nobodys(stream_id, kept[-1][1])
 
     def _nobodys(self, stream_id: str, at: HostTime) -> Event:
-        return Event(self._name, "refused", f"stream {stream_id} is of no sensor here", at)
+        return Event(self._name, EventKind.REFUSED, f"stream {stream_id} is of no sensor here", at)
 
     def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event]:
         serial = serial_number(block.stream_id)
@@ -277,7 +277,7 @@ class Streams:
             text = "".join(c if c.isprintable() else "?" for c in line).strip()
             if text:
                 for name in sorted(owners):
-                    yield Event(name, "status", cut(text), at)
+                    yield Event(name, EventKind.STATUS, cut(text), at)
 
 
 def cut(text: str) -> str:

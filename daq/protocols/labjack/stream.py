@@ -41,7 +41,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack.registers import CORE_HZ, CORE_TIMER, FEEDBACK, STREAM_DATA_CAPTURE_16
 from daq.protocols.plural import several
@@ -248,7 +248,9 @@ class StreamDecoder:
                 found += self._packet(item, rows, at)
             else:
                 found.append(
-                    Event(self._name, "resynchronised", f"skipped {several(item, 'byte')}", at)
+                    Event(
+                        self._name, EventKind.RESYNCHRONISED, f"skipped {several(item, 'byte')}", at
+                    )
                 )
         return found + self._blocks(rows, at)
 
@@ -267,15 +269,19 @@ class StreamDecoder:
             return found
         lost = self._lost_packets(packet, at)
         if lost is None:
-            found.append(Event(self._name, "resynchronised", "a packet came twice", at))
+            found.append(Event(self._name, EventKind.RESYNCHRONISED, "a packet came twice", at))
             return found
         if lost:
             found += self._blocks(rows, at)
-            found.append(Event(self._name, "resynchronised", several(lost, "packet", "lost"), at))
+            found.append(
+                Event(self._name, EventKind.RESYNCHRONISED, several(lost, "packet", "lost"), at)
+            )
             self._skip_samples(lost * self._packet_size)
         self._packet_size = max(len(packet.samples), self._packet_size)
         if packet.status == AUTO_RECOVER_ACTIVE and not self.recovers:
-            found.append(Event(self._name, "overflow", "the device's buffer overflowed (2940)", at))
+            found.append(
+                Event(self._name, EventKind.OVERFLOW, "the device's buffer overflowed (2940)", at)
+            )
         self.recovers = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
         if packet.status != AUTO_RECOVER_END:  # which may begin with a scan of 0xFFFF
@@ -285,19 +291,19 @@ class StreamDecoder:
             rows.append(before)
             found += self._blocks(rows, at)
             text = f"the device skipped {several(packet.information, 'scan')} (2941)"
-            found.append(Event(self._name, "overflow", text, at))
+            found.append(Event(self._name, EventKind.OVERFLOW, text, at))
             self._next_row += packet.information
             self._reason = "buffer overflow"
         elif packet.status in FATAL:
             self.fatal = packet.status
             text = f"{FATAL[packet.status]} ({packet.status})"
-            found.append(Event(self._name, "overflow", text, at))
+            found.append(Event(self._name, EventKind.OVERFLOW, text, at))
             if DUMMY in scans[-1:]:  # incomplete when the stream broke off
                 scans = scans[:-1]
         elif packet.status == BURST_COMPLETE:
             self.complete = True
         elif packet.status not in (0, AUTO_RECOVER_ACTIVE):
-            found.append(Event(self._name, "status", f"stream status {packet.status}", at))
+            found.append(Event(self._name, EventKind.STATUS, f"stream status {packet.status}", at))
         rows.append(scans)
         return found
 

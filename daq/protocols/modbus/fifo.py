@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.rtu import ReplyFinder
 
@@ -125,7 +125,9 @@ class FifoDecoder:
         self._doubtful += self._asked
         self._n_unanswered += 1
         text = f"no reply to a read: {instead or 'nothing came'} ({self._n_unanswered} so far)"
-        return [Event(self._sensor, "resynchronised" if instead else "status", text, at)]
+        return [
+            Event(self._sensor, EventKind.RESYNCHRONISED if instead else EventKind.STATUS, text, at)
+        ]
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take bytes of the line."""
@@ -137,14 +139,14 @@ class FifoDecoder:
             self.level = 0
             self._n_refused += 1
             text = f"the device refused a read: {why} ({self._n_refused} so far)"
-            return [Event(self._sensor, "refused", text, at)]
+            return [Event(self._sensor, EventKind.REFUSED, text, at)]
         registers = reply.registers
         level = int(registers[0]) + (self._asked if self._header == "left" else 0)
         found = self._resolve_doubt(level, at)
         if self._capacity is not None and level >= self._capacity and self._started:
             if not self._full:
                 text = f"{level} words wait: the FIFO is full and samples were dropped"
-                found.append(Event(self._sensor, "overflow", text, at))
+                found.append(Event(self._sensor, EventKind.OVERFLOW, text, at))
             index, since = self._caught_up
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
@@ -162,7 +164,7 @@ class FifoDecoder:
         if not self._started:
             return []
         text = f"{level} words wait where {self._asked} did: the device was restarted"
-        found = [*self._hand_over(at), Event(self._sensor, "reset", text, at)]
+        found = [*self._hand_over(at), Event(self._sensor, EventKind.RESET, text, at)]
         index, since = self._caught_up
         index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
         self._full.clear()

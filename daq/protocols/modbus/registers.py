@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, CountsArray, Event
+from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.plural import several
 
@@ -333,7 +333,7 @@ class RegisterDecoder:
             jumped = not restarted and abs(lag - self._lag) > JUMP_NS
             if jumped or int(lags.max()) - lag > JUMP_NS:
                 restarted = True
-                found.append(Event(self._sensor, "reset", "the device's time jumped", at))
+                found.append(Event(self._sensor, EventKind.RESET, "the device's time jumped", at))
                 lag = int(lags[-1])
             if restarted:
                 self._lag = lag

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import Place, SampleTimes
@@ -118,7 +118,7 @@ class TextDecoder:
                 f"{MAX_MESSAGE} bytes without {self._format.terminator!r}: given up to the next one"
                 f" ({self._n_given_up} so far); is the terminator right?"
             )
-            yield Event(self._sensor, "resynchronised", _cut(text), at)
+            yield Event(self._sensor, EventKind.RESYNCHRONISED, _cut(text), at)
 
     def _messages(self, messages: list[bytes], at: HostTime) -> list[Block | Event]:
         found: list[Block | Event] = []
@@ -138,13 +138,15 @@ class TextDecoder:
                 rows = []
                 self._n_unreadable += 1
                 text = f"{_cut(str(error), 160)} ({self._n_unreadable} unreadable so far)"
-                found.append(Event(self._sensor, "checksum", _cut(text), at))
+                found.append(Event(self._sensor, EventKind.CHECKSUM, _cut(text), at))
                 self._unreadable()
         found += self._rows(rows, at)
         if self._n_known > n_known:
             what = "packets" if self._format.layout == "channel" else "rows"
             text = f"{self._n_known - n_known} {what} came again or too late and were dropped"
-            found.append(Event(self._sensor, "status", f"{text} ({self._n_known} so far)", at))
+            found.append(
+                Event(self._sensor, EventKind.STATUS, f"{text} ({self._n_known} so far)", at)
+            )
         return found
 
     def _split(self, message: bytes) -> list[str] | None:
@@ -210,7 +212,7 @@ class TextDecoder:
                 self._reason = "counter"
             if run.restarted:
                 self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-                yield Event(self._sensor, "reset", "the counter began anew", at)
+                yield Event(self._sensor, EventKind.RESET, "the counter began anew", at)
             self._next = run.first_sample
             device = rows[run.start].time_ns if self._format.device_time else run.counter
             yield self._block(counts[run.start : run.stop], device, at)
@@ -240,7 +242,7 @@ class TextDecoder:
         for group in self._packets.ready(self._times):
             yield from self._timed([(group, b"")])
         for text in self._packets.dropped(at):
-            yield Event(self._sensor, "overflow", _cut(text), at)
+            yield Event(self._sensor, EventKind.OVERFLOW, _cut(text), at)
 
     # --- placed by their time ----------------------------------------------------------------
 
@@ -285,7 +287,7 @@ class TextDecoder:
 
     def _restarted(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
         """Yield what had to wait until it was clear that the device's clock was set."""
-        yield Event(self._sensor, "reset", "the device's clock was set", at)
+        yield Event(self._sensor, EventKind.RESET, "the device's clock was set", at)
         self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
         self._skip(place.missing, "clock set", is_exact=False)
         if self._doubtful is not None:
@@ -298,7 +300,7 @@ class TextDecoder:
             f"{len(group.counts)} samples with a time that is not between those of the others"
             f" were dropped ({self._n_unreadable} unreadable so far)"
         )
-        return Event(self._sensor, "checksum", text, at)
+        return Event(self._sensor, EventKind.CHECKSUM, text, at)
 
     def _skip(self, missing: int, reason: str, *, is_exact: bool) -> None:
         if missing:

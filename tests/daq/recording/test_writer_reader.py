@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from daq.bench.model import Channel, PolesZeros
 from daq.errors import NotARecordingError, RecordingError
-from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording
@@ -56,6 +56,27 @@ def block(sensor: str, first: int, n: int, **rest: object) -> Block:
     return Block(sensor, first, samples(first, n), at(first + n), **rest)  # type: ignore[arg-type]
 
 
+def test_kinds_of_events_are_the_documented_strings_and_unknown_ones_are_read(
+    tmp_path: Path,
+) -> None:
+    """A recording of a newer program, or of a driver from elsewhere, may hold other kinds."""
+    written = [*EventKind, "warmed up"]
+    writer = RecordingWriter.create(tmp_path / "r.h5", sensors=[layout("a")], created=NOW)
+    for kind in written:
+        writer.event(Event("a", kind, "", NOW))
+    writer.close()
+    with h5py.File(tmp_path / "r.h5") as file:
+        assert file["events"]["kind"].tolist() == [
+            *(b"started", b"stopped", b"mark", b"connected", b"disconnected", b"late", b"stalled"),
+            *(b"refused", b"resynchronised", b"checksum", b"reset", b"overflow", b"status"),
+            b"warmed up",
+        ]
+    with Recording.open(tmp_path / "r.h5") as recording:
+        kinds = [event.kind for event in recording.events]
+    assert kinds == written
+    assert [isinstance(kind, EventKind) for kind in kinds] == [True] * len(EventKind) + [False]
+
+
 def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "r.h5"
     writer = RecordingWriter.create(
@@ -66,7 +87,7 @@ def test_round_trip(tmp_path: Path) -> None:
     writer.gap("b", 130, 20, reason="Käbel" * 30, estimated=True)
     instants = np.arange(50, dtype=np.int64) * 10_000_000
     writer.append(block("a", 0, 50, instants_ns=instants))
-    writer.event(Event("b", "connected", "hello", NOW))
+    writer.event(Event("b", EventKind.CONNECTED, "hello", NOW))
     done = writer.close()
     assert done.closed
     assert done.sensors["b"].rows == 200
@@ -90,7 +111,7 @@ def test_round_trip(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.instants_ns(), instants)
         assert a.polled
         assert not b.polled
-        assert recording.events == (Event("b", "connected", "hello", NOW),)
+        assert recording.events == (Event("b", EventKind.CONNECTED, "hello", NOW),)
         assert recording.bench is None
         assert not recording.refresh()
         with pytest.raises(IndexError, match="200 are committed"):
