@@ -30,6 +30,7 @@ from daq.bench.model import Bench, Channel, Sensor
 from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
 from daq.protocols.epson import commands
+from daq.python_process import python_command
 from daq.recording.repair import verify
 from tui.commands.run import BEHIND, INTERVAL
 
@@ -117,7 +118,7 @@ def measure(bench_file: str, path: str, duration: float) -> None:
 @contextlib.contextmanager
 def played(n_sensors: int, sampling_rate: float) -> Iterator[Bench]:
     """Give a bench of devices that are played."""
-    command = [sys.executable, "-m", "benchmarks.recorder", "play", str(n_sensors)]
+    command = python_command("benchmarks.recorder", "play", str(n_sensors))
     with subprocess.Popen(
         [*command, str(sampling_rate)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as player:
@@ -142,7 +143,7 @@ def case(n_sensors: int, sampling_rate: float, duration: float) -> dict[str, flo
     with tempfile.TemporaryDirectory() as folder, played(n_sensors, sampling_rate) as bench:
         bench_file, path = Path(folder) / "bench.toml", Path(folder) / "r.h5"
         bench_file.write_text(bench.text, encoding="utf-8")
-        command = [sys.executable, "-m", "benchmarks.recorder", "record", str(bench_file)]
+        command = python_command("benchmarks.recorder", "record", str(bench_file))
         said = subprocess.run(
             [*command, str(path), str(duration)], check=True, stdout=subprocess.PIPE, text=True
         ).stdout
@@ -158,7 +159,7 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
     with tempfile.TemporaryDirectory() as folder, played(n_sensors, sampling_rate) as bench:
         bench_file, path = Path(folder) / "bench.toml", Path(folder) / "r.h5"
         bench_file.write_text(bench.text, encoding="utf-8")
-        command = [sys.executable, "-m", "tui", "run", str(bench_file), "--out", str(path)]
+        command = python_command("tui", "run", str(bench_file), "--out", str(path))
         command += ["--duration", str(begin + duration + 10)]
         with (
             _terminal() as screen,

@@ -13,7 +13,6 @@ import io
 import os
 import re
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from PIL import Image
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
+from daq.python_process import python_command
 from daq.results.band_summary import correlation_of
 from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
@@ -99,7 +99,7 @@ def application(folder: Path) -> None:
     """Draw the application on the demo's bench."""
     recording = folder / "lab.h5"
     bench = ROOT / "tui" / "resources" / "demo.toml"
-    command = [sys.executable, "-m", "tui", "simulate", str(bench), "--duration", "300s"]
+    command = python_command("tui", "simulate", str(bench), "--duration", "300s")
     subprocess.run([*command, "--out", str(recording)], check=True)
     picture = asyncio.run(photograph(recording, size=(100, 30), keys=("down",)))
     draw(picture, HERE / "application.png")
@@ -143,7 +143,7 @@ def report(folder: Path) -> None:
     bench, recording = folder / "bench.toml", folder / "report.h5"
     demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
     bench.write_text(demo + LIMIT, encoding="utf-8")
-    command = [sys.executable, "-m", "tui", "simulate", str(bench), "--duration", "20min"]
+    command = python_command("tui", "simulate", str(bench), "--duration", "20min")
     subprocess.run([*command, "--out", str(recording)], check=True)
     settings = Settings(segment=2.0, band=(2.0, 20.0))
     contents = report_of(estimate([recording], settings), settings, sources([recording]))

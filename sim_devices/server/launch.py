@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daq.python_process import python_command
 from sim_devices.errors import ServeError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def start(spec: Mapping[str, Any]) -> Iterator[tuple[RunningDevice, ...]]:
 
 def _start(file: Path, index: int) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "sim_devices", str(file), str(index)],
+        python_command("sim_devices", str(file), str(index)),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -34,6 +34,7 @@ from rich.table import Table
 from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
 from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.python_process import python_command
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
@@ -261,7 +262,7 @@ def outcome(
     truths: dict[str, Truth],
 ) -> Outcome:
     """Run ``huddle estimate`` and compare with the truth."""
-    command = [sys.executable, "-m", "tui", "estimate", str(path), *options]
+    command = python_command("tui", "estimate", str(path), *options)
     command += ["--method", "three-sensor", "--json", "-"]
     said = subprocess.run(command, capture_output=True, text=True, check=False)
     if said.returncode:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from daq.drivers.bench_file import load
+from daq.python_process import python_command
 from tests.acceptance import fault_script
 from tui.simulation.devices import specification, with_faults
 
@@ -37,7 +37,7 @@ class Served:
 def command(*arguments: str) -> subprocess.Popen[str]:
     """Start ``huddle`` with these arguments."""
     return subprocess.Popen(
-        [sys.executable, "-m", "tui", *arguments],
+        python_command("tui", *arguments),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

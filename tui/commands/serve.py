@@ -14,6 +14,7 @@ from daq.acquisition.schedule import due_times, remove_old, serve, utc_now
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
+from daq.python_process import python_command
 from tui.output.console import for_people, notices, write_json
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ async def _serve(path: Path, bench: Bench) -> None:
 
     async def run(_: datetime) -> None:
         _remove_old(bench)  # first: a full disk would end the run before it has begun
-        await _run(path, bench, stop)
+        await run_once(path, bench, stop)
         _remove_old(bench)
 
     await serve(bench.schedule, run, stop=stop, notice=_tell)
@@ -84,11 +85,17 @@ def _remove_old(bench: Bench) -> None:
         notices().print(str(error), soft_wrap=True)
 
 
-async def _run(path: Path, bench: Bench, stop: asyncio.Event) -> None:
-    """Do one ``huddle run``; when told to stop, let it close its file and show its result."""
+async def run_once(path: Path, bench: Bench, stop: asyncio.Event) -> None:
+    """Do one ``huddle run``; on `stop`, interrupt it and wait until it has written its result.
+
+    Raises
+    ------
+    RunFailedError
+        The run ended in trouble.
+    """
     out = recording_path(bench, SystemClock().now())
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tui", "run", str(path)),
+        *python_command("tui", "run", str(path)),
         *("--out", str(out), "--json", str(out.with_suffix(".json"))),
         stdin=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.PIPE,

@@ -15,6 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError, RecordingError
+from daq.python_process import python_command
 from daq.recording.control import ask
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class RecorderProcess:
             raise RecordingError(f"{out}: exists already; expected a new file")
         self.out = out
         self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
-        arguments = [sys.executable, "-m", "tui", "record", str(bench_path), "--out", str(out)]
+        arguments = python_command("tui", "record", str(bench_path), "--out", str(out))
         if duration is not None:
             arguments += ["--duration", repr(duration)]
         self._process = subprocess.Popen(

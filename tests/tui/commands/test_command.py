@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.python_process import python_command
 from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.cli.main import app
 from tui.studies.reproduce import STUDIES
@@ -64,7 +65,7 @@ def test_help_names_every_command_and_is_quick() -> None:
     for _ in range(3):  # processor time, the best of three: others use this machine too
         before = os.times()
         done = subprocess.run(
-            [sys.executable, "-m", "tui", "--help"], capture_output=True, text=True, check=True
+            python_command("tui", "--help"), capture_output=True, text=True, check=True
         )
         after = os.times()
         spent.append(
@@ -168,7 +169,7 @@ def test_a_window_that_nobody_knows_is_exit_2(tmp_path: Path) -> None:
 def test_output_survives_a_terminal_that_knows_no_signs(tmp_path: Path) -> None:
     file = str(imported(tmp_path))
     done = subprocess.run(
-        [sys.executable, "-m", "tui", "estimate", file, "--segment", "1s"],
+        python_command("tui", "estimate", file, "--segment", "1s"),
         capture_output=True,
         env=os.environ | {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
         check=True,

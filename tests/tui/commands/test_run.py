@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
+from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tui.cli.main import app
@@ -43,7 +44,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "tui", *arguments],
+        python_command("tui", *arguments),
         env=os.environ | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

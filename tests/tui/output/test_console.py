@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from typer.testing import CliRunner
 
 from daq.acquisition.block_writer import SensorStatus
 from daq.acquisition.recorder import Status
+from daq.python_process import python_command
 from tui.cli.main import app
 from tui.commands.record import progress_line
 from tui.output.console import notices, progress, write_text
@@ -42,7 +42,7 @@ def test_lines_are_appended(tmp_path: Path) -> None:
 @pytest.mark.skipif(not FULL.exists(), reason="a device that is always full")
 def test_trouble_that_cannot_be_told_is_trouble_all_the_same() -> None:
     with FULL.open("w") as full:
-        command = [sys.executable, "-m", "tui", "estimate", "nothing.h5"]
+        command = python_command("tui", "estimate", "nothing.h5")
         assert subprocess.run(command, stderr=full, check=False).returncode == 3
 
 

@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.drivers.bench_file import parse
+from daq.python_process import python_command
 from tui.cli.main import app
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
     bench.write_bytes(resources.files("tui.resources").joinpath("bench.toml").read_bytes())
     out = str(tmp_path / "simulated.toml")
     process = subprocess.Popen(
-        [sys.executable, "-m", "tui", "devices", str(bench), "--json", "-", "--out", out],
+        python_command("tui", "devices", str(bench), "--json", "-", "--out", out),
         env=os.environ | {"TMPDIR": str(folder)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer
 
+from daq.python_process import python_command
 from estimator.spectra.welch import CrossSpectra
 from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
@@ -190,7 +191,7 @@ def test_an_unknown_study_is_refused_before_anything_is_simulated() -> None:
 
 def test_the_command_line_refuses_an_unknown_study() -> None:
     said = subprocess.run(
-        [sys.executable, "-m", "tui", "reproduce", "fig6"],
+        python_command("tui", "reproduce", "fig6"),
         check=False,
         capture_output=True,
         text=True,

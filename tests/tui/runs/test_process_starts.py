@@ -1,0 +1,112 @@
+"""Our processes run none of the Python files that lie in the working directory."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from daq.bench.loading import dump
+from daq.drivers.bench_file import parse
+from daq.recording.reader import Recording
+from tui.commands.serve import run_once
+from tui.runs.recorder_process import RecorderProcess
+from tui.simulation.devices import simulated
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
+
+ROOT = Path(__file__).parents[3]
+MODULES = ("random", "cronsim", "json", "numpy", "typer", "huddle")
+PACKAGES = ("tui", "daq", "estimator", "sim_devices")
+FOREIGN = """
+from pathlib import Path
+with Path({record!r}).open("a") as record:
+    print(__file__, file=record)
+raise SystemExit(f"{{__file__}} was executed")
+"""
+
+
+@pytest.fixture
+def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Enter a folder full of modules of the user's; return where those that run are listed."""
+    record = tmp_path / "executed"
+    folder = tmp_path / "work"
+    folder.mkdir()
+    for name in MODULES:
+        (folder / f"{name}.py").write_text(FOREIGN.format(record=str(record)), encoding="utf-8")
+    for name in PACKAGES:
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text(
+            FOREIGN.format(record=str(record)), encoding="utf-8"
+        )
+    monkeypatch.chdir(folder)
+    return record
+
+
+def demo_bench() -> str:
+    return resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+
+
+def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None:
+    subprocess.run([sys.executable, "-m", "tui"], check=False, capture_output=True)
+    assert record.exists()
+
+
+def test_simulators_and_the_recorder_run_none(record: Path) -> None:
+    out = Path("recorded.h5").absolute()
+    with simulated(parse(demo_bench()), speed=8.0) as reachable:
+        Path("bench.toml").write_text(dump(reachable), encoding="utf-8")
+        recorder = RecorderProcess(Path("bench.toml"), out, duration=4.0)
+        try:
+            recorder.wait_for_file()
+            assert recorder.ends_within(60)
+            recorder.check()
+        finally:
+            recorder.stop()
+            recorder.close()
+    with Recording.open(out) as recording:
+        assert recording.closed
+    assert not record.exists()
+
+
+def test_runs_of_a_service_execute_none(record: Path) -> None:
+    with simulated(parse(demo_bench()), speed=8.0) as reachable:
+        bench = reachable.model_copy(
+            update={"recording": reachable.recording.model_copy(update={"duration": 12.0})}
+        )
+        Path("bench.toml").write_text(dump(bench), encoding="utf-8")
+        placed = parse(dump(bench), "bench.toml")
+        placed.recording_directory.mkdir(parents=True, exist_ok=True)
+        asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event()))
+    (result,) = placed.recording_directory.glob("*.json")
+    assert json.loads(result.read_text(encoding="utf-8"))["segments"] >= 5
+    assert not record.exists()
+
+
+def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> None:
+    command = Path(sys.executable).with_name("huddle")
+    done = subprocess.run(
+        [command, "demo", "--duration", "20s", "--speed", "8", "--json", "-"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["segments"] >= 10
+    assert not record.exists()
+
+
+def test_no_process_of_python_is_started_in_any_other_way() -> None:
+    starts = [
+        str(path.relative_to(ROOT))
+        for package in ("daq", "estimator", "sim_devices", "tui")
+        for path in (ROOT / package).rglob("*.py")
+        if "sys.executable" in path.read_text(encoding="utf-8")
+    ]
+    assert starts == [str(Path("daq", "python_process.py"))]
