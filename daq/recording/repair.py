@@ -117,13 +117,18 @@ def heal(path: str | Path, *, now: HostTime | None = None) -> Report:
 
 def write_results(
     path: str | Path,
-    method: str,
-    arrays: Mapping[str, NDArray[Any]],
-    attributes: Mapping[str, Any] | None = None,
+    results: Mapping[str, tuple[Mapping[str, NDArray[Any]], Mapping[str, Any]]],
 ) -> None:
-    """Write the result of a method to ``/results/<method>``, replacing an earlier one.
+    """Write the results of an estimate to ``/results``, replacing earlier ones.
 
-    A recording whose recorder was killed is healed first.
+    All results are written in one pass; a crash leaves either all of them or none. A recording that
+    its recorder left open is closed first.
+
+    Parameters
+    ----------
+    path : path
+    results : mapping
+        Arrays and attributes by name of the method, as `Recording.results` returns them.
 
     Raises
     ------
@@ -131,15 +136,18 @@ def write_results(
         If a recorder is writing the file, or it cannot be written.
     """
     path = Path(path)
-    heal(path)
+    with Recording.open(path, alone=True) as recording:
+        closed = recording.closed
+    if not closed:
+        heal(path)
     with _replaced(path) as copy, h5py.File(copy, "r+", libver=LIBVER) as file:
-        results = file.require_group("results")
-        if method in results:
-            del results[method]
-        group = results.create_group(method)
-        for name, values in arrays.items():
-            group.create_dataset(name, data=values)
-        group.attrs.update(attributes or {})
+        if "results" in file:
+            del file["results"]
+        for method, (arrays, attributes) in results.items():
+            group = file.create_group(f"results/{method}")
+            for name, values in arrays.items():
+                group.create_dataset(name, data=values)
+            group.attrs.update(attributes)
 
 
 def _verify_sensor(sensor: SensorRecord) -> SensorReport:

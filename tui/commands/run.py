@@ -20,13 +20,13 @@ from daq.estimation.estimation import Estimation
 from daq.estimation.settings import Settings
 from daq.estimation.throttle import Throttle
 from daq.host_clock import SystemClock
-from daq.recording.repair import heal, write_results
+from daq.recording.repair import heal
 from daq.results.band_summary import reached_cov
+from daq.results.store import store_results
 from tui.commands.estimate import LIMIT_NOT_MET, check_fit, chosen, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, notices, progress
 from tui.output.formatting import clock_time, time_left
-from tui.output.results import result_arrays
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
 
@@ -92,7 +92,7 @@ def run_test(
                 snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
             )
             try:
-                finish_recording(out, snapshot)
+                store_results(out, snapshot)
             finally:
                 recorder.check()  # its trouble says more than what follows from it
             if report is not None:
@@ -171,13 +171,6 @@ def follow_to_end(
         with Estimation([recorder.out], settings) as estimation:
             snapshot = estimation.finish()
         return snapshot, interruption.pressed
-
-
-def finish_recording(path: Path, snapshot: Snapshot) -> None:
-    """Write the result into the recording."""
-    for method in snapshot.results:
-        arrays, attributes = result_arrays(snapshot, method)
-        write_results(path, method, arrays, attributes)
 
 
 def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) -> None:

@@ -17,9 +17,9 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.control import ask
 from daq.recording.reader import Recording
+from daq.results.store import store_results
 from tui.application.app import HuddleApp
 from tui.commands.estimate import chosen
-from tui.commands.run import finish_recording
 from tui.output.console import notices
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
@@ -86,7 +86,7 @@ class BenchControls:
         with Recording.open(path) as recording:
             if recording.results():
                 return
-        finish_recording(path, snapshot)
+        store_results(path, snapshot)
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report."""

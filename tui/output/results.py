@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.limits import LimitResult
-    from estimator.self_noise.band_means import FloatArray
 
 
 def limit_line(result: LimitResult) -> str:
@@ -277,26 +276,6 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any result of a diagnostic
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return value
-
-
-def result_arrays(snapshot: Snapshot, method: str) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-    """Return one method's result as arrays and attributes for a recording's ``/results``."""
-    noise = snapshot.results[method]
-    arrays = {
-        "frequency": snapshot.frequency,
-        "data_psd": snapshot.data_psd,
-        "noise_psd": noise.noise_psd,
-        "noise_psd_low": noise.low,
-        "noise_psd_high": noise.high,
-        "cov": noise.cov,
-    }
-    attributes = {
-        "segments": snapshot.n_segments,
-        "effective_averages": snapshot.n_effective,
-        "channels": [f"{label.sensor}.{label.channel}" for label in snapshot.channels],
-        "unit": snapshot.unit,
-    }
-    return arrays, attributes
 
 
 def curves_csv(snapshot: Snapshot) -> str:

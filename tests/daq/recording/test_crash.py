@@ -246,35 +246,38 @@ def test_a_wrong_block_row_is_found(tmp_path: Path) -> None:
     assert verify(path).sensors[0].bad_blocks == (3,)
 
 
-def test_results_are_added(tmp_path: Path) -> None:
+def test_results_replace_earlier_ones_and_leave_the_samples(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     counts = make(path)
-    write_results(path, "three-sensor", {"frequency": np.arange(3.0)}, {"unit": "Hz"})
-    write_results(path, "three-sensor", {"frequency": np.arange(4.0)}, {"unit": "Hz"})
+    write_results(path, {"a": ({"x": np.arange(3.0)}, {}), "b": ({"x": np.arange(2.0)}, {})})
+    write_results(path, {"b": ({"x": np.arange(4.0)}, {"unit": "Hz"})})
     with Recording.open(path) as recording:
         ((method, (arrays, attributes)),) = recording.results().items()
-        assert method == "three-sensor"
-        assert arrays["frequency"].tolist() == [0, 1, 2, 3]
+        assert method == "b"
+        assert arrays["x"].tolist() == [0, 1, 2, 3]
         assert attributes == {"unit": "Hz"}
         np.testing.assert_array_equal(recording.sensors[0].counts(), counts)
     assert verify(path).intact
 
 
-def test_a_failed_rewrite_leaves_the_recording(tmp_path: Path) -> None:
+def test_results_that_cannot_be_written_leave_the_recording_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     make(path)
     before = path.read_bytes()
+    good, bad = {"x": np.arange(3.0)}, {"a/b": np.arange(3.0), "a": np.arange(3.0)}
     with pytest.raises(RecordingError, match="stays as it was"):
-        write_results(path, "m", {"a/b": np.arange(3.0), "a": np.arange(3.0)})
+        write_results(path, {"first": (good, {}), "second": (bad, {})})
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
-def test_results_wait_for_the_recorder(tmp_path: Path) -> None:
+def test_a_recording_left_open_is_closed_before_results_are_written(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     killed(path, 3)
-    write_results(path, "m", {"x": np.arange(3.0)})
+    write_results(path, {"m": ({"x": np.arange(3.0)}, {})})
     assert verify(path).closed
+    with Recording.open(path) as recording:
+        assert list(recording.results()) == ["m"]
 
 
 @pytest.mark.parametrize(
