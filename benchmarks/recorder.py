@@ -28,11 +28,11 @@ from daq.acquisition.recorder import run as record
 from daq.bench.loading import parse
 from daq.bench.model import Bench, Channel, Sensor
 from daq.estimation.estimation import Estimation
+from daq.estimation.follow import COMMIT_DELAY, SHORTEST_INTERVAL
 from daq.estimation.settings import Settings
 from daq.protocols.epson import commands
 from daq.python_process import python_command
 from daq.recording.repair import verify
-from tui.commands.run import BEHIND, INTERVAL
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -166,7 +166,7 @@ def live(n_sensors: int, sampling_rate: float, *, begin: float, duration: float)
             subprocess.Popen(command, stdout=screen, stderr=screen) as huddle,
         ):
             while not path.exists():
-                time.sleep(INTERVAL)
+                time.sleep(SHORTEST_INTERVAL)
             time.sleep(begin)
             (recorder,) = _children(huddle.pid)
             processes = (huddle.pid, recorder)
@@ -192,7 +192,7 @@ def _longest_delay(path: Path, *, until: float) -> float:
     with Estimation([path], Settings()) as estimation:
         estimation.update()
         while time.monotonic() < until:
-            time.sleep(max(INTERVAL, estimation.lacking - BEHIND))
+            time.sleep(max(SHORTEST_INTERVAL, estimation.lacking - COMMIT_DELAY))
             if estimation.update():
                 estimated = estimation.snapshot()
                 end = estimated.start_utc_ns * 1e-9 + estimated.elapsed

@@ -1,134 +1,215 @@
-"""Follows a recording in a thread: how it is at each look, the estimate when there is news."""
+"""Follows a recording while it grows, up to its result.
+
+Theory of operation
+-------------------
+One loop looks at the file again and again. Each look takes what the recorder has committed since;
+where a new segment is complete, the estimate is made again. Looks and estimates are throttled, so
+that a bench box stays free to record. When the recording is closed, the whole of it is estimated
+once more: that is the result. A recorder that ends without closing its file ends the loop with
+`RecordingLeftOpenError`.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from daq.errors import HuddleError, RecordingError
+from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
 from daq.recording.monitor import RecordingMonitor
-from daq.recording.reader import Recording, control_address
-from estimator.errors import EstimatorError, InsufficientDataError
+from daq.recording.reader import control_address
+from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
-    import threading
     from collections.abc import Callable
     from pathlib import Path
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.recording.reader import Recording
 
-LEAST_INTERVAL = 1.0
-LONGEST_INTERVAL = 5.0
-MAX_CPU_SHARE = 0.05
-"""Of one core, at most, that following may take."""
+STATUS_INTERVAL = 1.0
+"""Seconds between looks at the sensors, where they are watched."""
+SHORTEST_INTERVAL, LONGEST_INTERVAL = 0.25, 5.0
+"""Seconds between looks for a new segment."""
+COMMIT_DELAY = 2.0
+"""Seconds by which the file lies behind the sensors, at most."""
+LOOK_SHARE, ESTIMATE_SHARE = 0.03, 0.1
+"""Share of the time that looks, and that estimates, may take."""
 SILENCE = 10.0
-"""Seconds without a sample after which the recorder is asked whether it still lives."""
+"""Seconds without a sample after which a recorder in another process is asked whether it runs."""
 
 
-class _EndedError(Exception):
-    """Nobody wants the result any more."""
+class RecordingLeftOpenError(RecordingError):
+    """The recorder has ended without closing its recording."""
 
 
 class Observer(Protocol):
-    """Whoever wants to know; called from the thread that follows."""
+    """Receives what is seen of a recording, in the thread that follows it."""
 
-    def look(self, now: RecordingStatus) -> None:
-        """Take how the sensors are doing: often, and cheap."""
+    def status(self, status: RecordingStatus) -> None:
+        """Take the state of the sensors: often, and cheap."""
         ...
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Take the estimate: when a segment has come, and once more when the recording is closed.
-
-        That last one is the result, from the whole recording.
-        """
+        """Take the estimate after each new segment, and the result of a closed recording."""
         ...
 
     def progress(self, done: int, total: int) -> None:
-        """Take how far the result is, in segments."""
+        """Take how many segments of the result are done, and of how many."""
         ...
 
-    def trouble(self, text: str) -> None:
-        """Take what went wrong, in words."""
+
+class Recorder(Protocol):
+    """The process that writes the recording, as whoever started it knows it."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended."""
         ...
+
+    def ends_within(self, timeout: float) -> bool:
+        """Wait this long (s), or until the process has ended; return whether it has."""
+        ...
+
+
+class _CancelledError(Exception):
+    """The result is not wanted any more."""
 
 
 def follow(
     path: Path,
     settings: Settings | None,
+    observer: Observer,
     *,
-    onlooker: Observer,
-    ended: threading.Event,
+    recorder: Recorder | None = None,
+    cancelled: threading.Event | None = None,
+    watch_sensors: bool = True,
     growth: float = 0.0,
     silence: float = SILENCE,
-) -> None:
-    """Follow a recording until it is closed or ``ended``; a recorder that was killed is trouble.
+) -> Snapshot | None:
+    """Follow a recording until it is closed, and return its result.
 
-    The estimate is made anew when the number of segments has grown, and by this share at least;
-    less often where it takes long (:mod:`daq.estimation.throttle`).
+    Parameters
+    ----------
+    path : Path
+    settings : Settings, optional
+        Those of the bench in the recording, if not given.
+    observer : Observer
+    recorder : Recorder, optional
+        The process that writes the recording. If not given, the recorder is asked over its control
+        channel whether it still runs, once no sample has come for `silence` seconds.
+    cancelled : threading.Event, optional
+        Ends the following early once it is set.
+    watch_sensors : bool
+        Whether the observer takes the state of the sensors.
+    growth : float
+        Share by which the number of segments has grown, at least, before the next estimate.
+    silence : float
+        In seconds.
+
+    Returns
+    -------
+    Snapshot or None
+        The result, from the whole recording; None if `cancelled`.
+
+    Raises
+    ------
+    RecordingLeftOpenError
+        If the recorder has ended without closing the recording.
+    RecordingError, CannotAlignError
+        If the file cannot be read, or its sensors not be aligned.
+    InsufficientDataError
+        If the whole recording is too little for any of the methods.
     """
-    try:
-        with Estimation([path], settings) as estimation:
-            (recording,) = estimation.recordings
-            lookout = RecordingMonitor(recording)
-            states = _RecorderStates(path)
-            onlooker.look(lookout.look())
-            wanted, n_samples, heard = 0.0, -1, time.monotonic()
-            spacing = Throttle()
-            closed = recording.closed
-            while not closed:
-                began = time.thread_time()
+    cancelled = threading.Event() if cancelled is None else cancelled
+    with Estimation([path], settings) as estimation:
+        (recording,) = estimation.recordings
+        known = _RemoteRecorder(recording, cancelled, silence) if recorder is None else recorder
+        sensors = _Sensors(recording, observer) if watch_sensors else None
+        looks, estimates = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE)
+        bench, wanted = recording.bench, 0.0
+        speed = 1.0 if bench is None else bench.speed
+        if sensors is not None:
+            sensors.look()
+        closed = recording.closed
+        while not closed:
+            with looks:
+                left_open = known.ended  # asked before: what it wrote last is seen below
                 estimation.update()
                 closed = recording.closed
-                if closed:  # what is said of it from now on is its result
+                if closed:
                     break
-                if estimation.n_seen >= wanted and spacing.due:
+                if left_open:
+                    raise RecordingLeftOpenError(
+                        f"{path}: the recorder ended without closing it; what it had acknowledged"
+                        f" is safe: huddle repair {path}, then huddle estimate {path}"
+                    )
+                if estimation.n_seen >= wanted and estimates.is_due:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
-                    onlooker.look(lookout.look_closely())
-                    with spacing:
+                    if sensors is not None:
+                        sensors.look_closely()
+                    with estimates:
                         snapshot = estimation.snapshot()
-                    onlooker.snapshot(snapshot, estimation.settings)
-                else:
-                    now = lookout.look()
-                    if lookout.quiet():
-                        now = lookout.with_states(now, states.ask())
-                    onlooker.look(now)
-                total = sum(sensor.n_samples for sensor in recording.sensors)
-                if total != n_samples:
-                    n_samples, heard = total, time.monotonic()
-                elif time.monotonic() - heard >= silence:
-                    _check_recorder(path)
-                    heard = time.monotonic()
-                pause = (time.thread_time() - began) / MAX_CPU_SHARE
-                if ended.wait(min(max(LEAST_INTERVAL, pause), LONGEST_INTERVAL)):
-                    return
-            onlooker.look(lookout.look_closely())
-            try:
-                snapshot = estimation.finish(_progress(onlooker, ended))
-            except InsufficientDataError as error:
-                onlooker.snapshot(estimation.snapshot(), estimation.settings)
-                onlooker.trouble(str(error))
-            else:
-                onlooker.snapshot(snapshot, estimation.settings)
-    except _EndedError:
-        return
-    except (HuddleError, EstimatorError, OSError) as error:
-        onlooker.trouble(str(error))
+                    observer.snapshot(snapshot, estimation.settings)
+                elif sensors is not None:
+                    sensors.look()
+            interval = STATUS_INTERVAL
+            if sensors is None:  # before the next segment there is nothing to see
+                coming = (estimation.lacking - COMMIT_DELAY) / speed
+                interval = max(SHORTEST_INTERVAL, coming)
+            known.ends_within(min(max(interval, looks.remaining), LONGEST_INTERVAL))
+            if cancelled.is_set():
+                return None
+        if sensors is not None:
+            sensors.look_closely()
+        return _result(estimation, observer, cancelled)
 
 
-class _RecorderStates:
-    """What the recorder says of its sensors: only it knows at once that one is late."""
+def _result(
+    estimation: Estimation, observer: Observer, cancelled: threading.Event
+) -> Snapshot | None:
+    def progress(done: int, total: int) -> None:
+        if cancelled.is_set():
+            raise _CancelledError
+        observer.progress(done, total)
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    try:
+        snapshot = estimation.finish(progress)
+    except _CancelledError:
+        return None
+    except InsufficientDataError:
+        observer.snapshot(estimation.snapshot(), estimation.settings)
+        raise
+    observer.snapshot(snapshot, estimation.settings)
+    return snapshot
+
+
+class _Sensors:
+    """The state of the sensors: as the file has it, and as the recorder says where it is quiet."""
+
+    def __init__(self, recording: Recording, observer: Observer) -> None:
+        self._monitor, self._observer = RecordingMonitor(recording), observer
+        self._path = recording.path
         self._address: tuple[int, str] | None = None
 
-    def ask(self) -> dict[str, str]:
-        """Return the state of each sensor; nothing if no recorder answers."""
+    def look(self) -> None:
+        """Pass on the state of the sensors."""
+        status = self._monitor.look()
+        if self._monitor.quiet():
+            status = self._monitor.with_states(status, self._recorder_states())
+        self._observer.status(status)
+
+    def look_closely(self) -> None:
+        """Pass on the state of the sensors, and which channels do not move."""
+        self._observer.status(self._monitor.look_closely())
+
+    def _recorder_states(self) -> dict[str, str]:
+        """Ask the recorder: only it knows at once that a sensor is late."""
         try:
             self._address = self._address or control_address(self._path)
             if self._address is None:
@@ -139,25 +220,29 @@ class _RecorderStates:
         return {name: sensor["state"] for name, sensor in sensors.items()}
 
 
-def _progress(onlooker: Observer, ended: threading.Event) -> Callable[[int, int], None]:
-    """Return who tells the progress, and ends the work when nobody wants its result."""
+class _RemoteRecorder:
+    """A recorder that another process started: asked whether it runs when no sample comes."""
 
-    def tell(done: int, total: int) -> None:
-        if ended.is_set():
-            raise _EndedError
-        onlooker.progress(done, total)
+    def __init__(self, recording: Recording, cancelled: threading.Event, silence: float) -> None:
+        self._recording, self._silence = recording, silence
+        self._wait: Callable[[float], bool] = cancelled.wait
+        self._n_samples, self._heard = -1, time.monotonic()
 
-    return tell
+    @property
+    def ended(self) -> bool:
+        n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
+        now = time.monotonic()
+        if n_samples != self._n_samples:
+            self._n_samples, self._heard = n_samples, now
+        elif now - self._heard >= self._silence:
+            self._heard = now
+            try:
+                ask(self._recording.path, "status")
+            except NotConnectedError:
+                return True
+            except HuddleError:
+                return False  # it runs, and does not answer in time
+        return False
 
-
-def _check_recorder(path: Path) -> None:
-    try:
-        ask(path, "status")
-    except HuddleError as error:
-        with Recording.open(path) as recording:
-            if recording.closed:  # meanwhile
-                return
-        raise RecordingError(
-            f"{path}: its recorder is gone without having closed it; what it had acknowledged is "
-            f"safe: huddle repair {path}, then huddle estimate {path}"
-        ) from error
+    def ends_within(self, timeout: float) -> bool:
+        return self._wait(timeout)

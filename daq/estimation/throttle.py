@@ -1,4 +1,4 @@
-"""Live estimates come less often where one takes long, so that the machine stays free to record."""
+"""Limits the share of time that repeated work takes, so that the machine stays free to record."""
 
 from __future__ import annotations
 
@@ -8,26 +8,32 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-MAX_CPU_SHARE = 0.1
-"""Of the time, at most, that live estimates may take."""
-
 
 class Throttle:
-    """Says when the next estimate is due; around each one, a context that takes its time.
+    """Measures repeated work, and says when it may be done again.
+
+    Enter the throttle as a context manager around the work.
 
     Parameters
     ----------
+    share : float
+        Of the time, at most, that the work may take.
     now : callable
         Seconds of a clock that never goes back.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self._now = now
+    def __init__(self, share: float, now: Callable[[], float] = time.monotonic) -> None:
+        self._share, self._now = share, now
         self._began = self._next = now()
 
     @property
-    def due(self) -> bool:
-        """Whether estimates since the first have taken no more than their share."""
+    def remaining(self) -> float:
+        """Seconds until the work may be done again; 0 where it may be done now."""
+        return max(0.0, self._next - self._now())
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the work may be done now."""
         return self._now() >= self._next
 
     def __enter__(self) -> Self:
@@ -35,4 +41,4 @@ class Throttle:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._next = self._began + (self._now() - self._began) / MAX_CPU_SHARE
+        self._next = self._began + (self._now() - self._began) / self._share

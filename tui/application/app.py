@@ -17,6 +17,7 @@ from textual.widgets import Footer
 
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
+from estimator.errors import EstimatorError
 from tui.application import panels
 from tui.application.main_screen import Board, Shown
 from tui.application.messages import (
@@ -143,9 +144,15 @@ class HuddleApp(App[None]):
     def _follow(self, path: Path, ended: threading.Event) -> None:
         messenger = Messenger(self, ended)
         with self._reading:
-            follow(path, self._controls.settings, onlooker=messenger, ended=ended, growth=GROWTH)
-            if messenger.result is not None:
-                self._try(partial(self._controls.keep, path, messenger.result))
+            try:
+                result = follow(
+                    path, self._controls.settings, messenger, cancelled=ended, growth=GROWTH
+                )
+            except (HuddleError, EstimatorError, OSError) as error:
+                messenger.error(error)
+                return
+            if result is not None and messenger.was_open:
+                self._try(partial(self._controls.keep, path, result))
 
     @on(StatusUpdated)
     def _on_looked(self, message: StatusUpdated) -> None:

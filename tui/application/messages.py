@@ -69,33 +69,30 @@ class Messenger:
 
     Attributes
     ----------
-    result : Snapshot or None
-        The estimate from the whole recording, if its end has been seen here.
+    was_open : bool
+        Whether the recording was growing when it was seen first.
     """
 
     def __init__(self, app: App[None], ended: threading.Event) -> None:
         self._app, self._ended = app, ended
-        self._was_open = False
-        self.result: Snapshot | None = None
+        self.was_open = False
 
-    def look(self, now: RecordingStatus) -> None:
+    def status(self, status: RecordingStatus) -> None:
         """Tell how the sensors are doing."""
-        self._was_open |= not now.closed
-        self._post(StatusUpdated(now))
+        self.was_open |= not status.closed
+        self._post(StatusUpdated(status))
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show an estimate."""
-        if snapshot.closed and self._was_open:
-            self.result = snapshot
         self._post(SnapshotReady(snapshot, settings))
 
     def progress(self, done: int, total: int) -> None:
         """Tell how far the result is."""
         self._post(Progress(done, total))
 
-    def trouble(self, text: str) -> None:
-        """Tell that it is not followed any more, and why."""
-        self._post(ErrorReported(text, ended=True))
+    def error(self, error: Exception) -> None:
+        """Tell that the recording is not followed any more, and why."""
+        self._post(ErrorReported(str(error), ended=True))
 
     def _post(self, message: Message) -> None:
         if not self._ended.is_set():

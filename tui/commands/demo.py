@@ -22,9 +22,10 @@ from daq.estimation.settings import Settings
 from daq.results.band_summary import band_of, correlation_of
 from daq.results.clock_effect import effect
 from estimator.self_noise.band_means import band_edges, band_means
-from tui.commands.run import INTERRUPTED, follow_to_end
+from tui.commands.run import INTERRUPTED, result_of
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.formatting import level, level_with_error
+from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
 from tui.simulation.devices import scenario_of, simulated
 
@@ -132,14 +133,15 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
     recorder = RecorderProcess(path, out, duration=duration)
     try:
         recorder.wait_for_file()
-        _, interrupted = follow_to_end(recorder, settings, duration=duration)
+        with defer_interrupt(recorder.request_stop) as interruption:
+            result_of(recorder, settings, duration=duration)
         recorder.check()
     except KeyboardInterrupt:
         recorder.stop()
         raise
     finally:
         recorder.close()
-    return interrupted
+    return interruption.pressed
 
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -16,13 +15,14 @@ from daq.acquisition.recorder import recording_path
 from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError
-from daq.estimation.estimation import Estimation
+from daq.estimation.estimation import estimate
+from daq.estimation.follow import RecordingLeftOpenError, follow
 from daq.estimation.settings import Settings
-from daq.estimation.throttle import Throttle
 from daq.host_clock import SystemClock
 from daq.recording.repair import heal
 from daq.results.band_summary import reached_cov
 from daq.results.store import store_results
+from estimator.errors import EstimatorError
 from tui.commands.estimate import LIMIT_NOT_MET, check_fit, chosen, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, notices, progress
@@ -31,19 +31,16 @@ from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
+
+    from rich.progress import Progress
 
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
 
 INTERRUPTED = 130
-INTERVAL = 0.25
-LONGEST_INTERVAL = 5.0
-BEHIND = 2.0
-"""Seconds by which a recording that is looked at may lie behind its sensors, at most."""
-MAX_CPU_SHARE = 0.03
-"""Of one core, at most, that following may take, by fewer looks."""
 
 
 def run_test(
@@ -84,17 +81,15 @@ def run_test(
     try:
         recorder.wait_for_file()
         notices().print(f"recording to {out}; Ctrl-C stops and shows the result")
-        snapshot, interrupted = follow_to_end(
-            recorder, settings, duration=duration, until_cov=until_cov
-        )
-        with defer_interrupt(spent=interrupted) as interruption:
+        with defer_interrupt(recorder.request_stop) as interruption:
+            snapshot = result_of(recorder, settings, duration=duration, until_cov=until_cov)
             met = show_result(
                 snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
             )
             try:
                 store_results(out, snapshot)
             finally:
-                recorder.check()  # its trouble says more than what follows from it
+                recorder.check()  # its error says more than one that follows from it
             if report is not None:
                 write_report(
                     snapshot,
@@ -118,59 +113,64 @@ def run_test(
         raise typer.Exit(LIMIT_NOT_MET)
 
 
-def follow_to_end(
+def result_of(
     recorder: RecorderProcess,
     settings: Settings,
     *,
     duration: float | None,
     until_cov: float | None = None,
-) -> tuple[Snapshot, bool]:
-    """Follow a recorder's file until it is closed; Ctrl-C stops the recorder, not us.
+) -> Snapshot:
+    """Follow the recording of a recorder to its end, and return the result of all of it.
 
-    Returns
-    -------
-    snapshot : Snapshot
-        The result, from the whole recording.
-    interrupted : bool
-        Whether Ctrl-C was pressed.
+    A recording that its recorder left open is closed and estimated as it is.
+
+    Raises
+    ------
+    HuddleError, EstimatorError
+        What the recorder failed with, or else why there is no result.
     """
-    interrupted, snapshot, news = False, None, False
-    spacing = Throttle()
-    with Estimation([recorder.out], settings) as estimation, _progress() as show:
-        bench = estimation.recordings[0].bench
-        speed = 1.0 if bench is None else bench.speed
-        while True:
-            try:
-                began = time.process_time()
-                gone = recorder.ended  # looked at first: what it wrote last is then seen
-                news = estimation.update() or news
-                if gone or snapshot is None or (news and spacing.due):
-                    with spacing:
-                        snapshot = estimation.snapshot()
-                    news = False
-                    show(snapshot, settings, duration)
-                    if gone:
-                        break
-                    if until_cov is not None and reached_cov(snapshot, settings) <= until_cov:
-                        recorder.request_stop()
-                pause = (time.process_time() - began) / MAX_CPU_SHARE
-                coming = (estimation.lacking - BEHIND) / speed  # before, there is nothing to see
-                recorder.ends_within(min(max(INTERVAL, pause, coming), LONGEST_INTERVAL))
-            except KeyboardInterrupt:
-                if interrupted:
-                    raise
-                interrupted = True
-                recorder.request_stop()
-        if not snapshot.closed:
-            notices().print("[red]the recorder ended without closing its recording")
-            try:
-                heal(recorder.out)
-            except HuddleError as error:  # a full disk; the file can be read all the same
-                notices().print(f"[red]{error}")
-    with defer_interrupt(spent=interrupted) as interruption:
-        with Estimation([recorder.out], settings) as estimation:
-            snapshot = estimation.finish()
-        return snapshot, interruption.pressed
+    with _progress(duration) as bar:
+        observer = _Run(recorder, bar, until_cov)
+        try:
+            snapshot = follow(
+                recorder.out, settings, observer, recorder=recorder, watch_sensors=False
+            )
+        except RecordingLeftOpenError:
+            snapshot = None
+        except (HuddleError, EstimatorError):
+            recorder.check()  # its error says more than one that follows from it
+            raise
+    if snapshot is None:
+        notices().print("[red]the recorder ended without closing its recording")
+        try:
+            heal(recorder.out)
+        except HuddleError as error:  # a full disk; the file can be read all the same
+            notices().print(f"[red]{error}")
+        snapshot = estimate([recorder.out], settings)
+    recorder.wait()
+    return snapshot
+
+
+class _Run:
+    """Shows the progress of a run, and stops its recorder when the noise is known well enough."""
+
+    def __init__(self, recorder: RecorderProcess, bar: _Bar, until_cov: float | None) -> None:
+        self._recorder, self._bar, self._until_cov = recorder, bar, until_cov
+
+    def status(self, status: RecordingStatus) -> None:
+        """Show nothing: the line shows the estimate alone."""
+
+    def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Show how far the run is."""
+        if snapshot.closed:
+            return
+        self._bar.recording(snapshot, settings)
+        if self._until_cov is not None and reached_cov(snapshot, settings) <= self._until_cov:
+            self._recorder.request_stop()
+
+    def progress(self, done: int, total: int) -> None:
+        """Show how far the result is."""
+        self._bar.result(done, total)
 
 
 def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) -> None:
@@ -191,32 +191,48 @@ def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) ->
         )
 
 
+class _Bar:
+    """A line that follows a run: time, segments, c.o.v., time left."""
+
+    def __init__(self, bar: Progress, duration: float | None) -> None:
+        self._bar, self._duration = bar, duration
+        self._task = bar.add_task("0:00", total=None, state="")
+
+    def recording(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Show how far the recording is."""
+        left = None if self._duration is None else max(0.0, self._duration - snapshot.elapsed)
+        if settings.target_cov is not None and self._duration is None:
+            left = snapshot.time_left
+        cov = reached_cov(snapshot, settings)
+        parts = [f"{snapshot.n_segments} segments"]
+        if not math.isnan(cov):
+            parts.append(f"c.o.v. {cov:.3f}")
+        parts.append(time_left(left))
+        total = None if left is None else snapshot.elapsed + left
+        self._bar.update(
+            self._task,
+            description=clock_time(snapshot.elapsed),
+            completed=snapshot.elapsed,
+            total=total,
+            state=" · ".join(parts),
+        )
+
+    def result(self, done: int, total: int) -> None:
+        """Show how far the result of the whole recording is."""
+        self._bar.update(
+            self._task,
+            description="result",
+            completed=done,
+            total=total,
+            state=f"{done / total:.0%}",
+        )
+
+
 @contextmanager
-def _progress() -> Iterator[Callable[[Snapshot, Settings, float | None], None]]:
-    """Show a line that follows a run: time, segments, c.o.v., time left."""
+def _progress(duration: float | None) -> Iterator[_Bar]:
     with progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[state]}"),
     ) as bar:
-        task = bar.add_task("0:00", total=None, state="")
-
-        def show(snapshot: Snapshot, settings: Settings, duration: float | None) -> None:
-            left = None if duration is None else max(0.0, duration - snapshot.elapsed)
-            if settings.target_cov is not None and duration is None:
-                left = snapshot.time_left
-            cov = reached_cov(snapshot, settings)
-            parts = [f"{snapshot.n_segments} segments"]
-            if not math.isnan(cov):
-                parts.append(f"c.o.v. {cov:.3f}")
-            parts.append(time_left(left))
-            total = None if left is None else snapshot.elapsed + left
-            bar.update(
-                task,
-                description=clock_time(snapshot.elapsed),
-                completed=snapshot.elapsed,
-                total=total,
-                state=" · ".join(parts),
-            )
-
-        yield show
+        yield _Bar(bar, duration)

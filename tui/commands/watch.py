@@ -5,10 +5,8 @@ from __future__ import annotations
 import json as json_text
 import math
 import sys
-import threading
 from typing import TYPE_CHECKING, Any
 
-from daq.errors import RecordingError
 from daq.estimation.follow import follow
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
@@ -39,12 +37,12 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
         return
     with Recording.open(file) as recording:
         settings = chosen(Settings.of(recording.bench), method=method)
-    onlooker = _Lines(json)
-    follow(file, settings, onlooker=onlooker, ended=threading.Event())
-    if onlooker.last is not None and onlooker.last.results and json is None:
-        show_result(onlooker.last, settings, json=None, csv=None, bench=None)
-    if onlooker.troubles:
-        raise RecordingError(onlooker.troubles[0])
+    lines = _Lines(json)
+    try:
+        follow(file, settings, lines)
+    finally:
+        if lines.last is not None and lines.last.results and json is None:
+            show_result(lines.last, settings, json=None, csv=None, bench=None)
 
 
 class _Lines:
@@ -55,16 +53,15 @@ class _Lines:
         self._now: RecordingStatus | None = None
         self._n_events = 0
         self.last: Snapshot | None = None
-        self.troubles: list[str] = []
 
-    def look(self, now: RecordingStatus) -> None:
-        before, self._now = self._now, now
-        events = now.events[self._n_events :]
-        self._n_events = len(now.events)
+    def status(self, status: RecordingStatus) -> None:
+        before, self._now = self._now, status
+        events = status.events[self._n_events :]
+        self._n_events = len(status.events)
         if before is None:  # what was before we came
             return
         for event in events:
-            at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
+            at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
             if self._json is None:
                 said = " ".join(part for part in (event.sensor, event.kind, event.text) if part)
                 console().print(f"{clock_time(at)}  {said}", markup=False, soft_wrap=True)
@@ -88,9 +85,6 @@ class _Lines:
 
     def progress(self, done: int, total: int) -> None:
         pass
-
-    def trouble(self, text: str) -> None:
-        self.troubles.append(text)
 
     def _write(self, document: dict[str, Any]) -> None:
         if self._json is not None:

@@ -1,4 +1,4 @@
-"""The first Ctrl-C while a result is being made waits for it; the second does not."""
+"""Ctrl-C during a run: the first ends the recording and keeps the result, the second aborts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tui.output.console import notices
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from types import FrameType
 
 
@@ -22,24 +22,24 @@ class Interruption:
 
 
 @contextmanager
-def defer_interrupt(*, spent: bool = False) -> Iterator[Interruption]:
-    """Take note of the first Ctrl-C, and be ended by the second; by the first where `spent`.
+def defer_interrupt(stop: Callable[[], None]) -> Iterator[Interruption]:
+    """Call `stop` at the first Ctrl-C, and raise `KeyboardInterrupt` at the second.
 
     Raises
     ------
     KeyboardInterrupt
         At the second.
     """
-    found = Interruption(spent)
+    found = Interruption()
     before = signal.getsignal(signal.SIGINT)
 
     def note(_number: int, _frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
         found.pressed = True
-        notices().print("the result is being made; Ctrl-C once more ends without it")
+        notices().print("stopping; the result follows. Press Ctrl-C again to end without it")
+        stop()
 
-    if not spent:
-        signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, note)
     try:
         yield found
     finally:

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import threading
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from daq.estimation.follow import follow
+from daq.estimation.follow import (
+    COMMIT_DELAY,
+    LONGEST_INTERVAL,
+    SHORTEST_INTERVAL,
+    RecordingLeftOpenError,
+    follow,
+)
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.recording.monitor import RecordingMonitor, RecordingStatus, SensorStatus
 from daq.recording.reader import Recording
+from estimator.errors import InsufficientDataError
 from tests.tui.example_snapshot import SETTINGS, growing
 
 if TYPE_CHECKING:
@@ -28,24 +36,32 @@ if TYPE_CHECKING:
 RATE = 200
 
 
+class NoWait(threading.Event):
+    """An event for which nobody waits: what would be a pause is none."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Return at once."""
+        del timeout
+        return self.is_set()
+
+
 @dataclass
 class Noted:
     """Writes down what it is told, in order."""
 
-    ended: threading.Event = field(default_factory=threading.Event)
+    cancelled: threading.Event = field(default_factory=NoWait)
     wanted: int = 10**9
     """Looks after which it has seen enough."""
     told: list[str] = field(default_factory=list)
-    nows: list[RecordingStatus] = field(default_factory=list)
+    seen: list[RecordingStatus] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
-    troubles: list[str] = field(default_factory=list)
 
-    def look(self, now: RecordingStatus) -> None:
+    def status(self, status: RecordingStatus) -> None:
         """Count it."""
         self.told.append("look")
-        self.nows.append(now)
-        if len(self.nows) >= self.wanted:
-            self.ended.set()
+        self.seen.append(status)
+        if len(self.seen) >= self.wanted:
+            self.cancelled.set()
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Keep it."""
@@ -57,9 +73,20 @@ class Noted:
         """Check it."""
         assert 0 < done <= total
 
-    def trouble(self, text: str) -> None:
-        """Keep it."""
-        self.troubles.append(text)
+
+@dataclass
+class Process:
+    """A recorder's process: notes for how long it is waited for, and then goes on."""
+
+    goes_on: Callable[[], object]
+    ended: bool = False
+    waits: list[float] = field(default_factory=list)
+
+    def ends_within(self, timeout: float) -> bool:
+        """Go on."""
+        self.waits.append(timeout)
+        self.goes_on()
+        return self.ended
 
 
 class Bench:
@@ -183,9 +210,9 @@ def test_an_estimate_is_made_only_when_a_segment_has_come(tmp_path: Path) -> Non
     with growing(path) as writer:
         bench, noted = Bench(writer), Noted(wanted=4)
         bench.send("ABC", 6)
-        follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+        assert follow(path, SETTINGS, noted, cancelled=noted.cancelled) is None
     assert noted.told == ["look", "look", "snapshot", "look", "look"]
-    assert noted.nows[-1].elapsed >= 6
+    assert noted.seen[-1].elapsed >= 6
 
 
 def test_the_end_is_one_result(tmp_path: Path) -> None:
@@ -194,12 +221,12 @@ def test_the_end_is_one_result(tmp_path: Path) -> None:
         Bench(writer).send("ABC", 30)
         writer.close()
     noted = Noted()
-    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
-    (snapshot,) = noted.snapshots
-    assert snapshot.closed
-    assert "advice" in snapshot.diagnostics
-    assert noted.nows[-1].closed
-    assert not noted.troubles
+    result = follow(path, SETTINGS, noted)
+    assert noted.snapshots == [result]
+    assert result is not None
+    assert result.closed
+    assert "advice" in result.diagnostics
+    assert noted.seen[-1].closed
 
 
 def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> None:
@@ -207,26 +234,26 @@ def test_what_closes_with_its_last_segment_has_one_result(tmp_path: Path) -> Non
     with growing(path) as writer:
 
         class Closing(Noted):
-            def look(self, now: RecordingStatus) -> None:
-                if not self.nows:  # it has been seen open, and ends before the next look
+            def status(self, status: RecordingStatus) -> None:
+                if not self.seen:  # it has been seen open, and ends before the next look
                     Bench(writer).send("ABC", 30)
                     writer.close()
-                super().look(now)
+                super().status(status)
 
         noted = Closing()
-        follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
-    (snapshot,) = noted.snapshots
-    assert snapshot.closed
-    assert "advice" in snapshot.diagnostics
+        result = follow(path, SETTINGS, noted, cancelled=noted.cancelled)
+    assert result is not None
+    assert noted.snapshots == [result]
+    assert "advice" in result.diagnostics
 
 
-def test_nobody_waits_for_a_result_that_nobody_wants(tmp_path: Path) -> None:
+def test_a_result_that_is_not_wanted_is_not_computed(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer:
         Bench(writer).send("ABC", 30)
         writer.close()
     noted = Noted(wanted=1)
-    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    assert follow(path, SETTINGS, noted, cancelled=noted.cancelled) is None
     assert not noted.snapshots
 
 
@@ -236,15 +263,70 @@ def test_too_short_a_recording_says_so(tmp_path: Path) -> None:
         Bench(writer).send("ABC", 1)
         writer.close()
     noted = Noted()
-    follow(path, SETTINGS, onlooker=noted, ended=noted.ended)
+    with pytest.raises(InsufficientDataError, match="record longer"):
+        follow(path, SETTINGS, noted)
     assert noted.snapshots[-1].closed
-    assert "record longer" in noted.troubles[0]
 
 
-def test_a_recorder_that_is_gone_is_trouble(tmp_path: Path) -> None:
+def test_a_remote_recorder_that_has_ended_is_found_by_its_silence(tmp_path: Path) -> None:
     path = tmp_path / "killed.h5"
     with growing(path):
         pass
     noted = Noted()
-    follow(path, None, onlooker=noted, ended=noted.ended, silence=0.0)
-    assert f"huddle repair {path}" in noted.troubles[0]
+    with pytest.raises(RecordingLeftOpenError, match=f"huddle repair {path}"):
+        follow(path, None, noted, cancelled=noted.cancelled, silence=0.0)
+
+
+def test_a_process_that_ends_without_closing_its_recording_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        bench, noted = Bench(writer), Noted()
+        bench.send("ABC", 6)
+
+        def be_killed() -> None:
+            process.ended = True
+
+        process = Process(be_killed)
+        with pytest.raises(RecordingLeftOpenError, match="huddle repair"):
+            follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
+    assert noted.told == ["snapshot"]  # of the sensors nothing, as they are not watched
+
+
+def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        bench, noted = Bench(writer), Noted()
+
+        def end() -> None:
+            bench.send("ABC", 30)
+            writer.close()
+            process.ended = True
+
+        process = Process(end)
+        result = follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
+    assert result is not None
+    assert result.n_segments > 20
+
+
+def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.h5"
+    with growing(path) as writer:
+        bench, noted = Bench(writer), Noted()
+        steps: list[Callable[[], object]] = [partial(bench.send, "ABC", 1)]
+        steps += [partial(bench.send, "ABC", 3), writer.close]
+
+        def go_on() -> None:
+            steps.pop(0)()
+
+        process = Process(go_on)
+        settings = replace(SETTINGS, segment=6.0)
+        with pytest.raises(InsufficientDataError):
+            follow(path, settings, noted, recorder=process, watch_sensors=False)
+    # The demo's bench runs at four times real time; the file may lie behind by two seconds.
+    # Looks, a few milliseconds each, may take 3 % of the time, which can make a wait longer.
+    speed = 4.0
+    for waited, lacking in zip(process.waits, (6.0, 5.0, 3.0), strict=True):
+        assert waited >= max(SHORTEST_INTERVAL, (lacking - COMMIT_DELAY) / speed) - 1e-9
+        assert waited <= LONGEST_INTERVAL

@@ -1,4 +1,4 @@
-"""Ctrl-C while a result is being made."""
+"""Ctrl-C during a run."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ import pytest
 from tui.runs.interrupt import defer_interrupt
 
 
-def test_the_first_ctrl_c_waits_for_the_result_and_the_second_does_not() -> None:
+def test_the_first_ctrl_c_stops_the_recorder_and_the_second_raises() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with defer_interrupt() as interruption:
+    stops = []
+    with defer_interrupt(lambda: stops.append("stop")) as interruption:
         before_it = interruption.pressed
         signal.raise_signal(signal.SIGINT)
-        assert (before_it, interruption.pressed) == (False, True)
+        assert (before_it, interruption.pressed, stops) == (False, True, ["stop"])
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_one_that_was_pressed_before_counts() -> None:
-    with defer_interrupt(spent=True) as interruption:
-        assert interruption.pressed
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+    assert stops == ["stop"]
