@@ -1,27 +1,22 @@
-"""``python -m sim_devices SPEC.json [INDEX]``; see :mod:`sim_devices.server.serve`."""
+"""``python -m sim_devices SPEC.json``; see :mod:`sim_devices.server.serve`."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import sys
 from pathlib import Path
 
 from sim_devices.errors import ScenarioError, ServeError
 from sim_devices.server.launch import start
-from sim_devices.server.serve import serve
 
 
 def main(arguments: list[str]) -> int:
-    """Serve one device or, each in its own process, all of them."""
-    if len(arguments) not in {1, 2}:
+    """Serve every device of a specification until standard input is closed."""
+    if len(arguments) != 1:
         print(__doc__, file=sys.stderr)
         return 2
     try:
         spec = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
-        if len(arguments) == 2:
-            asyncio.run(serve(spec, int(arguments[1])))
-            return 0
         with start(spec) as running:
             for device in running:
                 said = {

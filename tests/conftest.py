@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.device_server import server_pids, stop_server
+
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
@@ -59,7 +61,7 @@ def nothing_left_behind() -> Iterator[None]:
     ]
     if left:
         pytest.fail(f"threads left behind: {left}")
-    born = _children() - children
+    born = _children() - children - server_pids()
     if born:
         pytest.fail(f"processes left behind: {sorted(born)}")
     opened = {n: t for n, t in _open_descriptors().items() if descriptors.get(n) != t}
@@ -85,6 +87,11 @@ def pytest_configure() -> None:
     """Let our commands be interrupted, even where the tests run in a shell's background."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # which all children would inherit
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionfinish() -> None:
+    """End what served simulated devices to all tests."""
+    stop_server()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

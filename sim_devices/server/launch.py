@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import tempfile
+import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from daq.python_process import python_command
 from sim_devices.errors import ServeError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
-
-STOP_TIMEOUT = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,74 +29,97 @@ class RunningDevice:
     port: str
     settings: dict[str, Any]
     """To be added to the settings of its sensors."""
-    process: subprocess.Popen[str]
+    pid: int
+
+    def kill(self) -> None:
+        """Kill the device's process: the device has lost its power."""
+        os.kill(self.pid, signal.SIGKILL)
+
+
+class DeviceServer:
+    """A process that serves simulated devices (:mod:`sim_devices.server.fork_server`).
+
+    It can serve several specifications at once, and is safe to use from several threads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process = subprocess.Popen(
+            python_command("sim_devices.server.fork_server"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            # A device multiplies no large matrices: more threads would only fight for the cores.
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            start_new_session=True,  # a Ctrl-C at the terminal is for the parent; it ends them
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id of the process that forks the devices."""
+        return self._process.pid
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process and every device."""
+        with self._process:  # closes its standard input and waits for its end
+            pass
+
+    @contextmanager
+    def serve(self, spec: Mapping[str, Any]) -> Iterator[tuple[RunningDevice, ...]]:
+        """Serve every device of a specification until the context ends.
+
+        Parameters
+        ----------
+        spec
+            As described in :mod:`sim_devices.server.serve`.
+
+        Raises
+        ------
+        ServeError
+            A device could not be served; the message says why.
+        """
+        with tempfile.TemporaryDirectory(prefix="huddle-") as folder:
+            file = Path(folder) / "spec.json"
+            file.write_text(json.dumps(spec), encoding="utf-8")
+            answer = self._ask({"serve": str(file)})
+            if "error" in answer:
+                raise ServeError(f"a simulated device did not start: {answer['error']}")
+            try:
+                yield tuple(
+                    RunningDevice(
+                        sensors=tuple(device["sensors"]),
+                        driver=device["driver"],
+                        port=device["port"],
+                        settings=device["settings"],
+                        pid=device["pid"],
+                    )
+                    for device in answer["devices"]
+                )
+            finally:
+                if self._process.poll() is None:  # else every device has ended with it
+                    self._ask({"stop": str(file)})
+
+    def _ask(self, request: Mapping[str, str]) -> dict[str, Any]:
+        with self._lock:
+            if self._process.stdin is None or self._process.stdout is None:
+                raise ServeError("the server of simulated devices has no pipes")
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        if not line:
+            raise ServeError(f"the server of simulated devices ended with {self._process.wait()}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
 
 
 @contextmanager
 def start(spec: Mapping[str, Any]) -> Iterator[tuple[RunningDevice, ...]]:
-    """Serve every device of ``spec`` in a process of its own until the context ends.
-
-    The processes start in parallel, and end with this one in any case.
-
-    Parameters
-    ----------
-    spec
-        As described in :mod:`sim_devices.server.serve`.
-
-    Raises
-    ------
-    ServeError
-        A device could not be served; the message holds what its process said.
-    """
-    with tempfile.TemporaryDirectory(prefix="huddle-") as folder:
-        file = Path(folder) / "spec.json"
-        file.write_text(json.dumps(spec), encoding="utf-8")
-        started: list[subprocess.Popen[str]] = []
-        try:
-            started.extend(_start(file, index) for index in range(len(spec["devices"])))
-            yield tuple(_running(process) for process in started)
-        finally:
-            _stop(started)
-
-
-def _start(file: Path, index: int) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        python_command("sim_devices", str(file), str(index)),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(file.parent)},  # what a killed one leaves goes too
-        start_new_session=True,  # a Ctrl-C at the terminal is for the parent; it ends them
-    )
-
-
-def _running(process: subprocess.Popen[str]) -> RunningDevice:
-    said = process.stdout.readline() if process.stdout else ""
-    if not said:
-        process.wait()
-        why = process.stderr.read().strip() if process.stderr else ""
-        raise ServeError(f"a simulated device did not start: {why or 'it ended without a word'}")
-    table = json.loads(said)
-    return RunningDevice(
-        sensors=tuple(table["sensors"]),
-        driver=table["driver"],
-        port=table["port"],
-        settings=table["settings"],
-        process=process,
-    )
-
-
-def _stop(processes: list[subprocess.Popen[str]]) -> None:
-    for process in processes:
-        if process.stdin:
-            process.stdin.close()
-    for process in processes:
-        try:
-            process.wait(STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        for stream in (process.stdout, process.stderr):
-            if stream:
-                stream.close()
+    """Serve every device of ``spec`` until the context ends; see :meth:`DeviceServer.serve`."""
+    with DeviceServer() as server, server.serve(spec) as running:
+        yield running

@@ -1,4 +1,4 @@
-"""Serve simulated devices: ``python -m sim_devices SPEC.json [INDEX]``.
+"""Serve simulated devices: ``python -m sim_devices SPEC.json``.
 
 The specification is one JSON object::
 
@@ -20,13 +20,13 @@ The specification is one JSON object::
         "model": "", "serial_number": "",     what it says it is; the family's own if empty
         "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
 
-With INDEX this process serves that device alone; without, it starts one process for each. Each
-prints one JSON line when it can be connected to::
+Each device is served by a process of its own (:mod:`sim_devices.server.fork_server`), which
+announces when it can be connected to::
 
     {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
 
-``settings`` holds what must be added to the sensors' settings (further port numbers). A process
-ends on SIGTERM, SIGINT, or when its standard input is closed, so that none outlives its parent.
+``settings`` holds what must be added to the sensors' settings (further port numbers). ``python -m
+sim_devices`` prints one such line for each device and ends when its standard input is closed.
 
 Device families (``FAMILIES``) are named here and imported when served; see
 :mod:`sim_devices.devices.interface` for what a family offers.
@@ -35,11 +35,8 @@ Device families (``FAMILIES``) are named here and imported when served; see
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import os
 import signal
-import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -179,8 +176,26 @@ class Served:
         self._schedule()
 
 
-async def serve(spec: Mapping[str, Any], index: int) -> None:
-    """Serve device ``index`` of a specification until told to end; print where it listens."""
+async def serve(
+    spec: Mapping[str, Any],
+    index: int,
+    *,
+    announce: Callable[[Mapping[str, Any]], None],
+    lifeline: int,
+) -> None:
+    """Serve one device until SIGTERM or SIGINT, or until the other end of ``lifeline`` is closed.
+
+    Parameters
+    ----------
+    spec : mapping
+        As described in this module.
+    index : int
+        Of the device in the specification.
+    announce : callable
+        Called once, when the device can be connected to.
+    lifeline : int
+        File descriptor, open for reading.
+    """
     epoch_ns = int(spec["epoch_ns"])
     device = replace(device_spec(spec["devices"][index]), utc_ns=utc_of(epoch_ns))
     scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
@@ -199,8 +214,7 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, ended.set)
-    with contextlib.suppress(PermissionError):  # /dev/null: nobody will close it
-        loop.add_reader(sys.stdin.fileno(), _end_of_input, ended)
+    loop.add_reader(lifeline, ended.set)  # nothing is ever written to it
     name = ",".join(device.sensors)
     tell_fault, tell_sent = _Log(spec.get("fault_log"), device), _Log(spec.get("sent_log"), device)
 
@@ -232,10 +246,10 @@ async def serve(spec: Mapping[str, Any], index: int) -> None:
         for one in served:
             opened.append(one)
             await one.wire.open()
-        print(json.dumps(_announcement(device, served)), flush=True)
+        announce(_announcement(device, served))
         await ended.wait()
     finally:
-        loop.remove_reader(sys.stdin.fileno())
+        loop.remove_reader(lifeline)
         for one in opened:
             await one.close()
 
@@ -258,11 +272,6 @@ class _Log:
             line = json.dumps({"sensors": self._sensors, **told}) + "\n"
             with Path(self._path).open("ab", buffering=0) as file:
                 file.write(line.encode())
-
-
-def _end_of_input(ended: asyncio.Event) -> None:
-    if not os.read(sys.stdin.fileno(), 4096):
-        ended.set()
 
 
 def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any]:

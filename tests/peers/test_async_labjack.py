@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from sim_devices.server import launch
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import scenario, spec
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def digitizer() -> Iterator[RunningDevice]:
         "sampling_rate": RATE,
         "channels": {"A": [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]},
     }
-    with launch.start(spec(table, sampling_rate=RATE)) as (one,):
+    with serving(spec(table, sampling_rate=RATE)) as (one,):
         yield one
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from daq.protocols.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
-from sim_devices.server import launch
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, spec
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ pytestmark = [
 @pytest.fixture
 def accelerometer() -> Iterator[Any]:
     """Yield the vendor's object for a device it found out about by itself."""
-    with launch.start(spec(device("A", serial_number="A0000042"), speed=4.0)) as (running,):
+    with serving(spec(device("A", serial_number="A0000042"), speed=4.0)) as (running,):
         said = io.StringIO()
         with contextlib.redirect_stdout(said):
             found = sensor_device.SensorDevice(running.port, speed=460800, model="auto")

@@ -14,8 +14,8 @@ from daq.bench.model import Channel, Sensor
 from daq.drivers.registry import driver_type
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block
-from sim_devices.server import launch
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.peers.libmodbus import build, ready, running, serial_cable
 from tests.sim_devices.simulated_bench import device, scenario, spec
 
@@ -52,7 +52,7 @@ def slave(request: pytest.FixtureRequest) -> Iterator[tuple[str, RunningDevice]]
         settings={"address": 0x34, "device_id": SLAVE},
         channels={"A": CHANNELS},
     )
-    with launch.start(spec(table, speed=STILL, age=AGE, sampling_rate=RATE)) as (one,):
+    with serving(spec(table, speed=STILL, age=AGE, sampling_rate=RATE)) as (one,):
         yield request.param, one
 
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from sim_devices.server import launch
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, scenario, spec
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def test_rsudp_reads_our_packets(tmp_path: Path) -> None:
         channels={"A": [{"name": name, "sensitivity": COUNTS} for name in NAMES]},
     )
     made = spec(table, speed=8.0, sampling_rate=RATE)
-    with launch.start(made) as (one,), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+    with serving(made) as (one,), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.bind(("127.0.0.1", int(one.port.rpartition(":")[2])))
         port.settimeout(10)
         packets = [port.recv(4096) for _ in range(30)]

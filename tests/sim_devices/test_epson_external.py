@@ -14,11 +14,11 @@ from daq.host_clock import SystemClock
 from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.devices.interface import Source
-from sim_devices.server import launch
 from sim_devices.server.serve import device_spec
 from sim_devices.server.world_clock import utc_of
 from sim_devices.world.scenario import Scenario
 from tests.daq.drivers.reading import record
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Running(dict[str, "RunningDevice"]):
 @pytest.fixture(scope="module")
 def running() -> Iterator[Running]:
     spec = world()
-    with launch.start(spec) as devices:
+    with serving(spec) as devices:
         yield Running(spec, devices)
 
 

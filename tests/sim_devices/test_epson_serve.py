@@ -17,16 +17,16 @@ from daq.protocols.block import Block, BlockFlag
 from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
-from sim_devices.server import launch
+from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.bench.model import Sensor
-    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 DRIVER = driver_type("epson")
@@ -39,7 +39,7 @@ SPEC = spec(*TABLES, speed=SPEED)
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start(SPEC) as devices:
+    with serving(SPEC) as devices:
         yield devices
 
 
@@ -191,7 +191,7 @@ async def test_silence_and_strangers_are_told_apart() -> None:
     async with await asyncio.start_server(stranger, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A")
-        quiet = launch.RunningDevice(("A",), "epson", port, {}, None)  # type: ignore[arg-type]  # no process
+        quiet = RunningDevice(("A",), "epson", port, {}, None)  # type: ignore[arg-type]  # no process
         (sensor,) = sensors(quiet, table)
         with pytest.raises(NoAnswerError, match=r"'A' on socket://.* got nothing; check cable"):
             await blocks(sensor, 1)
@@ -203,12 +203,12 @@ async def test_silence_and_strangers_are_told_apart() -> None:
 
 async def test_a_device_that_vanishes_ends_the_session() -> None:
     table = device("A")
-    with launch.start(spec(table, speed=SPEED)) as (one,):
+    with serving(spec(table, speed=SPEED)) as (one,):
         (sensor,) = sensors(one, table)
         async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
             stream = session.read()
             assert isinstance(await anext(stream), Block)
-            one.process.kill()
+            one.kill()
             with pytest.raises(NotConnectedError, match=r"'A' on /tmp/.*: the port closed"):
                 async for _ in stream:
                     pass
@@ -220,7 +220,7 @@ def test_a_spec_that_cannot_be_served_says_why() -> None:
     wrong["scenario"]["motion"]["spectra"] = []
     with (
         pytest.raises(ServeError, match=r"did not start: .*spectra"),
-        launch.start(wrong),
+        serving(wrong),
     ):
         pass
 

@@ -18,8 +18,8 @@ from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.epson import commands
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import LineFaults, SampleFaults, parse
-from sim_devices.server import launch
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 from tui.simulation.devices import specification, with_faults
 
@@ -191,7 +191,7 @@ async def test_every_sample_that_came_has_its_place(
     world = spec(table, speed=SPEED) | {"faults": EVERYTHING, "fault_log": str(log)}
     blocks: list[Block] = []
     events: list[Event] = []
-    with launch.start(world) as (one,):
+    with serving(world) as (one,):
         (sensor,) = sensors(one, table)
         async with connected(sensor, SystemClock(SPEED)) as session:
             async for item in session.read():
@@ -230,7 +230,7 @@ async def test_every_sample_that_came_has_its_place(
 async def test_what_ends_a_session(kind: str, port: str, error: type[Exception]) -> None:
     table = device("A", port=port)
     fault = {"kind": kind, "at": 8.0, "every": 12.0, "duration": 1.0}
-    with launch.start(spec(table, speed=SPEED) | {"faults": [fault]}) as (one,):
+    with serving(spec(table, speed=SPEED) | {"faults": [fault]}) as (one,):
         (sensor,) = sensors(one, table)
         clock = SystemClock(SPEED)
         ended = sampled = False

@@ -10,8 +10,8 @@ import pytest
 
 from daq.drivers.registry import driver_type
 from daq.protocols.block import Block, BlockFlag, Event
-from sim_devices.server import launch
 from tests.daq.drivers.reading import reading, record
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ FAULTS += [{"kind": "drop", "at": AGE + 3, "every": 6.0, "count": 2, "sensors": 
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start({**spec(*TABLES, speed=SPEED, age=AGE), "faults": FAULTS}) as devices:
+    with serving({**spec(*TABLES, speed=SPEED, age=AGE), "faults": FAULTS}) as devices:
         yield devices
 
 

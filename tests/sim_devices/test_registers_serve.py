@@ -16,7 +16,8 @@ from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDe
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.modbus import rtu
-from sim_devices.server import launch
+from sim_devices.server.launch import RunningDevice
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Sensor
-    from sim_devices.server.launch import RunningDevice
 
 SPEED = 4.0
 DRIVER = driver_type("registers")
@@ -57,7 +57,7 @@ TABLES: list[dict[str, Any]] = [
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start(spec(*TABLES, speed=SPEED, sampling_rate=50.0)) as devices:
+    with serving(spec(*TABLES, speed=SPEED, sampling_rate=50.0)) as devices:
         yield devices
 
 
@@ -116,7 +116,7 @@ async def test_registers_with_others_between_are_read_apart() -> None:
         "time_format": "uint32-us",
     }
     table = device("H", "registers", port="tcp", channels={"H": VOLTS}, settings=settings)
-    with launch.start(spec(table, speed=SPEED)) as (one,):
+    with serving(spec(table, speed=SPEED)) as (one,):
         (sensor,) = sensors(one, table, settings=settings, sampling_rate=50.0)
         found = await read([sensor], 40, SystemClock(SPEED))
         counts = np.concatenate([block.counts for block in found["H"]])
@@ -150,7 +150,7 @@ async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path)
     off = {"kind": "silent", "sensors": ["B"], "at": 29.0, "every": 40.0, "duration": 8.0}
     log = tmp_path / "sent"
     world = spec(TABLES[0], speed=SPEED, sampling_rate=50.0)
-    with launch.start(world | {"faults": [off], "sent_log": str(log)}) as (one,):
+    with serving(world | {"faults": [off], "sent_log": str(log)}) as (one,):
         clock = SystemClock(SPEED)
         blocks: dict[str, list[Block]] = {"A": [], "B": []}
         events: list[Event] = []
@@ -249,7 +249,7 @@ async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
     async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS})
-        here = launch.RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
+        here = RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
         (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
         events: list[str] = []
         async with DRIVER.open([sensor], SystemClock()) as session:
@@ -271,12 +271,12 @@ async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
 
 async def test_a_bus_that_vanishes_ends_the_session() -> None:
     table = device("C", "registers", port="tcp", settings={"preset": "labjack-ain"})
-    with launch.start(spec(table)) as (one,):
+    with serving(spec(table)) as (one,):
         (sensor,) = sensors(one, table, settings={"preset": "labjack-ain", "timeout": 0.1})
         async with DRIVER.open([sensor], SystemClock()) as session:
             stream = session.read()
             assert isinstance(await anext(stream), Block)
-            one.process.kill()
+            one.kill()
             with pytest.raises((NotConnectedError, NoAnswerError), match="'C' on modbus-tcp://"):
                 async for _ in stream:
                     pass
@@ -307,7 +307,7 @@ async def test_a_late_reply_never_answers_the_next_request() -> None:
     async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS[:1]})
-        here = launch.RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
+        here = RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
         (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
         values: list[int] = []
         async with DRIVER.open([sensor], SystemClock()) as session:

@@ -23,7 +23,7 @@ from daq.drivers.registry import driver_names
 from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, HostTime
-from sim_devices.server import launch
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 from tui.cli.main import app
 
@@ -53,7 +53,7 @@ FAULTS = [
 def running() -> Iterator[tuple[RunningDevice, ...]]:
     world = spec(*TABLES, speed=SPEED, sampling_rate=RATE)
     world["scenario"]["sensors"]["A"]["sampling_rate"] = 200.0
-    with launch.start(world | {"faults": FAULTS}) as devices:
+    with serving(world | {"faults": FAULTS}) as devices:
         yield devices
 
 

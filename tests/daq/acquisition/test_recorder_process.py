@@ -21,13 +21,15 @@ from daq.protocols.epson import commands
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import heal, verify
-from sim_devices.server import launch
 from sim_devices.world.world import World
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import bench_of, device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
+
+    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 NAMES = ("A", "B", "C")
@@ -45,12 +47,12 @@ run(load(sys.argv[1]), sys.argv[2], acknowledged=say)
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[tuple[launch.RunningDevice, ...]]:
-    with launch.start(spec(*TABLES, speed=SPEED)) as devices:
+def running() -> Iterator[tuple[RunningDevice, ...]]:
+    with serving(spec(*TABLES, speed=SPEED)) as devices:
         yield devices
 
 
-def make_bench(running: tuple[launch.RunningDevice, ...]) -> Bench:
+def make_bench(running: tuple[RunningDevice, ...]) -> Bench:
     return bench_of(running, TABLES, simulation={"speed": SPEED})
 
 
@@ -88,7 +90,7 @@ def check_against_truth(path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["SIGINT", "stop"])
 def test_it_closes_the_file_when_asked(
-    running: tuple[launch.RunningDevice, ...], tmp_path: Path, how: str
+    running: tuple[RunningDevice, ...], tmp_path: Path, how: str
 ) -> None:
     path = tmp_path / "r.h5"
     with start(make_bench(running), path) as recorder:
@@ -111,7 +113,7 @@ def test_it_closes_the_file_when_asked(
 
 
 def test_killed_in_the_middle_nothing_acknowledged_is_lost(
-    running: tuple[launch.RunningDevice, ...], tmp_path: Path
+    running: tuple[RunningDevice, ...], tmp_path: Path
 ) -> None:
     path = tmp_path / "r.h5"
     with start(make_bench(running), path) as recorder:
@@ -131,10 +133,10 @@ def test_killed_in_the_middle_nothing_acknowledged_is_lost(
 
 
 @contextlib.asynccontextmanager
-async def started(told: dict[str, Any]) -> AsyncIterator[tuple[launch.RunningDevice, ...]]:
+async def started(told: dict[str, Any]) -> AsyncIterator[tuple[RunningDevice, ...]]:
     """Start devices without holding up the recorder in this process."""
     with contextlib.ExitStack() as stack:
-        yield await asyncio.to_thread(stack.enter_context, launch.start(told))
+        yield await asyncio.to_thread(stack.enter_context, serving(told))
         await asyncio.to_thread(stack.close)
 
 
@@ -154,7 +156,7 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
             if a.samples >= samples and a.state == state:
                 return status
 
-    with launch.start(told) as (first, other):
+    with serving(told) as (first, other):
         link.symlink_to(first.port)
         bench = Bench(
             name="simulated",
@@ -169,7 +171,7 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
         )
         before = (await until(1000, "recording")).sensors["A"].samples
         link.unlink()  # else it leads to the next terminal made here, of whatever test runs now
-        first.process.send_signal(signal.SIGKILL)
+        first.kill()
         await until(before, "lost")
         lost_for = clock.now().monotonic_ns
         async with started(only_a) as (again,):
@@ -202,7 +204,7 @@ if (
     from pathlib import Path
 
     rounds, rng, samples, blocks = int(sys.argv[1]), random.Random(1), 0, 0
-    with launch.start(spec(*TABLES, speed=SPEED)) as devices:
+    with serving(spec(*TABLES, speed=SPEED)) as devices:
         for number in range(rounds):
             with tempfile.TemporaryDirectory() as folder:
                 target = Path(folder) / "r.h5"

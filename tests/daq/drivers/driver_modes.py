@@ -15,10 +15,10 @@ from scipy.spatial import KDTree
 
 from daq.protocols.epson import commands
 from sim_devices.devices.interface import Source
-from sim_devices.server import launch
 from sim_devices.server.serve import device_spec
 from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.scenario import Scenario
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
 
 
 @contextlib.contextmanager
-def serving(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iterator[Served]:
+def serving_all(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iterator[Served]:
     """Serve the devices of all modes, with a fault script."""
     tables = [table(mode) for mode in CASES]
     world = spec(*tables, speed=speed)
@@ -163,5 +163,5 @@ def serving(*, speed: float, faults: list[dict[str, Any]] | None = None) -> Iter
             "sent_log": str(log),
             "fault_log": str(log.with_name("faults")),
         }
-        with launch.start(world) as running:
+        with serving(world) as running:
             yield Served(dict(zip(CASES, running, strict=True)), world, log)

@@ -14,7 +14,7 @@ from daq.errors import DeviceError, NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
-from tests.daq.drivers.driver_modes import CASES, RATE, Served, serving
+from tests.daq.drivers.driver_modes import CASES, RATE, Served, serving_all
 from tests.daq.drivers.reading import reading
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ N = 150
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    with serving(speed=SPEED) as devices:
+    with serving_all(speed=SPEED) as devices:
         yield devices
 
 
@@ -159,7 +159,7 @@ async def test_z_a_device_that_vanishes_ends_the_session(served: Served, mode: s
             async for item in items:
                 seen += isinstance(item, Block)
                 if seen:
-                    served.device(mode).process.kill()
+                    served.device(mode).kill()
     except (NotConnectedError, NoAnswerError) as came:
         error = came
     assert seen

@@ -24,7 +24,7 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
 from daq.recording.reader import Recording
 from sim_devices.server.world_clock import WorldClock
-from tests.daq.drivers.driver_modes import CASES, Served, serving
+from tests.daq.drivers.driver_modes import CASES, Served, serving_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,7 +161,7 @@ def test_each_sample_is_in_its_place(
     monkeypatch.setattr("daq.drivers.labjack.device.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.acquisition.connection.LONGEST_DELAY", LONGEST_DELAY / SPEED)
     path = tmp_path / "all.h5"
-    with serving(speed=SPEED, faults=script()) as served:
+    with serving_all(speed=SPEED, faults=script()) as served:
         struck = asyncio.run(_recorded(served, path))
         with Recording.open(path) as recording:
             for mode, sensor in itertools.product(CASES, recording.sensors):

@@ -21,11 +21,11 @@ from daq.transport.ports import open_port
 from sim_devices.devices.fifo import create
 from sim_devices.devices.interface import Source
 from sim_devices.faults import LineFaults
-from sim_devices.server import launch
 from sim_devices.server.serve import Served, device_spec
 from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.world import World
 from tests.daq.drivers.reading import reading
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ SPEC = spec(*TABLES, sampling_rate=RATE)
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start(SPEC) as devices:
+    with serving(SPEC) as devices:
         yield devices
 
 
@@ -120,7 +120,7 @@ async def test_at_the_rate_it_leaves_the_factory_with_every_sample_comes() -> No
     """7812 Hz of three channels: 191 reads a second."""
     one = table("A", rate=7812.0, settings={"capacity": 65_535})
     world = spec(one, sampling_rate=7812.0, age=0.0)
-    with launch.start(world) as (running,):
+    with serving(world) as (running,):
         patient = sensors(running, one, settings={"capacity": 65_535, "timeout": 2.0})[0]
         blocks, events = await record(patient, 4000)
     assert not events
@@ -146,7 +146,7 @@ async def test_who_asks_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daq.drivers.modbus.fifo.NOT_LESS", 0.4)
     one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
-    with launch.start(spec(one, sampling_rate=RATE)) as (running,):
+    with serving(spec(one, sampling_rate=RATE)) as (running,):
         slow = sensors(running, one, settings={})[0]
         with pytest.raises(
             NoAnswerError, match=r"never read up, 58\d\d words wait: the link is too"

@@ -19,8 +19,9 @@ from daq.protocols.guralp.gcf import SampleBlock, SystemId
 from sim_devices.devices import guralp
 from sim_devices.devices.interface import DeviceSpec
 from sim_devices.errors import ScenarioError
-from sim_devices.server import launch
+from sim_devices.server.launch import RunningDevice
 from tests.daq.drivers import reading
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from sim_devices.devices.interface import Source
-    from sim_devices.server.launch import RunningDevice
 
 SPEED = 8.0
 RATE = 200.0
@@ -53,7 +53,7 @@ SPEC = spec(*TABLES, speed=SPEED)
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start(SPEC) as devices:
+    with serving(SPEC) as devices:
         yield devices
 
 
@@ -141,16 +141,16 @@ def test_a_rate_that_gcf_has_no_code_for_is_named() -> None:
 
 
 async def test_nothing_listens() -> None:
-    gone = launch.RunningDevice(("D",), "guralp", "udp://127.0.0.1:9", {}, None)  # type: ignore[arg-type]  # no process
+    gone = RunningDevice(("D",), "guralp", "udp://127.0.0.1:9", {}, None)  # type: ignore[arg-type]  # no process
     with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: nothing listens"):
         await record(sensors(gone, TABLES[3])[0], 1)
 
 
 async def test_a_digitizer_that_vanishes_ends_the_session() -> None:
-    with launch.start(spec(TABLES[0], speed=SPEED)) as (one,):
+    with serving(spec(TABLES[0], speed=SPEED)) as (one,):
         async with reading.reading(DRIVER, sensors(one, TABLES[0]), speed=SPEED) as items:
             assert isinstance(await anext(items), (Block, Event))
-            one.process.kill()
+            one.kill()
             with pytest.raises(NotConnectedError, match="the port closed"):
                 async for _ in items:
                     pass
@@ -191,7 +191,7 @@ async def test_nothing_that_comes_while_streams_are_found_is_lost(named: bool) -
     streams = ["0123Z2", "0123N2", "0123E2"]  # a block tells 123Z2
     settings = {"link": "scream", "patience": 5.0} | ({"streams": streams} if named else {})
     async with sending(streams, 2) as port:
-        one = launch.RunningDevice(("C",), "guralp", port, settings, None)  # type: ignore[arg-type]  # no process
+        one = RunningDevice(("C",), "guralp", port, settings, None)  # type: ignore[arg-type]  # no process
         changes = {"settings": settings, "serial_number": "0123"}
         async with reading.reading(DRIVER, sensors(one, TABLES[2], **changes)) as items:
             blocks: list[Block] = []
@@ -232,7 +232,7 @@ async def test_recovery_that_failed_is_tried_again() -> None:
     drops = [{"kind": "drop", "at": 5.5, "every": 0.9}]
     streams = {"streams": ["D000Z2", "D000N2", "D000E2"]}  # known: one link from the beginning
     served = table("D", port="udp", settings=streams)
-    with launch.start(spec(served, speed=SPEED) | {"faults": drops}) as (one,):
+    with serving(spec(served, speed=SPEED) | {"faults": drops}) as (one,):
         async with unreliable(one.settings["recovery_port"], 2) as port:
             (chosen,) = sensors(one, served, settings={**streams, "recovery_port": port})
             blocks: list[Block] = []

@@ -20,9 +20,9 @@ from daq.errors import (
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.labjack.registers import actual_scan_rate
-from sim_devices.server import launch
 from sim_devices.world.world import World
 from tests.daq.drivers.reading import reading
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import scenario, spec
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def running() -> Iterator[tuple[RunningDevice, ...]]:
         table(serial_number="470001234"),
         table(["F"], settings={"ends_with": 2945, "ends_after": 400}),
     ]
-    with launch.start(spec(*tables, speed=SPEED, sampling_rate=RATE)) as devices:
+    with serving(spec(*tables, speed=SPEED, sampling_rate=RATE)) as devices:
         yield devices
 
 
@@ -231,7 +231,7 @@ async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
     told = spec(table(["R"], settings=settings), speed=SPEED, sampling_rate=RATE)
     told["faults"] = [{"kind": "reset", "at": 6.0, "every": 1.0}]
     said = "reading the stream: .*exception 4.*, reason 2620"
-    with launch.start(told) as (one,), pytest.raises(DeviceError, match=said):
+    with serving(told) as (one,), pytest.raises(DeviceError, match=said):
         await record(bench(one, settings=settings), 10**6)
 
 

@@ -13,9 +13,9 @@ from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
 from daq.protocols.block import BlockFlag, Event
 from daq.transport.address import host_and_port
-from sim_devices.server import launch
 from sim_devices.world.world import World
 from tests.daq.drivers import reading
+from tests.device_server import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def specification() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[tuple[RunningDevice, ...]]:
-    with launch.start(specification()) as devices:
+    with serving(specification()) as devices:
         yield devices
 
 
@@ -161,7 +161,7 @@ async def test_rows_twice_lost_and_late_leave_every_sample_in_its_place() -> Non
     """Packets, counted rows, rows with a time: the motion says which sample is which."""
     chosen = (0, 1, 3)
     world = spec(*(TABLES[i] for i in chosen), speed=SPEED, sampling_rate=RATE)
-    with launch.start(world | {"faults": FAULTS}) as running:
+    with serving(world | {"faults": FAULTS}) as running:
         ones = [
             sensors(device, TABLES[i], settings=SETTINGS[i])[0]
             for i, device in zip(chosen, running, strict=True)

@@ -17,8 +17,8 @@ from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from sim_devices.errors import ServeError
-from sim_devices.server import launch
 from tests.acceptance.run_bench import command
+from tests.device_server import serving
 from tui.simulation.devices import connected, specification
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
     ports = {d["sensors"][0]: d["number"] for d in told["devices"]}
     alone = {**told, "devices": told["devices"][:2]}
     out = tmp_path / "r.h5"
-    with launch.start(told) as running:
+    with serving(told) as running:
         assert {one.sensors[0]: one.port for one in running} == {
             name: f"modbus-tcp://127.0.0.1:{number}" for name, number in ports.items()
         }
@@ -110,10 +110,10 @@ def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
         with command("record", str(file), "--out", str(out)) as recorder:
             wait_until(out, recorder, **dict.fromkeys(MODES, 600))
             for one in running[:2]:
-                one.process.kill()
+                one.kill()
             before = wait_until(out, recorder, **dict.fromkeys(KILLED, "lost"))
             wait_until(out, recorder, C=before["C"]["samples"] + 600)
-            with launch.start(alone) as again:
+            with serving(alone) as again:
                 assert [one.port for one in again] == [one.port for one in running[:2]]
                 wait_until(out, recorder, **{n: before[n]["samples"] + 600 for n in KILLED})
                 ask(out, "stop")
@@ -146,6 +146,6 @@ def test_a_port_that_is_taken_is_named() -> None:
         held.listen()
         with (
             pytest.raises(ServeError, match=f"port {number} of this machine cannot be listened on"),
-            launch.start({**told, "devices": told["devices"][:1]}),
+            serving({**told, "devices": told["devices"][:1]}),
         ):
             pass
