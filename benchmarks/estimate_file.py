@@ -27,10 +27,9 @@ from daq.alignment.resampling import resample
 from daq.bench.model import Channel
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
-from daq.formats.importer import BLOCK_ROWS
-from daq.protocols.block import Block, HostTime
+from daq.protocols.block import HostTime
+from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.recording.writer import RecordingWriter
 from daq.results.store import store_results
 
 if TYPE_CHECKING:
@@ -42,7 +41,8 @@ REPEATS = 3
 MEMORY = """
 import sys
 from benchmarks.row import peak_memory
-from daq.estimation import Settings, estimate
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
 estimate([sys.argv[1]], Settings(methods=("three-sensor",)))
 print(peak_memory())
 """
@@ -224,19 +224,23 @@ def _record(
     ]
     created = HostTime(10**12, 1_790_000_000 * 10**9)
     seconds = 1.0 if chunk_rows is None else chunk_rows / rate
-    writer = RecordingWriter.create(path, sensors=layouts, created=created, chunk_seconds=seconds)
     length = 10 * rate
     begins = range(0, len(samples) - length + 1, length)
-    for number, layout in enumerate(layouts):
-        own_rate = rate * (1 + ppm[number] * 1e-6)
-        # one digitizer sends what it has of all its sensors together
-        delays = np.random.default_rng(0 if shared else number).exponential(1e-3, len(begins))
-        for first, delay in zip(begins, delays, strict=True):
-            late = round(((first + length - 1) / own_rate + delay) * 1e9)
-            counts = samples[first : first + length, 3 * number : 3 * number + 3]
-            received = HostTime(created.monotonic_ns + late, created.utc_ns + late)
-            writer.append(Block(layout.name, first, counts, received))
-    writer.close()
+    with ArrayWriter(path, sensors=layouts, created=created, chunk_seconds=seconds) as writer:
+        for number, layout in enumerate(layouts):
+            own_rate = rate * (1 + ppm[number] * 1e-6)
+            # one digitizer sends what it has of all its sensors together
+            delays = np.random.default_rng(0 if shared else number).exponential(1e-3, len(begins))
+            writer.samples(
+                layout.name,
+                samples[: len(begins) * length, 3 * number : 3 * number + 3],
+                block_rows=length,
+                received_ns=[
+                    round(((first + length - 1) / own_rate + delay) * 1e9)
+                    for first, delay in zip(begins, delays, strict=True)
+                ],
+                restart=False,
+            )
     return path
 
 

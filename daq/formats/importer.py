@@ -18,21 +18,18 @@ from daq.errors import ImportFormatError
 from daq.formats.csv_reader import read_delimited
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.npz import read_mat, read_npz
-from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.protocols.block import HostTime
+from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-    from typing import Any
 
-    from daq.formats.foreign_sensor import ForeignSensor, Stretch
+    from daq.formats.foreign_sensor import ForeignSensor
     from daq.formats.response import Responses
 
 DELIMITED = frozenset({".csv", ".tsv", ".txt"})
-BLOCK_ROWS = 4096
-"""Samples per block and per chunk: long enough to read fast, and little is read twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,22 +87,15 @@ def import_files(
     described = {name: _described(sensor, bench, responses) for name, sensor in found.items()}
     written = _bench(out, bench, tuple(described.values()))
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
-    writer = RecordingWriter.create(
+    with ArrayWriter(
         out,
         written,
         sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
         created=HostTime(start, start),
         attributes={"origin": ", ".join(path.name for path in sources)},
         chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
-    )
-    try:
-        imported = tuple(_write(writer, sensor) for sensor in found.values())
-        writer.close()
-    except BaseException:
-        writer.abandon()
-        out.unlink(missing_ok=True)
-        raise
-    return imported
+    ) as writer:
+        return tuple(_write(writer, sensor) for sensor in found.values())
 
 
 def _read(sources: Sequence[Path], sampling_rate: float | None) -> list[ForeignSensor]:
@@ -229,7 +219,7 @@ def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:
     )
 
 
-def _write(writer: RecordingWriter, sensor: ForeignSensor) -> Imported:
+def _write(writer: ArrayWriter, sensor: ForeignSensor) -> Imported:
     missing = 0
     placed = [(sensor.first_sample(stretch), stretch) for stretch in sensor.stretches]
     for (first, stretch), (following, _) in pairwise(placed):
@@ -237,7 +227,17 @@ def _write(writer: RecordingWriter, sensor: ForeignSensor) -> Imported:
         writer.gap(sensor.name, end, following - end, reason=f"not in {sensor.source}")
         missing += following - end
     for first, stretch in placed:
-        _write_stretch(writer, sensor, first, stretch)
+        begin = stretch.start_utc_ns - writer.created.utc_ns
+        rows = [*range(0, stretch.n_samples, BLOCK_ROWS), stretch.n_samples]
+        times = [begin + round(row * NS_PER_S / sensor.sampling_rate) for row in rows]
+        writer.samples(
+            sensor.name,
+            stretch.counts,
+            first_sample=first,
+            received_ns=times[1:],
+            utc_ns=times[:-1],
+            restart=True,
+        )
     return Imported(
         sensor=sensor.name,
         channels=sensor.channels,
@@ -247,26 +247,3 @@ def _write(writer: RecordingWriter, sensor: ForeignSensor) -> Imported:
         n_gaps=len(placed) - 1,
         missing=missing,
     )
-
-
-def _write_stretch(
-    writer: RecordingWriter, sensor: ForeignSensor, first: int, stretch: Stretch
-) -> None:
-    def at(row: int) -> int:
-        return stretch.start_utc_ns + round(row * NS_PER_S / sensor.sampling_rate)
-
-    flags = BlockFlag.DEVICE_UTC | BlockFlag.CLOCK_RESTART
-    for row in range(0, stretch.n_samples, BLOCK_ROWS):
-        counts: Any = stretch.counts[row : row + BLOCK_ROWS]
-        end_ns = at(row + counts.shape[0])
-        writer.append(
-            Block(
-                sensor=sensor.name,
-                first_sample=first + row,
-                counts=counts,
-                received=HostTime(end_ns, end_ns),
-                device_counter=at(row),
-                flags=flags,
-            )
-        )
-        flags = BlockFlag.DEVICE_UTC

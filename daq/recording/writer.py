@@ -32,7 +32,7 @@ import numpy as np
 from daq.errors import RecordingError
 from daq.recording import file_format
 from daq.recording.chunk_writer import SensorRows, Table
-from daq.recording.locking import WriterLock
+from daq.recording.locking import WriterLock, is_being_written
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -70,6 +70,7 @@ class RecordingWriter:
         self, path: Path, file: h5py.File, sensors: Sequence[SensorLayout], lock: WriterLock
     ) -> None:
         self.path = path
+        self._hidden: Path | None = None
         self._file = file
         self._lock = lock
         self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
@@ -88,6 +89,7 @@ class RecordingWriter:
         control: tuple[int, str] | None = None,
         attributes: dict[str, str | float] | None = None,
         chunk_seconds: float = 1.0,
+        hidden: bool = False,
     ) -> RecordingWriter:
         """Create a recording.
 
@@ -107,6 +109,9 @@ class RecordingWriter:
             More attributes of the file, such as its origin.
         chunk_seconds : float
             Length of a chunk; longer ones read faster, but a sample waits that long.
+        hidden : bool
+            Keep the temporary name until `close`, for a recording that is not to be seen before it
+            is complete; `abandon` then removes it.
 
         Raises
         ------
@@ -116,8 +121,10 @@ class RecordingWriter:
         path = Path(path)
         if path.exists():
             raise RecordingError(f"{path}: exists already; expected a new file")
-        renames = os.name != "nt"  # Windows renames no file that is open
+        renames = hidden or os.name != "nt"  # Windows renames no file that is open
         temporary = path.with_name(f".{path.name}.new") if renames else path
+        if hidden and temporary.exists() and is_being_written(temporary):
+            raise RecordingError(f"{path}: another process is writing it; expected a new file")
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             # Little cache: chunks are written whole and never looked at again.
@@ -128,7 +135,9 @@ class RecordingWriter:
                 file.swmr_mode = True
                 writer = cls(path, file, sensors, WriterLock(temporary))
                 writer._sync()
-                if renames:
+                if hidden:
+                    writer._hidden = temporary
+                elif renames:
                     temporary.rename(path)
                 sync_directory(path.parent)
             except BaseException:
@@ -189,12 +198,25 @@ class RecordingWriter:
             with self._guarded():
                 for sensor in self._sensors.values():
                     sensor.finish()
-            return self._commit(closed=True)
+            done = self._commit(closed=True)
+            if self._hidden is not None:
+                with _as_recording_error(self.path):
+                    self._file.close()
+                    _publish(self._hidden, self.path)
+                self._hidden = None
+            return done
         finally:
             self.abandon()
 
     def abandon(self) -> None:
         """Close the file without writing what waits; ``commit`` has what is safe."""
+        try:
+            self._close_file()
+        finally:
+            if self._hidden is not None:
+                self._hidden.unlink(missing_ok=True)
+
+    def _close_file(self) -> None:
         try:
             with contextlib.suppress(OSError, RuntimeError):
                 self._file.close()
@@ -251,6 +273,21 @@ def _as_recording_error(path: Path) -> Iterator[None]:
         system = re.search(r"error message = '([^']+)'", str(error))
         reason = system[1] if system else error
         raise RecordingError(f"{path}: cannot be written: {reason}") from error
+
+
+def _publish(temporary: Path, path: Path) -> None:
+    """Give a closed file its name, which nobody must have taken."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise RecordingError(f"{path}: exists already; expected a new file") from None
+    except OSError:  # a file system without hard links
+        if path.exists():
+            raise RecordingError(f"{path}: exists already; expected a new file") from None
+        temporary.rename(path)
+    else:
+        temporary.unlink()
+    sync_directory(path.parent)
 
 
 def _fixed(text: str, n_bytes: int) -> bytes:

@@ -33,11 +33,11 @@ from rich.table import Table
 
 from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
-from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.protocols.block import BlockFlag
 from daq.python_process import python_command
+from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
-from daq.recording.writer import RecordingWriter
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from sim_devices.world.world import World
@@ -197,34 +197,30 @@ def write_oracle(recording: Recording, truths: dict[str, Truth], path: Path) -> 
         )
         for record in recording.sensors
     ]
-    writer = RecordingWriter.create(
-        path, recording.bench, sensors=layouts, created=created, chunk_seconds=10.0
-    )
     # World time 0 by the earliest arrival: any constant would do.
     zero_ns = min(
         int(record.blocks["monotonic_ns"][0])
         - round(float(truths[record.name].at(np.array([0.0]))[0]) * 1e9)
         for record in recording.sensors
     )
-    for record in recording.sensors:
-        truth = truths[record.name]
-        pieces = ((run, at) for run in truth.runs for at in range(0, run.n_samples, PIECE))
-        for run, offset in pieces:
-            n = min(PIECE, run.n_samples - offset)
-            row, world = run.first_row + offset, run.world + offset
-            instants_ns = zero_ns + np.round(truth.times[world : world + n] * 1e9).astype(np.int64)
-            at = int(instants_ns[-1])
-            writer.append(
-                Block(
+    with ArrayWriter(path, recording.bench, sensors=layouts, created=created) as writer:
+        for record in recording.sensors:
+            truth = truths[record.name]
+            pieces = ((run, at) for run in truth.runs for at in range(0, run.n_samples, PIECE))
+            for run, offset in pieces:
+                n = min(PIECE, run.n_samples - offset)
+                row, world = run.first_row + offset, run.world + offset
+                instants_ns = np.round(truth.times[world : world + n] * 1e9).astype(np.int64)
+                instants_ns += zero_ns - created.monotonic_ns
+                writer.samples(
                     record.name,
-                    run.first_sample + offset,
                     record.counts(row, row + n),
-                    HostTime(at, created.utc_ns + at - created.monotonic_ns),
-                    flags=BlockFlag.NONE if offset else BlockFlag.CLOCK_RESTART,
+                    first_sample=run.first_sample + offset,
+                    block_rows=PIECE,
+                    received_ns=instants_ns[-1:],
                     instants_ns=instants_ns,
+                    restart=offset == 0,
                 )
-            )
-    writer.close()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ import numpy as np
 from daq.bench.model import Bench, Channel, Sensor
 from daq.drivers.bench_file import load
 from daq.drivers.registry import driver_type
-from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
+from daq.protocols.block import EventKind, HostTime
+from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.recording.writer import RecordingWriter
 from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.tables import SensorClock
@@ -22,7 +22,7 @@ from tui.output.console import for_people, progress, write_json
 from tui.simulation.devices import scenario_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -126,37 +126,29 @@ def write(
     """
     world = World(scenario)
     layouts = {sensor.name: _layout(sensor, scenario) for sensor in bench.sensors}
-    start = HostTime(time.monotonic_ns(), time.time_ns())
-    writer = RecordingWriter.create(
+    with ArrayWriter(
         out,
         bench,
         sensors=tuple(layouts.values()),
-        created=start,
+        created=HostTime(time.monotonic_ns(), time.time_ns()),
         attributes={"origin": SIMULATED},
         chunk_seconds=CHUNK_SECONDS,
-    )
-    try:
-        writer.event(Event("", EventKind.STARTED, "simulated", start))
+    ) as writer:
+        writer.event(EventKind.STARTED, "simulated")
         for first in np.arange(0.0, duration, CHUNK_SECONDS):
             last = min(first + CHUNK_SECONDS, duration)
             for layout in layouts.values():
-                rows = [round(at * layout.sampling_rate) for at in (first, last)]
-                for block in _blocks(world, layout, start=start, first=rows[0], last=rows[1]):
-                    writer.append(block)
+                begin, end = (round(at * layout.sampling_rate) for at in (first, last))
+                _write_samples(writer, world, layout, begin, end)
             if simulated is not None:
                 simulated(last)
-        writer.event(Event("", EventKind.STOPPED, "simulated", _after(start, duration)))
-        writer.close()
-    except BaseException:
-        writer.abandon()
-        out.unlink(missing_ok=True)
-        raise
+        writer.event(EventKind.STOPPED, "simulated", at_ns=round(duration * 1e9))
 
 
-def _blocks(
-    world: World, layout: SensorLayout, *, start: HostTime, first: int, last: int
-) -> Iterator[Block]:
-    """Simulate samples `first` to `last` of one sensor, as the blocks a driver would make."""
+def _write_samples(
+    writer: ArrayWriter, world: World, layout: SensorLayout, first: int, last: int
+) -> None:
+    """Write samples `first` to `last` of one sensor, in blocks as a driver would make them."""
     sensitivity = np.array([channel.sensitivity for channel in layout.channels])
     counts = world.samples(layout.name, first, last - first) * sensitivity
     if np.issubdtype(layout.dtype, np.integer):
@@ -164,15 +156,14 @@ def _blocks(
         counts = np.clip(np.rint(counts), limits.min, limits.max)
     instants = world.sample_times(layout.name, first, last - first)
     n_block = max(1, round(BLOCK_SECONDS * layout.sampling_rate))
-    for row in range(0, last - first, n_block):
-        part = counts[row : row + n_block]
-        yield Block(
-            sensor=layout.name,
-            first_sample=first + row,
-            counts=part.astype(layout.dtype),
-            received=_after(start, float(instants[row + len(part) - 1])),
-            flags=BlockFlag.NONE if first + row else BlockFlag.CLOCK_RESTART,
-        )
+    ends = [min(row + n_block, last - first) - 1 for row in range(0, last - first, n_block)]
+    writer.samples(
+        layout.name,
+        counts.astype(layout.dtype),
+        first_sample=first,
+        block_rows=n_block,
+        received_ns=[round(float(instants[end]) * 1e9) for end in ends],
+    )
 
 
 def _described(scenario: str) -> tuple[Bench, Scenario]:
@@ -243,8 +234,3 @@ def _layout(sensor: Sensor, scenario: Scenario) -> SensorLayout:
         driver=sensor.driver,
         port=sensor.port,
     )
-
-
-def _after(start: HostTime, seconds: float) -> HostTime:
-    elapsed = round(seconds * 1e9)
-    return HostTime(start.monotonic_ns + elapsed, start.utc_ns + elapsed)

@@ -13,15 +13,15 @@ import numpy as np
 from daq.bench.model import Channel
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.protocols.block import Block, BlockFlag, HostTime
+from daq.protocols.block import HostTime
+from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.recording.writer import RecordingWriter
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tui.studies.study import Curve, Panel, Point, Series, Study
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -101,50 +101,36 @@ def synthesise(
         )
         for name in scenario.names
     ]
-    writer = RecordingWriter.create(path, sensors=layouts, created=ORIGIN, chunk_seconds=10.0)
     rng = np.random.default_rng(seed)
     world = World(scenario)
-    for layout in layouts:
-        begin = scenario.sensors[layout.name].clock.offset
-        length = max(1, round(block * layout.sampling_rate))
-        n_blocks = int((duration - begin) * layout.sampling_rate) // length
-        ends = world.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
-        arrivals = latency.arrivals(ends, rng)
-        for each in _blocks(world, layout, length=length, arrivals=arrivals, instants=instants):
-            if utc and layout.name in utc:
-                taken = float(world.sample_times(layout.name, each.first_sample, 1)[0])
-                stated = ORIGIN.utc_ns + round((taken + utc[layout.name]) * 1e9)
-                writer.append(
-                    replace(each, flags=each.flags | BlockFlag.DEVICE_UTC, device_counter=stated)
+    with ArrayWriter(path, sensors=layouts, created=ORIGIN) as writer:
+        for layout in layouts:
+            begin = scenario.sensors[layout.name].clock.offset
+            length = max(1, round(block * layout.sampling_rate))
+            n_blocks = int((duration - begin) * layout.sampling_rate) // length
+            ends = world.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
+            arrivals_ns = _ns(latency.arrivals(ends, rng))
+            behind = (utc or {}).get(layout.name)
+            at_once = max(1, 20_000 // length)
+            for number in range(0, n_blocks, at_once):
+                received_ns = arrivals_ns[number : number + at_once]
+                first, n_samples = number * length, len(received_ns) * length
+                samples = world.samples(layout.name, first, n_samples)
+                times = world.sample_times(layout.name, first, n_samples)
+                writer.samples(
+                    layout.name,
+                    np.round(samples * SENSITIVITY).astype(np.int32),
+                    first_sample=first,
+                    block_rows=length,
+                    received_ns=received_ns,
+                    utc_ns=None if behind is None else _ns(times[::length] + behind),
+                    instants_ns=_ns(times) if instants else None,
                 )
-            else:
-                writer.append(each)
-    writer.close()
     return Path(path)
 
 
-def _blocks(
-    world: World, layout: SensorLayout, *, length: int, arrivals: FloatArray, instants: bool
-) -> Iterator[Block]:
-    """Yield the blocks of one sensor, each `length` samples, that arrive then (world seconds)."""
-    arrivals_ns = np.round(arrivals * 1e9).astype(np.int64).tolist()
-    at_once = max(1, 20_000 // length)
-    for first in range(0, len(arrivals_ns), at_once):
-        some = arrivals_ns[first : first + at_once]
-        samples = world.samples(layout.name, first * length, len(some) * length)
-        counts = np.round(samples * SENSITIVITY).astype(np.int32)
-        times = world.sample_times(layout.name, first * length, len(counts))
-        taken = ORIGIN.monotonic_ns + np.round(times * 1e9).astype(np.int64)
-        for number, arrival in enumerate(some):
-            rows = slice(number * length, (number + 1) * length)
-            yield Block(
-                layout.name,
-                (first + number) * length,
-                counts[rows],
-                HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
-                flags=BlockFlag.NONE if first + number else BlockFlag.CLOCK_RESTART,
-                instants_ns=taken[rows] if instants else None,
-            )
+def _ns(seconds: FloatArray) -> NDArray[np.int64]:
+    return np.round(seconds * 1e9).astype(np.int64)
 
 
 def free_running(

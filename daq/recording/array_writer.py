@@ -1,0 +1,165 @@
+"""Writes a recording from arrays of samples: imported, simulated, or computed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Self, TypeAlias
+
+import numpy as np
+
+from daq.protocols.block import Block, BlockFlag, Event, HostTime
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Bench
+    from daq.protocols.block import CountsArray, EventKind
+    from daq.recording.file_format import SensorLayout
+
+    Times: TypeAlias = Sequence[int] | NDArray[np.int64]
+
+BLOCK_ROWS = 4096
+"""Samples of a block, where the caller does not say: quickly read, and little is read twice."""
+CHUNK_SECONDS = 10.0
+_NS_PER_S = 1_000_000_000
+
+
+class ArrayWriter:
+    """Writes a recording from arrays; a context manager.
+
+    The recording appears under its name when the context ends without an exception; otherwise
+    nothing is left behind. Samples may be added in pieces of any length, so memory stays bounded.
+    All times are in ns after `created`.
+
+    Parameters
+    ----------
+    path : path
+        Must not exist; its directory is made.
+    bench : Bench, optional
+        What the recording says of the bench.
+    sensors : sequence of SensorLayout
+    created : HostTime
+        Start of the recording.
+    attributes : dict, optional
+        More attributes of the file, such as its origin.
+    chunk_seconds : float
+        Length of a chunk. Longer chunks are read faster.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        bench: Bench | None = None,
+        *,
+        sensors: Sequence[SensorLayout],
+        created: HostTime,
+        attributes: dict[str, str | float] | None = None,
+        chunk_seconds: float = CHUNK_SECONDS,
+    ) -> None:
+        self.created = created
+        self._rates = {sensor.name: sensor.sampling_rate for sensor in sensors}
+        self._writer = RecordingWriter.create(
+            path,
+            bench,
+            sensors=sensors,
+            created=created,
+            attributes=attributes,
+            chunk_seconds=chunk_seconds,
+            hidden=True,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._writer.close()
+        else:
+            self._writer.abandon()
+
+    def samples(
+        self,
+        sensor: str,
+        counts: CountsArray,
+        *,
+        first_sample: int = 0,
+        block_rows: int = BLOCK_ROWS,
+        received_ns: Times | None = None,
+        utc_ns: Times | None = None,
+        instants_ns: Times | None = None,
+        restart: bool | None = None,
+    ) -> None:
+        """Add consecutive samples of a sensor, cut into blocks.
+
+        Parameters
+        ----------
+        sensor : str
+        counts : ndarray, shape (n_samples, n_channels)
+            Of the dtype of the sensor's layout. Sliced block by block, so a lazily read array is
+            never in memory as a whole.
+        first_sample : int
+            Index of the first one, counted from the sensor's first sample of the recording.
+        block_rows : int
+            Samples of a block; the last block has what remains.
+        received_ns : int, shape (n_blocks,), optional
+            When each block was received. By default, one sampling interval after its last sample at
+            the nominal rate.
+        utc_ns : int, shape (n_blocks,), optional
+            Time of the first sample of each block, where the device itself states UTC.
+        instants_ns : int64, shape (n_samples,), optional
+            Time of each sample, where it is known.
+        restart : bool, optional
+            Whether the sampling clock starts anew here; by default, at sample 0 only.
+        """
+        rate, n_samples = self._rates[sensor], len(counts)
+        flags = BlockFlag.NONE if utc_ns is None else BlockFlag.DEVICE_UTC
+        for number, row in enumerate(range(0, n_samples, block_rows)):
+            end = min(row + block_rows, n_samples)
+            received = (
+                round((first_sample + end) * _NS_PER_S / rate)
+                if received_ns is None
+                else int(received_ns[number])
+            )
+            starts_anew = number == 0 and (first_sample == 0 if restart is None else restart)
+            self._writer.append(
+                Block(
+                    sensor=sensor,
+                    first_sample=first_sample + row,
+                    counts=counts[row:end],
+                    received=self._at(received),
+                    device_counter=(
+                        None if utc_ns is None else self.created.utc_ns + int(utc_ns[number])
+                    ),
+                    flags=flags | BlockFlag.CLOCK_RESTART if starts_anew else flags,
+                    instants_ns=(
+                        None
+                        if instants_ns is None
+                        else self.created.monotonic_ns + np.asarray(instants_ns[row:end])
+                    ),
+                )
+            )
+
+    def gap(self, sensor: str, first_sample: int, missing: int, *, reason: str) -> None:
+        """Record that samples from `first_sample` on are missing."""
+        self._writer.gap(sensor, first_sample, missing, reason=reason)
+
+    def event(self, kind: EventKind | str, text: str, *, at_ns: int = 0, sensor: str = "") -> None:
+        """Record an event."""
+        self._writer.event(Event(sensor, kind, text, self._at(at_ns)))
+
+    def _at(self, ns: int) -> HostTime:
+        return HostTime(self.created.monotonic_ns + ns, self.created.utc_ns + ns)

@@ -1,0 +1,134 @@
+"""Recordings made from arrays: complete under their name, or not there at all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel
+from daq.errors import RecordingError
+from daq.protocols.block import BlockFlag, EventKind, HostTime
+from daq.recording.array_writer import ArrayWriter
+from daq.recording.file_format import NO_COUNTER, SensorLayout
+from daq.recording.reader import Recording
+from daq.recording.repair import verify
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+CREATED = HostTime(5_000_000_000, 1_790_000_000_000_000_000)
+RATE = 100.0
+LAYOUT = SensorLayout(
+    "A", tuple(Channel(name=n, sensitivity=1.0) for n in "XY"), RATE, np.dtype(np.int32)
+)
+COUNTS = np.random.default_rng(1).integers(-(2**20), 2**20, (1000, 2), dtype=np.int32)
+
+
+def written(path: Path, *pieces: int, **options: Any) -> NDArray[np.void]:  # noqa: ANN401 - times
+    """Write `COUNTS` in pieces of so many samples; check the samples and return the blocks."""
+    with ArrayWriter(path, sensors=[LAYOUT], created=CREATED) as writer:
+        first = 0
+        for n_samples in pieces:
+            writer.samples("A", COUNTS[first : first + n_samples], first_sample=first, **options)
+            first += n_samples
+    report = verify(path)
+    assert report.closed
+    assert report.intact
+    with Recording.open(path) as recording:
+        sensor = recording.sensors[0]
+        np.testing.assert_array_equal(sensor.counts(), COUNTS)
+        return np.array(sensor.blocks)
+
+
+def test_pieces_of_any_length_make_the_same_recording(tmp_path: Path) -> None:
+    at_once = written(tmp_path / "1.h5", 1000, block_rows=50)
+    in_pieces = written(tmp_path / "2.h5", 50, 400, 550, block_rows=50)
+    np.testing.assert_array_equal(at_once, in_pieces)
+    assert len(at_once) == 20
+    assert written(tmp_path / "3.h5", 1000)["n_samples"].tolist() == [1000]
+    assert written(tmp_path / "4.h5", 990, 10, block_rows=300)["n_samples"].tolist() == [
+        *(300, 300, 300, 90),
+        10,
+    ]
+
+
+def test_blocks_are_received_at_the_nominal_rate_unless_times_are_given(tmp_path: Path) -> None:
+    blocks = written(tmp_path / "1.h5", 1000, block_rows=500)
+    assert (blocks["utc_ns"] - CREATED.utc_ns).tolist() == [5 * 10**9, 10 * 10**9]
+    assert (blocks["monotonic_ns"] - CREATED.monotonic_ns).tolist() == [5 * 10**9, 10 * 10**9]
+    assert blocks["flags"].tolist() == [BlockFlag.CLOCK_RESTART, 0]
+    assert blocks["device_counter"].tolist() == [NO_COUNTER, NO_COUNTER]
+    times = {"received_ns": [7, 8], "utc_ns": np.array([3, 4]), "instants_ns": np.arange(1000)}
+    blocks = written(tmp_path / "2.h5", 1000, block_rows=500, restart=False, **times)
+    assert (blocks["utc_ns"] - CREATED.utc_ns).tolist() == [7, 8]
+    assert (blocks["device_counter"] - CREATED.utc_ns).tolist() == [3, 4]
+    assert blocks["flags"].tolist() == [BlockFlag.DEVICE_UTC] * 2
+    with Recording.open(tmp_path / "2.h5") as recording:
+        instants = recording.sensors[0].instants_ns()
+    np.testing.assert_array_equal(instants - CREATED.monotonic_ns, np.arange(1000))
+
+
+def test_gaps_and_events_are_recorded(tmp_path: Path) -> None:
+    with ArrayWriter(tmp_path / "r.h5", sensors=[LAYOUT], created=CREATED) as writer:
+        writer.samples("A", COUNTS[:400])
+        writer.gap("A", 400, 100, reason="not in the file")
+        writer.samples("A", COUNTS[400:], first_sample=500, restart=True)
+        writer.event(EventKind.STOPPED, "the end", at_ns=11)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        (event,) = recording.events
+        assert (event.kind, event.text) == (EventKind.STOPPED, "the end")
+        assert event.received.utc_ns == CREATED.utc_ns + 11
+        (gap,) = recording.sensors[0].gaps
+        assert (gap["first_sample"], gap["missing"], gap["reason"]) == (
+            400,
+            100,
+            b"not in the file",
+        )
+        assert recording.sensors[0].blocks["first_sample"].tolist() == [0, 500]
+
+
+def test_a_recording_is_not_there_before_it_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    with ArrayWriter(path, sensors=[LAYOUT], created=CREATED) as writer:
+        writer.samples("A", COUNTS)
+        assert not path.exists()
+        with pytest.raises(RecordingError, match="another process is writing it"):
+            ArrayWriter(path, sensors=[LAYOUT], created=CREATED)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_an_error_leaves_nothing_behind(tmp_path: Path) -> None:
+    def fail() -> None:
+        with ArrayWriter(tmp_path / "r.h5", sensors=[LAYOUT], created=CREATED) as writer:
+            writer.samples("A", COUNTS)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_of_that_name_is_never_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+
+    def write() -> None:
+        with ArrayWriter(path, sensors=[LAYOUT], created=CREATED) as writer:
+            writer.samples("A", COUNTS)
+            path.write_bytes(b"made meanwhile")
+
+    with pytest.raises(RecordingError, match="exists already"):
+        write()
+    assert path.read_bytes() == b"made meanwhile"
+    with pytest.raises(RecordingError, match="exists already"):
+        ArrayWriter(path, sensors=[LAYOUT], created=CREATED)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_what_a_killed_process_left_does_not_stand_in_the_way(tmp_path: Path) -> None:
+    (tmp_path / ".r.h5.new").write_bytes(b"half of it")
+    written(tmp_path / "r.h5", 1000)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
