@@ -5,6 +5,7 @@ No clock and no event loop: the recorder calls it from its writing thread.
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -20,6 +21,15 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
     from daq.recording.writer import Committed, RecordingWriter
 
+_LOGGER = logging.getLogger(__name__)
+_ROUTINE = {
+    EventKind.STARTED,
+    EventKind.STOPPED,
+    EventKind.MARK,
+    EventKind.CONNECTED,
+    EventKind.STATUS,
+}
+"""Kinds of events that are logged as information; all others are warnings."""
 _SAY_INTERVAL_NS = 1_000_000_000
 MOST_ALIKE = 20
 """Events of one kind of one sensor that are written of each second."""
@@ -119,8 +129,8 @@ class BlockWriter:
                     self._gap(name, sensor, gap)
         for (name, kind), alike in self._alike.items():
             for event in alike.left_out(Event(name, kind, "", now)):
-                self._writer.event(event)
-        self._writer.event(Event("", EventKind.STOPPED, reason, now))
+                self._record(event)
+        self._record(Event("", EventKind.STOPPED, reason, now))
         return self._writer.close()
 
     def abandon(self) -> None:
@@ -146,7 +156,7 @@ class BlockWriter:
 
     def _event(self, event: Event) -> None:
         for said in self._alike[event.sensor, event.kind].take(event):
-            self._writer.event(said)
+            self._record(said)
 
     def _trouble(self, trouble: SensorLost) -> None:
         """Change a sensor's state. That it was late is recorded once it is lost, not before.
@@ -189,10 +199,23 @@ class BlockWriter:
         if at.monotonic_ns - sensor.said_ns >= _SAY_INTERVAL_NS:
             sensor.said_ns = at.monotonic_ns
             text = f"{sensor.repeated} samples so far came again and were recorded once"
-            self._writer.event(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
+            self._record(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
+
+    def _record(self, event: Event) -> None:
+        """Write an event to the recording and to the log."""
+        self._writer.event(event)
+        level = logging.INFO if event.kind in _ROUTINE else logging.WARNING
+        what = " ".join(part for part in (event.sensor, event.kind) if part)
+        fields = {"sensor": event.sensor, "kind": event.kind}
+        _LOGGER.log(level, "%s: %s", what, event.text, extra=fields)
 
     def _gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
         sensor.missing += gap.missing
+        _LOGGER.debug(
+            "%s gap: %d samples missing from %d on: %s",
+            *(name, gap.missing, gap.first_sample, gap.reason),
+            extra={"sensor": name, "first_sample": gap.first_sample, "missing": gap.missing},
+        )
         self._writer.gap(
             name, gap.first_sample, gap.missing, reason=gap.reason, estimated=gap.estimated
         )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
 import re
 import signal
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
     from daq.recording.writer import Committed
 
+_LOGGER = logging.getLogger(__name__)
 QUEUE_LENGTH = 4096
 COMMIT_INTERVAL, LEAST_COMMIT_INTERVAL = 0.5, 0.25
 """Between commits, s: the usual one, and the one where a whole chunk of samples waits for it."""
@@ -259,6 +261,7 @@ class _Recorder:
             attributes={} if duration is None else {"duration": duration},
         )
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
+        _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
         return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
 
     async def _write(

@@ -6,6 +6,7 @@ Each contiguous stretch is written as blocks that state the UTC of their first s
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from daq.formats.foreign_sensor import ForeignSensor
     from daq.formats.response import Responses
 
+_LOGGER = logging.getLogger(__name__)
 DELIMITED = frozenset({".csv", ".tsv", ".txt"})
 
 
@@ -112,10 +114,13 @@ def _read(sources: Sequence[Path], sampling_rate: float | None) -> list[ForeignS
             found += read_delimited(path, sampling_rate)
         else:
             waveforms.append(path)
+            continue
+        _LOGGER.info("%s read", path, extra={"file": str(path)})
     if waveforms:
         from daq.formats.miniseed import read_waveforms  # noqa: PLC0415 - ObsPy is an extra
 
         found += read_waveforms(waveforms)
+        _LOGGER.info("%d waveform files read", len(waveforms), extra={"files": len(waveforms)})
     return found
 
 

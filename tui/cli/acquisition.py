@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tui.cli.examples import examples
+from tui.cli.logging_options import with_log_file, with_logging
 from tui.cli.options import (
     BandOption,
     BenchArgument,
@@ -30,6 +31,7 @@ from tui.cli.options import (
 
 
 @examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
+@with_log_file
 def tui(
     source: Annotated[
         Path | None,
@@ -59,6 +61,7 @@ def tui(
     "huddle run lab.toml --until-cov 0.05 --band 1:20",
     "huddle run lab.toml -d 20min --json result.json --report result.pdf",
 )
+@with_logging
 def run(
     bench: BenchArgument,
     *,
@@ -118,6 +121,7 @@ def run(
 
 
 @examples("huddle record lab.toml --duration 3h --out night.h5")
+@with_logging
 def record(
     bench: BenchArgument,
     *,
@@ -132,6 +136,7 @@ def record(
 
 
 @examples("huddle watch night.h5", "huddle watch night.h5 --json -   (a line of JSON each update)")
+@with_logging
 def watch(file: FileArgument, *, method: MethodOption = None, json: JsonOption = None) -> None:
     """Look on while another process writes a recording."""
     from tui.commands.watch import watch_recording
@@ -140,6 +145,7 @@ def watch(file: FileArgument, *, method: MethodOption = None, json: JsonOption =
 
 
 @examples("huddle serve lab.toml", "huddle serve lab.toml --list")
+@with_logging
 def serve(
     bench: BenchArgument,
     *,

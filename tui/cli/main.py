@@ -19,7 +19,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-import traceback
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -45,6 +44,27 @@ _WRONG_USE = {"ScenarioError", "BandError"}
 class HuddleGroup(TyperGroup):
     """Runs a subcommand and turns what it raises into a message and an exit code."""
 
+    def main(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401 - the library's own
+        """Run the command; where standard error is no terminal, say usage errors line by line."""
+        if sys.stderr.isatty() or not options.get("standalone_mode", True):
+            return super().main(*args, **options)
+        try:
+            code = super().main(*args, **options | {"standalone_mode": False})
+        except typer.Abort:  # the end of standard input where an answer is expected
+            code = TROUBLE
+        except Exception as error:
+            if not hasattr(error, "format_message"):
+                raise
+            from tui.output.logs import report_failure  # noqa: PLC0415 - seldom needed
+
+            context = getattr(error, "ctx", None)
+            lines = [error.format_message()]
+            if context is not None:
+                lines.append(f"see {context.command_path} --help")
+            report_failure(lines, exit_code=USAGE)
+            code = USAGE
+        sys.exit(code)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - the context is the library's own
         """Run the subcommand."""
         try:
@@ -57,14 +77,15 @@ class HuddleGroup(TyperGroup):
         except Exception as error:
             if isinstance(error, (typer.Exit, typer.Abort)) or hasattr(error, "show"):
                 raise  # the library's own: usage errors show themselves
+            from tui.output.logs import COMMAND, report_failure  # noqa: PLC0415 - seldom needed
+
             code = exit_code(error)
+            lines = list(messages(error))
             if code is None:
-                traceback.print_exc()
-                typer.echo("huddle: this is a fault in huddle itself; please report it", err=True)
-                raise typer.Exit(TROUBLE) from None
-            with suppress(OSError):  # where that goes to a file, its disk may be full as well
-                for line in messages(error):
-                    typer.echo(f"huddle: {line}", err=True)
+                COMMAND.critical("unexpected error", exc_info=True)
+                code, lines = TROUBLE, ["this is an error in huddle itself; please report it"]
+            with suppress(OSError):  # standard error may be a file on a full disk
+                report_failure(lines, exit_code=code)
             raise typer.Exit(code) from None
 
 
@@ -155,6 +176,9 @@ def _options(
     ),
 ) -> None:
     del version
+    from tui.output.logs import configure  # noqa: PLC0415 - not for --help
+
+    configure()
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from tui.cli.examples import examples
+from tui.cli.logging_options import with_logging
 from tui.cli.options import (
     CsvOption,
     DiagnosticsOption,
@@ -83,6 +84,7 @@ def report(
     "huddle import samples.csv --bench lab.toml --out lab.h5",
     "huddle import arrays.npz --sampling-rate 200 --out lab.h5",
 )
+@with_logging
 def import_(
     sources: Annotated[
         list[Path],
@@ -134,6 +136,7 @@ def import_(
 
 
 @examples("huddle simulate lab.toml --duration 3h --out model.h5")
+@with_logging
 def simulate(
     scenario: Annotated[
         str,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tui.cli.examples import examples
+from tui.cli.logging_options import with_logging
 from tui.cli.options import BenchArgument, JsonOption, SpeedOption
 from tui.cli.options import duration as read_duration
 
@@ -69,6 +70,7 @@ def check(
     "huddle devices lab.toml --speed 10 -o simulated.toml   (and in another terminal:)",
     "huddle run simulated.toml --duration 10min",
 )
+@with_logging
 def devices(
     bench: BenchArgument,
     *,
@@ -111,6 +113,7 @@ def devices(
 
 
 @examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
+@with_logging
 def demo(
     *,
     duration: Annotated[

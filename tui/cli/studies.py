@@ -8,12 +8,14 @@ from typing import Annotated
 import typer
 
 from tui.cli.examples import examples
+from tui.cli.logging_options import with_logging
 from tui.cli.options import JsonOption
 
 DISAGREES = 1
 
 
 @examples("huddle reproduce fig4 fig9", "huddle reproduce all --out figures --json points.json")
+@with_logging
 def reproduce(
     studies: Annotated[
         list[str] | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
 import tempfile
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from estimator.self_noise.band_means import FloatArray
     from sim_devices.world.scenario import Scenario
 
+_LOGGER = logging.getLogger(__name__)
 METHODS = ("three-channel", "three-sensor")
 ALL_AT_ONCE = 2.773
 """Standard deviations within which nine errors lie together 95 times in 100 (Bonferroni)."""
@@ -98,7 +100,7 @@ def run_demo(
         snapshot = estimate([out], settings)
         if keep is not None:
             shutil.copyfile(out, keep)
-            notices().print(f"recording kept as {keep}")
+            _LOGGER.info("recording kept as %s", keep, extra={"recording": str(keep)})
     scenario = scenario_of(bench)
     compared = compare(snapshot, settings, scenario)
     screen = for_people(json)
@@ -128,7 +130,8 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
     """Record without a screen; return whether Ctrl-C ended it."""
     notices().print(
         "Three simulated accelerometers on their serial protocol, "
-        f"{format_duration(duration)} at {speed:g} × life, so {format_duration(duration / speed)}."
+        f"{format_duration(duration)} at {speed:g} times real time: it takes "
+        f"{format_duration(duration / speed)}."
     )
     recorder = RecorderProcess(path, out, duration=duration)
     try:

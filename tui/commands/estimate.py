@@ -8,7 +8,6 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.markup import escape
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
 from daq.bench.durations import format_duration, parse_duration
@@ -19,7 +18,7 @@ from daq.results.limits import exceeded
 from estimator.errors import EstimatorError
 from estimator.likelihood.factor_analysis import max_factors
 from estimator.spectra.windows import get_window
-from tui.output.console import check_places, for_people, notices, progress, write_json, write_text
+from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
 from tui.output.results import curves_csv, document, limit_line, remarks, result_table, result_title
 
@@ -54,9 +53,7 @@ def estimate_recordings(
     check_places(json, csv)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
     met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
-    notices().print(
-        f"[dim]for a report of it: huddle report {escape(str(files[0]))}", soft_wrap=True
-    )
+    hint(f"for a report of it: huddle report {files[0]}")
     if not met:
         raise typer.Exit(LIMIT_NOT_MET)
 

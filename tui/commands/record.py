@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import time
 from typing import TYPE_CHECKING
 
 from rich.live import Live
@@ -13,9 +16,14 @@ from tui.output.console import notices, write_json
 from tui.output.formatting import clock_time, roughly, several
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from daq.acquisition.recorder import Status
+
+_LOGGER = logging.getLogger(__name__)
+GAP_INTERVAL = 60.0
+"""Seconds at least between two log lines about gaps: a polled sensor may have many."""
 
 
 def record_bench(path: Path, *, duration: float | None, out: Path | None, json: str | None) -> None:
@@ -32,18 +40,49 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
     if out is None:
         out = recording_path(bench, SystemClock().now())
     screen = notices()
+    gaps = GapLog()
     if screen.is_terminal:
         with Live(console=screen, refresh_per_second=2, transient=True) as live:
-            status = run(
-                bench,
-                out,
-                duration=duration,
-                acknowledged=lambda now: live.update(progress_line(now, duration)),
-            )
+
+            def show(now: Status) -> None:
+                gaps.look(now)
+                live.update(progress_line(now, duration))
+
+            status = run(bench, out, duration=duration, acknowledged=show)
     else:
-        status = run(bench, out, duration=duration)
-    screen.print(f"{progress_line(status)}\n{out} closed", soft_wrap=True)
+        status = run(bench, out, duration=duration, acknowledged=gaps.look)
+    if status.closed:
+        _LOGGER.info("%s closed: %s", out, progress_line(status), extra={"recording": str(out)})
     write_json(json, status.to_dict())
+
+
+class GapLog:
+    """Logs how many samples are missing, when that has grown: once a minute at most.
+
+    Parameters
+    ----------
+    now : callable
+        Seconds on a clock that is never stepped.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._next = -math.inf
+        self._known: dict[str, int] = {}
+
+    def look(self, status: Status) -> None:
+        """Take the recorder's state."""
+        if self._now() < self._next and not status.closed:
+            return
+        for name, sensor in status.sensors.items():
+            if sensor.gaps > self._known.get(name, 0):
+                self._known[name] = sensor.gaps
+                self._next = self._now() + GAP_INTERVAL
+                _LOGGER.warning(
+                    "%s: %s so far, %d samples missing",
+                    *(name, several(sensor.gaps, "gap"), sensor.missing),
+                    extra={"sensor": name, "gaps": sensor.gaps, "missing": sensor.missing},
+                )
 
 
 def progress_line(status: Status, duration: float | None = None) -> str:

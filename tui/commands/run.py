@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.markup import escape
 from rich.progress import BarColumn, TextColumn
 
 from daq.acquisition.recorder import recording_path
@@ -25,7 +25,7 @@ from daq.results.store import store_results
 from estimator.errors import EstimatorError
 from tui.commands.estimate import LIMIT_NOT_MET, check_fit, chosen, show_result
 from tui.commands.report import checked, write_report
-from tui.output.console import check_places, for_people, notices, progress
+from tui.output.console import check_places, for_people, hint, progress
 from tui.output.formatting import clock_time, time_left
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
 
+_LOGGER = logging.getLogger(__name__)
 INTERRUPTED = 130
 
 
@@ -80,7 +81,7 @@ def run_test(
     recorder = RecorderProcess(path, out, duration=duration)
     try:
         recorder.wait_for_file()
-        notices().print(f"recording to {out}; Ctrl-C stops and shows the result")
+        hint("Ctrl-C stops the recording and shows the result")
         with defer_interrupt(recorder.request_stop) as interruption:
             snapshot = result_of(recorder, settings, duration=duration, until_cov=until_cov)
             met = show_result(
@@ -104,9 +105,7 @@ def run_test(
     finally:
         recorder.close()
     if report is None:
-        notices().print(
-            f"[dim]for a report of it: huddle report {escape(str(out))}", soft_wrap=True
-        )
+        hint(f"for a report of it: huddle report {out}")
     if interruption.pressed:
         raise typer.Exit(INTERRUPTED)
     if not met:
@@ -141,11 +140,11 @@ def result_of(
             recorder.check()  # its error says more than one that follows from it
             raise
     if snapshot is None:
-        notices().print("[red]the recorder ended without closing its recording")
+        _LOGGER.error("%s: the recorder ended without closing it", recorder.out)
         try:
             heal(recorder.out)
         except HuddleError as error:  # a full disk; the file can be read all the same
-            notices().print(f"[red]{error}")
+            _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
         snapshot = estimate([recorder.out], settings)
     recorder.wait()
     return snapshot

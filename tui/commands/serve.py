@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import signal
 import sys
 from itertools import islice
@@ -15,15 +16,20 @@ from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, HuddleError, RecordingError
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
-from tui.output.console import for_people, notices, write_json
+from tui.output import logs
+from tui.output.console import for_people, write_json
+from tui.runs.child_log import ChildLog
 
 if TYPE_CHECKING:
+    from asyncio.subprocess import Process
     from datetime import datetime
     from pathlib import Path
 
     from daq.acquisition.schedule import RunNotice
     from daq.bench.model import Bench
 
+_LOGGER = logging.getLogger(__name__)
+_LEVELS = {"failed": logging.ERROR, "missed": logging.WARNING, "refused": logging.WARNING}
 SHOWN = 5
 
 
@@ -80,9 +86,13 @@ def _remove_old(bench: Bench) -> None:
     directory, retention = bench.recording_directory, bench.recording.retention
     try:
         for old in remove_old(directory, retention, bench=bench.name):
-            notices().print(f"{old} removed: older than the bench file keeps", soft_wrap=True)
+            _LOGGER.info(
+                "%s removed: older than the bench file's retention",
+                old,
+                extra={"recording": str(old)},
+            )
     except RecordingError as error:
-        notices().print(str(error), soft_wrap=True)
+        _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 
 
 async def run_once(path: Path, bench: Bench, stop: asyncio.Event) -> None:
@@ -97,23 +107,37 @@ async def run_once(path: Path, bench: Bench, stop: asyncio.Event) -> None:
     process = await asyncio.create_subprocess_exec(
         *python_command("tui", "run", str(path)),
         *("--out", str(out), "--json", str(out.with_suffix(".json"))),
+        *logs.arguments_for_child(),
         stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,  # the result is in the recording and the JSON file
         stderr=asyncio.subprocess.PIPE,
         start_new_session=sys.platform != "win32",
     )
+    log = ChildLog("the run")
     stopping = asyncio.create_task(stop.wait())
-    done = asyncio.create_task(process.communicate())
+    done = asyncio.create_task(_follow(process, log))
     await asyncio.wait({stopping, done}, return_when=asyncio.FIRST_COMPLETED)
     stopping.cancel()
     if not done.done():
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGINT)
-    _, said = await done
+    await done
     if process.returncode not in {0, 1, 130}:
-        lines = said.decode(errors="replace").strip().splitlines()
-        raise RunFailedError("; ".join(line.removeprefix("huddle: ") for line in lines[-5:]))
+        said = "; ".join(log.errors) or f"huddle run ended with exit code {process.returncode}"
+        raise RunFailedError(said)
+
+
+async def _follow(process: Process, log: ChildLog) -> None:
+    """Take what a run writes to standard error, until it has ended."""
+    while process.stderr is not None and (content := await process.stderr.read(1 << 16)):
+        log.feed(content)
+    await process.wait()
 
 
 def _tell(notice: RunNotice) -> None:
-    text = f": {notice.text}" if notice.text else ""
-    notices().print(f"{notice.due:%Y-%m-%d %H:%M %Z}  {notice.kind}{text}", soft_wrap=True)
+    _LOGGER.log(
+        _LEVELS.get(notice.kind, logging.INFO),
+        "run due %s %s%s",
+        *(f"{notice.due:%Y-%m-%d %H:%M %Z}", notice.kind, notice.text and f": {notice.text}"),
+        extra={"due": notice.due.isoformat(), "run": notice.kind},
+    )

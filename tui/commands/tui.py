@@ -21,6 +21,7 @@ from daq.results.store import store_results
 from tui.application.app import HuddleApp
 from tui.commands.estimate import chosen
 from tui.output.console import notices
+from tui.output.logs import screen_taken
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
 
@@ -195,7 +196,8 @@ def _run(app: HuddleApp, *, again: Path) -> None:
             "the application needs a terminal; huddle watch RECORDING and huddle run BENCH do"
             " without"
         )
-    app.run()
+    with screen_taken():
+        app.run()
     if app.path is None:
         return
     if app.recording:
@@ -219,7 +221,8 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     # The demo's recording goes when the demo ends; what has been asked for stays.
     controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
-        HuddleApp(controls, start=True).run()
+        with screen_taken():
+            HuddleApp(controls, start=True).run()
         for recorder in controls.started:
             recorder.stop()
     finally:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 STANDARD_OUTPUT = "-"
 WIDTH_OF_FILES = 110
 """Columns of tables that go into a file or a pipe."""
+_for_json = False
 
 
 def console() -> Console:
@@ -28,8 +29,21 @@ def console() -> Console:
 
 @cache
 def notices() -> Console:
-    """Return standard error, where progress and remarks go."""
-    return Console(stderr=True, highlight=False, width=_width(sys.stderr))
+    """Return standard error, where progress and remarks go; nowhere if it carries JSON."""
+    return Console(stderr=True, highlight=False, width=_width(sys.stderr), quiet=_for_json)
+
+
+def reserve_standard_error(*, for_json: bool) -> None:
+    """Leave standard error to log lines in JSON: no remark, table or progress bar goes there."""
+    global _for_json  # noqa: PLW0603 - there is one standard error
+    _for_json = for_json
+    notices.cache_clear()
+
+
+def hint(text: str) -> None:
+    """Tell a person at the terminal what to do next; files and pipes get no hints."""
+    if notices().is_terminal:
+        notices().print(text, style="dim", markup=False, soft_wrap=True)
 
 
 def _width(stream: TextIO) -> int | None:
@@ -44,7 +58,7 @@ def progress(*columns: str | ProgressColumn) -> Progress:
         console=screen,
         refresh_per_second=2,
         transient=True,
-        disable=not screen.is_terminal,
+        disable=screen.quiet or not screen.is_terminal,
     )
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tui.output.console import notices
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType
+
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -36,7 +38,7 @@ def defer_interrupt(stop: Callable[[], None]) -> Iterator[Interruption]:
     def note(_number: int, _frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
         found.pressed = True
-        notices().print("stopping; the result follows. Press Ctrl-C again to end without it")
+        _LOGGER.warning("stopping; the result follows. Press Ctrl-C again to end without it")
         stop()
 
     signal.signal(signal.SIGINT, note)

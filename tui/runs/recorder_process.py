@@ -1,27 +1,32 @@
 """The recorder as a process of its own: start it, reach it, and know how it ended.
 
-It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. What
-it says on standard error goes to a file without a name, which outlives us too.
+It runs in its own session, so that neither Ctrl-C nor the end of whoever started it stops it. Its
+standard error is a file without a name: unlike a pipe, that never makes it wait, and it outlives
+us. The recorder logs JSON there; a thread reads it and logs each record here as well.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from daq.errors import HuddleError, RecordingError
 from daq.python_process import python_command
 from daq.recording.control import ask
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from tui.output import logs
+from tui.runs.child_log import ChildLog
 
 POLL = 0.05
+LOG_POLL = 0.25
+"""Seconds between two looks at what the recorder logged."""
 STOP_TIMEOUT = 30.0
 
 
@@ -54,21 +59,28 @@ class RecorderProcess:
         if out.exists():
             raise RecordingError(f"{out}: exists already; expected a new file")
         self.out = out
-        self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
         arguments = python_command("tui", "record", str(bench_path), "--out", str(out))
+        arguments += logs.arguments_for_child()
         if duration is not None:
             arguments += ["--duration", repr(duration)]
-        self._process = subprocess.Popen(
-            arguments,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._said,
-            **_own_session(),
-        )
+        descriptor, name = tempfile.mkstemp(prefix="huddle-recorder-", suffix=".log")
+        try:
+            self._process = subprocess.Popen(
+                arguments,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=descriptor,
+                **_own_session(),
+            )
+            self._log = _LogFollower(Path(name))
+        finally:
+            os.close(descriptor)
+            with suppress(OSError):  # Windows keeps it while it is open
+                Path(name).unlink()
 
     def close(self) -> None:
         """Forget the process; it goes on."""
-        self._said.close()
+        self._log.close()
         self._process.returncode = self._process.poll() or 0  # it may outlive us: that is meant
 
     @property
@@ -106,9 +118,7 @@ class RecorderProcess:
         code = self._process.poll()
         if code in {None, 0}:
             return
-        self._said.seek(0)
-        lines = [line.removeprefix("huddle: ").rstrip() for line in self._said]
-        said = "\n".join(line for line in lines if line) or self._how_it_ended(code)
+        said = "\n".join(self._log.errors()) or self._how_it_ended(code)
         raise RecorderFailedError(said, code if code in {2, 3} else 3)
 
     def _how_it_ended(self, code: int) -> str:
@@ -156,6 +166,44 @@ class RecorderProcess:
         if not self.ends_within(timeout):
             self._process.kill()
             self._process.wait()
+
+
+class _LogFollower:
+    """Follows the file that is a recorder's standard error, in a thread.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb", buffering=0)
+        self._log = ChildLog("the recorder")
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="recorder log", daemon=True)
+        self._thread.start()
+
+    def errors(self) -> list[str]:
+        """Return why the recorder failed, as far as it said."""
+        self._read()
+        return self._log.errors
+
+    def close(self) -> None:
+        """Read what is left, and stop."""
+        self._closed.set()
+        self._thread.join()
+        self._read()
+        self._file.close()
+
+    def _follow(self) -> None:
+        while not self._closed.wait(LOG_POLL):
+            self._read()
+
+    def _read(self) -> None:
+        with self._lock:
+            while found := self._file.read(1 << 16):
+                self._log.feed(found)
 
 
 def _own_session() -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 import time
@@ -18,7 +19,7 @@ from sim_devices.faults import check
 from sim_devices.faults import parse as parse_faults
 from sim_devices.server.launch import start
 from sim_devices.world.scenario import Scenario
-from tui.output.console import console, notices, write_json
+from tui.output.console import console, hint, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from sim_devices.server.launch import RunningDevice
 
+_LOGGER = logging.getLogger(__name__)
 HEAD_START_NS = 200_000_000
 """World time 0 lies this far ahead, so that every process is there when it begins."""
 
@@ -220,10 +222,14 @@ def serve_devices(
             json,
             {"speed": speed, "ports": {sensor.name: sensor.port for sensor in reachable.sensors}},
         )
-        notices().print(
-            f"{len(bench.sensors)} sensors served at {speed:g} × life"
-            + (f"; huddle run {out} connects to them" if out else "")
-            + ". Ctrl-C ends it."
-        )
+        for sensor in reachable.sensors:
+            _LOGGER.info(
+                "%s served at %s",
+                *(sensor.name, sensor.port),
+                extra={"sensor": sensor.name, "port": sensor.port, "speed": speed},
+            )
+        _LOGGER.info("%d sensors served at %g times real time", len(bench.sensors), speed)
+        if out is not None:
+            hint(f"huddle run {out} connects to them; Ctrl-C ends them")
         while True:
             time.sleep(3600)
