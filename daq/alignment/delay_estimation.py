@@ -25,10 +25,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.fft
 
 from daq.alignment.resampling import USABLE
 
@@ -209,7 +209,7 @@ class DelayEstimator:
         frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
         frames -= frames.mean(axis=-1, keepdims=True)
         frames *= self.window
-        spectra = scipy.fft.rfft(frames, axis=-1, overwrite_x=True)[:, :, 1 : len(self.omega) + 1]
+        spectra = np.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1]
         return np.ascontiguousarray(spectra.transpose(2, 0, 1))
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
@@ -290,11 +290,19 @@ class DelayEstimator:
 
         A fraction of a period of the highest frequency; τ = 0 is in the middle of the row.
         """
-        n = scipy.fft.next_fast_len(4 * len(self.window), real=True)
+        n = _fast_length(4 * len(self.window))
         padded = np.zeros((crossed.shape[1], n // 2 + 1), dtype=np.complex128)
         padded[:, 1 : len(crossed) + 1] = crossed.T
-        height = scipy.fft.fftshift(scipy.fft.irfft(padded, n=n, axis=-1), axes=-1)
+        height = np.fft.fftshift(np.fft.irfft(padded, n=n, axis=-1), axes=-1)
         return height, float(2 * np.pi / self.omega[0] / n)
+
+
+@cache
+def _fast_length(n: int) -> int:
+    """Return the least length from `n` whose prime factors are 2, 3 and 5: fast to transform."""
+    while n != math.gcd(n, 2**64 * 3**40 * 5**28):
+        n += 1
+    return n
 
 
 def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:

@@ -23,7 +23,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.fft
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -153,18 +152,18 @@ def _by_spans(
     offsets = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)
     # Output k of a span lies between rows base + k and base + k + 1. (n_spans, n_delays, taps)
     taps = _kernel(offsets - (((middle - base)[:, None] + nodes)[:, :, None]))
-    responses = scipy.fft.rfft(taps[:, :, ::-1], n=_FFT_LENGTH, axis=-1)
+    responses = np.fft.rfft(taps[:, :, ::-1], n=_FFT_LENGTH, axis=-1)
     start = base + offsets[0]
     low = int(start.min())
     inputs = _padded(samples, low, int(start.max()) + _FFT_LENGTH)
     windows = np.lib.stride_tricks.sliding_window_view(inputs, _FFT_LENGTH, axis=0)
-    spectra = scipy.fft.rfft(windows[start - low], axis=-1)  # (n_spans, n_channels, n_freqs)
+    spectra = np.fft.rfft(windows[start - low], axis=-1)  # (n_spans, n_channels, n_freqs)
     steps = np.zeros((n_spans, SPAN))
     steps.reshape(-1)[: len(positions)] = positions
     steps -= np.arange(SPAN) + middle[:, None]
     result = np.zeros((n_spans, n_channels, SPAN))
     for delay in range(nodes.shape[1]):
-        filtered = scipy.fft.irfft(spectra * responses[:, None, delay], axis=-1)
+        filtered = np.fft.irfft(spectra * responses[:, None, delay], axis=-1)
         valid = filtered[:, :, len(offsets) - 1 : len(offsets) - 1 + SPAN]
         result += valid * _lagrange(steps, nodes, delay)[:, None, :]
     return result.transpose(0, 2, 1).reshape(-1, n_channels)[: len(positions)]
