@@ -14,7 +14,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from estimator.errors import InvalidMatrixError
 from estimator.self_noise.coherency import check_averages
@@ -159,6 +158,8 @@ def interval(
         upper end grows with c and no longer with its exponential, so that it stays finite
         when the estimate stands at zero.
     """
+    from scipy import special  # noqa: PLC0415 - takes a quarter of a second to import
+
     z = float(special.ndtri((1 + level) / 2))
     positive = np.where(noise_psd > 0, noise_psd, 1.0)
     c = np.where(noise_psd > 0, standard_error / positive, np.inf)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
+from estimator.likelihood.chi_square import digamma, upper_tail
 from estimator.self_noise.coherency import check_averages
 from estimator.spectra.windows import get_window
 
@@ -117,12 +117,12 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
         raise InsufficientDataError(
             f"{n_effective:.1f} averages of {p} channels: more averages than channels are needed"
         )
-    logs = special.digamma(averages - np.arange(order)).sum() - order * np.log(averages)
+    logs = sum(digamma(averages - i) for i in range(order)) - order * np.log(averages)
     estimated = _estimated_parameters(maximum)
     degrees = order**2 - estimated
     mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
     statistic = 2 * averages * maximum.discrepancy * degrees / mean
-    return ModelTest(statistic, degrees, np.asarray(special.chdtrc(degrees, statistic)))
+    return ModelTest(statistic, degrees, upper_tail(degrees, statistic))
 
 
 def _estimated_parameters(maximum: Maximum) -> FloatArray:
@@ -208,7 +208,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
         return BandTest(total, degrees, float("nan"), count)
     pairs = np.array([np.sum(taken[h:] & taken[:-h]) for h in range(1, len(r) + 1)])
     spread = 1 + 2 * float(pairs @ r**2) / count
-    p_value = float(special.chdtrc(degrees / spread, total / spread))
+    p_value = float(upper_tail(degrees / spread, total / spread))
     return BandTest(total, degrees, p_value, count)
 
 
