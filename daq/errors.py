@@ -28,7 +28,12 @@ class NoAnswerError(DeviceError, TimeoutError):
 
 
 class WrongDeviceError(DeviceError, ValueError):
-    """Something answers, but it is not the device the bench file names."""
+    """Something answers, but it is not the device that the bench file names."""
+
+    def __init__(self, message: str, *, found: object = None) -> None:
+        super().__init__(message)
+        self.found = found
+        """What was found instead, such as a serial number, to tell wrong devices apart."""
 
 
 class RecordingError(HuddleError, OSError):

@@ -45,7 +45,7 @@ class BlockValidator:
         self._dtypes = {sensor.name: driver.counts_dtype(sensor) for sensor in sensors}
         self._polled: dict[str, bool] = {}
 
-    def check(self, item: object) -> Block | Event:
+    def validated(self, item: object) -> Block | Event:
         """Return it, if it is as it should be.
 
         Raises

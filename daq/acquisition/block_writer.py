@@ -1,6 +1,6 @@
-"""From what ports hand over to rows of a recording: places blocks, writes gaps and events.
+"""Writes the items of all connections into the recording: places blocks, adds gaps and events.
 
-No clock and no event loop: the recorder calls it from its writing thread.
+Has no clock and no event loop; the recorder calls it from its writing thread.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from daq.acquisition.connection import SensorLost
+from daq.acquisition.connection import SensorLate, SensorLost
 from daq.acquisition.sample_index import Gap, SampleIndexer
 from daq.protocols.block import Block, Event, EventKind
+from daq.recording.sensor_state import SensorState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -30,175 +31,181 @@ _ROUTINE = {
     EventKind.STATUS,
 }
 """Kinds of events that are logged as information; all others are warnings."""
-_SAY_INTERVAL_NS = 1_000_000_000
-MOST_ALIKE = 20
-"""Events of one kind of one sensor that are written of each second."""
+_REPORT_INTERVAL_NS = 1_000_000_000
+MAX_EVENTS_PER_SECOND = 20
+"""Events of one kind of one sensor that are written in each second."""
 
 
 @dataclass(frozen=True, slots=True)
-class SensorStatus:
-    """How one sensor is doing."""
+class SensorProgress:
+    """How much of one sensor is recorded, and its state."""
 
-    state: str
-    """``waiting`` for its first block, ``recording``, ``late`` with the next, or ``lost``."""
+    state: SensorState
     samples: int
     """Safe on disk."""
     gaps: int
     missing: int
-    """Samples that were not received, as far as is known."""
+    """Samples that were not received, as far as known."""
 
 
 class _Sensor:
     def __init__(self, sampling_rate: float) -> None:
         self.rate = sampling_rate
-        self.continuity = SampleIndexer(sampling_rate)
-        self.state = "waiting"
-        self.late: Event | None = None  # to be written if nothing comes after all
-        self.missing = 0
-        self.repeated = 0
-        self.said_ns = -_SAY_INTERVAL_NS
+        self.indexer = SampleIndexer(sampling_rate)
+        self.state = SensorState.WAITING
+        self.late_event: Event | None = None  # written only if the sensor is lost afterwards
+        self.n_missing = 0
+        self.n_repeated = 0
+        self.repeats_reported_ns = -_REPORT_INTERVAL_NS
 
 
-class _Alike:
-    """Events of one kind of one sensor: a line full of noise must not fill the file."""
+class _RateLimit:
+    """Limits events of one kind of one sensor: noise on a line must not fill the file."""
 
     def __init__(self) -> None:
-        self._since_ns = -_SAY_INTERVAL_NS
+        self._since_ns = -_REPORT_INTERVAL_NS
         self._n = 0
 
-    def take(self, event: Event) -> Iterator[Event]:
-        """Yield what is to be written."""
-        if event.kind == "mark":  # a person's words
+    def passed(self, event: Event) -> Iterator[Event]:
+        """Yield the events to be written now: this one, and how many were left out before."""
+        if event.kind == EventKind.MARK:  # a person's words are never left out
             yield event
             return
         now_ns = event.received.monotonic_ns
-        if now_ns - self._since_ns >= _SAY_INTERVAL_NS:
+        if now_ns - self._since_ns >= _REPORT_INTERVAL_NS:
             yield from self.left_out(event)
             self._since_ns, self._n = now_ns, 0
         self._n += 1
-        if self._n <= MOST_ALIKE:
+        if self._n <= MAX_EVENTS_PER_SECOND:
             yield event
 
     def left_out(self, event: Event) -> Iterator[Event]:
-        """Yield how many were left out, as an event like this one."""
-        if self._n > MOST_ALIKE:
-            yield replace(event, text=f"{self._n - MOST_ALIKE} more of these before")
+        """Yield an event like this one that says how many were left out, if any were."""
+        n = self._n - MAX_EVENTS_PER_SECOND
+        if n > 0:
+            yield replace(event, text=f"{n} more events of this kind before")
 
 
 class BlockWriter:
-    """The one who writes a recording's rows."""
+    """Writes the rows of a recording."""
 
     def __init__(self, writer: RecordingWriter, sampling_rates: Mapping[str, float]) -> None:
         self._writer = writer
         self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
-        self._alike: defaultdict[tuple[str, str], _Alike] = defaultdict(_Alike)
+        self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
 
-    def take(self, items: Iterable[Item]) -> None:
-        """Write what came, in order.
+    def write(self, items: Iterable[Item]) -> None:
+        """Write items in order.
 
         Raises
         ------
         RecordingError
-            If it cannot be written.
+            If the file cannot be written.
         """
         for item in items:
             if isinstance(item, Block):
-                self._block(item)
+                self._write_block(item)
             elif isinstance(item, Event):
-                self._event(item)
+                self._write_event(item)
+            elif isinstance(item, SensorLate):
+                self._set_late(item)
             elif isinstance(item, SensorLost):
-                self._trouble(item)
+                self._set_lost(item)
             else:
-                self._connected(item)
+                self._begin_session(item)
 
     @property
     def n_written(self) -> int:
-        """Rows of samples in the file, of all sensors: what a commit now would make safe."""
+        """Rows of samples of all sensors in the file: those that a commit now would make safe."""
         return self._writer.n_written
 
     def commit(self) -> Committed:
-        """Make it safe."""
+        """Make what was written safe."""
         return self._writer.commit()
 
     def close(self, now: HostTime, reason: str) -> Committed:
-        """Record what is missing of lost sensors, say why the run ended, and close the file."""
+        """Record the last gap of lost sensors and why the run ended, and close the file."""
         for name, sensor in self._sensors.items():
-            if sensor.state == "lost":
-                gap = sensor.continuity.lost_until(now, "lost at the end")
+            if sensor.state.is_lost or sensor.state is SensorState.WAITING:
+                gap = sensor.indexer.lost_until(now, "lost at the end")
                 if gap is not None:
-                    self._gap(name, sensor, gap)
-        for (name, kind), alike in self._alike.items():
-            for event in alike.left_out(Event(name, kind, "", now)):
+                    self._write_gap(name, sensor, gap)
+            if not sensor.state.is_lost:
+                sensor.state = SensorState.ENDED
+        for (name, kind), limit in self._limits.items():
+            for event in limit.left_out(Event(name, kind, "", now)):
                 self._record(event)
         self._record(Event("", EventKind.STOPPED, reason, now))
         return self._writer.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the file without writing anything more."""
         self._writer.abandon()
 
-    def status(self, committed: Committed) -> dict[str, SensorStatus]:
-        """Return how the sensors are doing."""
+    def progress(self, committed: Committed) -> dict[str, SensorProgress]:
+        """Return the progress of each sensor."""
         return {
-            name: SensorStatus(
-                self._sensors[name].state, counts.rows, counts.gaps, self._sensors[name].missing
+            name: SensorProgress(
+                self._sensors[name].state, counts.rows, counts.gaps, self._sensors[name].n_missing
             )
             for name, counts in committed.sensors.items()
         }
 
-    def recorded(self) -> float:
-        """Return how much of the sensor that has least is recorded, gaps included, in s."""
-        return min(s.continuity.next_sample / s.rate for s in self._sensors.values())
-
-    def states(self) -> dict[str, str]:
-        """Return how the sensors are doing, in a word."""
+    def states(self) -> dict[str, SensorState]:
+        """Return the state of each sensor."""
         return {name: sensor.state for name, sensor in self._sensors.items()}
 
-    def _event(self, event: Event) -> None:
-        for said in self._alike[event.sensor, event.kind].take(event):
-            self._record(said)
+    def recorded_seconds(self) -> float:
+        """Return the recorded length, gaps included, of the sensor that has least."""
+        return min(s.indexer.next_sample / s.rate for s in self._sensors.values())
 
-    def _trouble(self, trouble: SensorLost) -> None:
-        """Change a sensor's state. That it was late is recorded once it is lost, not before.
+    def _write_event(self, event: Event) -> None:
+        for passed in self._limits[event.sensor, event.kind].passed(event):
+            self._record(passed)
 
-        A line that is a little late now and then would fill the file with it.
+    def _set_late(self, item: SensorLate) -> None:
+        """Keep the event of a late sensor until it is lost.
+
+        Blocks that are a little late now and then would fill the file with events.
         """
-        sensor = self._sensors[trouble.event.sensor]
-        if trouble.state == "late":
-            if sensor.state == "recording":
-                sensor.state, sensor.late = "late", trouble.event
-            return
-        if sensor.late is not None:
-            self._event(sensor.late)
-        sensor.state, sensor.late = "lost", None
-        self._event(trouble.event)
+        sensor = self._sensors[item.event.sensor]
+        if sensor.state is SensorState.LIVE:
+            sensor.state, sensor.late_event = SensorState.LATE, item.event
 
-    def _connected(self, item: Connected) -> None:
+    def _set_lost(self, item: SensorLost) -> None:
+        sensor = self._sensors[item.event.sensor]
+        if sensor.late_event is not None:
+            self._write_event(sensor.late_event)
+        sensor.state, sensor.late_event = item.state, None
+        self._write_event(item.event)
+
+    def _begin_session(self, item: Connected) -> None:
         for name in item.sensors if item.reason else ():
-            continuity = self._sensors[name].continuity
+            sensor = self._sensors[name]
+            sensor.state = SensorState.WAITING
             if item.resumed:
-                continuity.resume(item.reason)
+                sensor.indexer.resume(item.reason)
             else:
-                continuity.new_session(item.reason)
+                sensor.indexer.new_session(item.reason)
 
-    def _block(self, block: Block) -> None:
+    def _write_block(self, block: Block) -> None:
         sensor = self._sensors[block.sensor]
-        placed = sensor.continuity.place(block)
+        placed = sensor.indexer.place(block)
         if placed.repeated:
-            sensor.repeated += placed.repeated
-            self._say_repeated(sensor, block)
+            sensor.n_repeated += placed.repeated
+            self._report_repeated(sensor, block)
         if placed.gap is not None:
-            self._gap(block.sensor, sensor, placed.gap)
+            self._write_gap(block.sensor, sensor, placed.gap)
         if placed.block is not None:
-            sensor.state, sensor.late = "recording", None
+            sensor.state, sensor.late_event = SensorState.LIVE, None
             self._writer.append(placed.block)
 
-    def _say_repeated(self, sensor: _Sensor, block: Block) -> None:
-        """Say it at most once a second: a line may repeat everything, for weeks."""
+    def _report_repeated(self, sensor: _Sensor, block: Block) -> None:
+        """Report at most once a second: a device may repeat everything, for weeks."""
         at = block.received
-        if at.monotonic_ns - sensor.said_ns >= _SAY_INTERVAL_NS:
-            sensor.said_ns = at.monotonic_ns
-            text = f"{sensor.repeated} samples so far came again and were recorded once"
+        if at.monotonic_ns - sensor.repeats_reported_ns >= _REPORT_INTERVAL_NS:
+            sensor.repeats_reported_ns = at.monotonic_ns
+            text = f"{sensor.n_repeated} samples so far arrived twice and were recorded once"
             self._record(Event(block.sensor, EventKind.RESYNCHRONISED, text, at))
 
     def _record(self, event: Event) -> None:
@@ -209,8 +216,8 @@ class BlockWriter:
         fields = {"sensor": event.sensor, "kind": event.kind}
         _LOGGER.log(level, "%s: %s", what, event.text, extra=fields)
 
-    def _gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
-        sensor.missing += gap.missing
+    def _write_gap(self, name: str, sensor: _Sensor, gap: Gap) -> None:
+        sensor.n_missing += gap.missing
         _LOGGER.debug(
             "%s gap: %d samples missing from %d on: %s",
             *(name, gap.missing, gap.first_sample, gap.reason),

@@ -1,9 +1,9 @@
-"""One port's device, kept connected for as long as a run lasts.
+"""Keeps the device on one port connected until the run ends.
 
-Connects, reads, and hands on; when a block is late says so (:mod:`daq.acquisition.stall_detector`),
-when the device is lost or stalls says that, and tries again with back-off. What it hands on is
-checked (:mod:`daq.acquisition.block_checks`), and in its sessions' own indices
-(:mod:`daq.acquisition.sample_index` places it).
+Connects, reads, and passes on what the driver yields. Reports a sensor whose block is late, and one
+that is lost; after a loss connects again, with a delay that grows from attempt to attempt. Items
+are validated (:mod:`daq.acquisition.block_checks`) and keep the sample indices of their session;
+:mod:`daq.acquisition.sample_index` converts these to indices of the recording.
 """
 
 from __future__ import annotations
@@ -11,74 +11,88 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from daq.acquisition.block_checks import BlockValidator
-from daq.acquisition.device_identity import require
+from daq.acquisition.device_identity import check_identity
 from daq.acquisition.stall_detector import StallDetector
 from daq.drivers.interface import Resuming
 from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
+from daq.recording.sensor_state import STATE_AFTER, SensorState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
     from contextlib import AbstractAsyncContextManager
 
-    from daq.acquisition.stall_detector import Stage
+    from daq.acquisition.stall_detector import OverdueState
     from daq.bench.model import Sensor
     from daq.drivers.interface import DeviceInformation, DriverType, Session
     from daq.host_clock import HostClock
 
-FIRST_DELAY, LONGEST_DELAY = 0.2, 5.0
-LEAVE_TIMEOUT = 5.0
-"""How long a driver may take to leave its device, s."""
-LEAST_SUSPENDED = 0.5
-"""How long a computer is suspended at least, s; a busy one may read its two clocks so far apart."""
+FIRST_RETRY_DELAY, MAX_RETRY_DELAY = 0.2, 5.0
+"""Seconds before a device is tried again: after its first failure, and at most."""
+CLOSE_TIMEOUT = 5.0
+"""Seconds that a driver may take to close its session."""
+MIN_SUSPENSION = 0.5
+"""Shortest suspension of the computer, s; a busy one reads its two clocks this far apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """A session began: blocks that follow are in its index."""
+    """A session began: the blocks that follow have its sample indices."""
 
     sensors: tuple[str, ...]
     reason: str
-    """Why the one before ended; empty for the first."""
+    """Why the session before ended; empty for the first."""
     resumed: bool = False
-    """The index of the session before goes on."""
+    """Whether the sample indices of the session before continue."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorLate:
+    """A sensor is late until its next block."""
+
+    event: Event
+    """To be recorded if the sensor is lost afterwards."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorLost:
-    """A sensor is late or lost until its next block."""
+    """A sensor is lost until its next block."""
 
-    state: Literal["late", "lost"]
     event: Event
-    """What there is to be recorded of it."""
+    """To be recorded; its kind says which state the sensor is in."""
+
+    @property
+    def state(self) -> SensorState:
+        """Stalled, disconnected or refused."""
+        return STATE_AFTER[self.event.kind]
 
 
-Item = Block | Event | Connected | SensorLost
+Item = Block | Event | Connected | SensorLate | SensorLost
 
 
 @dataclass(slots=True)
 class BackOff:
-    """How long to wait before a device is tried again: twice as long after each failure."""
+    """Delay before a device is tried again; doubles with each failure."""
 
-    delay: float = FIRST_DELAY
-    """Before the next attempt, s."""
+    delay: float = FIRST_RETRY_DELAY
+    """Seconds before the next attempt."""
 
-    def failed(self) -> float:
-        """Return how long to wait now, s."""
-        delay, self.delay = self.delay, min(2 * self.delay, LONGEST_DELAY)
+    def next_delay(self) -> float:
+        """Return the seconds to wait after a failure, and double them for the next one."""
+        delay, self.delay = self.delay, min(2 * self.delay, MAX_RETRY_DELAY)
         return delay
 
-    def lived(self, seconds: float) -> None:
-        """Note how long a session has yielded blocks: one that comes and goes is no success."""
+    def session_lasted(self, seconds: float) -> None:
+        """Reset the delay once a session has yielded blocks for as long as the delay is."""
         if seconds >= self.delay:
-            self.delay = FIRST_DELAY
+            self.delay = FIRST_RETRY_DELAY
 
 
 class Connection:
-    """A port with its driver and sensors."""
+    """One port with its driver and sensors."""
 
     def __init__(self, driver: DriverType, sensors: Sequence[Sensor], clock: HostClock) -> None:
         self.driver = driver
@@ -86,78 +100,78 @@ class Connection:
         self.port = self.sensors[0].port
         self.names = tuple(sensor.name for sensor in self.sensors)
         self.information: tuple[DeviceInformation, ...] = ()
-        """What the devices said when they were first connected."""
+        """What the devices reported about themselves when they were first connected."""
         self.connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Done when the first session is open, or could not be opened."""
-        self.alive = False
+        """Done when the first session is open, or failed to open."""
+        self._is_connected = False
         self._back_off = BackOff()
-        self._said = ""
-        self._before: Session | None = None
+        self._reported: tuple[EventKind | None, object] = None, None
+        self._last_session: Session | None = None
         self._clock = clock
 
-    async def run(self, queue: asyncio.Queue[Item], go: asyncio.Event) -> None:
-        """Connect once, wait for ``go``, then read until cancelled, reconnecting if need be."""
+    async def run(self, queue: asyncio.Queue[Item], start: asyncio.Event) -> None:
+        """Connect, wait for ``start``, then read and reconnect until cancelled."""
         reason = ""
         while True:
             try:
-                async with self._in_time(self._open(), queue) as session:
+                async with self._opened(self._open(), queue) as session:
                     self._check_identity(session)
                     if not self.connected.done():
                         self.connected.set_result(None)
-                        await go.wait()
-                    resumed = self._before is not None and getattr(session, "resumed", False)
+                        await start.wait()
+                    resumed = self._last_session is not None and getattr(session, "resumed", False)
                     await queue.put(Connected(self.names, reason, resumed))
                     for name in self.names:
-                        await queue.put(self._introduced(session, name))
-                    self.alive = True
-                    self._before = session
+                        await queue.put(self._first_item(session, name))
+                    self._is_connected = True
+                    self._last_session = session
                     try:
                         await self._forward(session, queue)
                     except Exception as error:
-                        # At once: the driver may have a last word to a device that is gone.
-                        reason = await self._say(error, queue)
+                        # Before the driver closes its session, which can take seconds.
+                        reason = await self._report_lost(error, queue)
                         raise
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
-            # Whatever a driver raises concerns its device only: a fault of one must not end the
-            # recording of the others. At the start it is reported, later recorded.
-            except Exception as error:  # noqa: BLE001 -- a driver may be anybody's
+            # Drivers may come from anywhere. An error in one must not end the recording of other
+            # devices: it is raised at the start of a run, and recorded later.
+            except Exception as error:  # noqa: BLE001
                 failure = error
             if not self.connected.done():
                 self.connected.set_exception(failure)
                 return
-            # Said once, not at every attempt: a device may be away for weeks.
-            if self.alive:
-                reason = await self._say(failure, queue)
-            elif _kind(failure) == "refused" and str(failure) != self._said:
-                await self._say(failure, queue)
-            await asyncio.sleep(self._back_off.failed())
+            # Of failed attempts, which may go on for weeks, only another wrong device is recorded.
+            if self._is_connected:
+                reason = await self._report_lost(failure, queue)
+            elif isinstance(failure, WrongDeviceError) and _summary(failure) != self._reported:
+                await self._report_lost(failure, queue)
+            await asyncio.sleep(self._back_off.next_delay())
 
     def _open(self) -> AbstractAsyncContextManager[Session]:
-        if self._before is not None and isinstance(self.driver, Resuming):
-            return self.driver.resume(self.sensors, self._clock, self._before)
+        if self._last_session is not None and isinstance(self.driver, Resuming):
+            return self.driver.resume(self.sensors, self._clock, self._last_session)
         return self.driver.open(self.sensors, self._clock)
 
     @contextlib.asynccontextmanager
-    async def _in_time(
+    async def _opened(
         self, context: AbstractAsyncContextManager[Session], queue: asyncio.Queue[Item]
     ) -> AsyncIterator[Session]:
-        """Open a session; leave it within ``LEAVE_TIMEOUT``, and say where that is not enough."""
+        """Open a session, and close it within ``CLOSE_TIMEOUT``."""
         session = await context.__aenter__()
         try:
             yield session
         except BaseException as error:
-            await self._leave(context, error, queue)
+            await self._close(context, error, queue)
             raise
-        await self._leave(context, None, queue)
+        await self._close(context, None, queue)
 
-    async def _leave(
+    async def _close(
         self,
         context: AbstractAsyncContextManager[Session],
         error: BaseException | None,
         queue: asyncio.Queue[Item],
     ) -> None:
-        """Let the driver leave its device; why the session ended matters more than how."""
-        limit = asyncio.timeout(LEAVE_TIMEOUT)
+        """Close a session that ended by ``error``; errors of closing must not replace that one."""
+        limit = asyncio.timeout(CLOSE_TIMEOUT)
         try:
             async with limit:
                 await context.__aexit__(
@@ -170,68 +184,79 @@ class Connection:
             if error is None and not limit.expired():
                 raise
         if limit.expired():
-            text = f"the driver did not leave the device within {LEAVE_TIMEOUT:g} s"
+            text = f"the driver did not close its session within {CLOSE_TIMEOUT:g} s"
             for name in self.names:
                 with contextlib.suppress(asyncio.QueueFull):
                     queue.put_nowait(Event(name, EventKind.STATUS, text, self._clock.now()))
 
-    async def _say(self, failure: Exception, queue: asyncio.Queue[Item]) -> str:
-        """Record that the device is lost, and why; return the kind of the event."""
-        self.alive = False
-        kind, self._said = _kind(failure), str(failure)
+    async def _report_lost(self, failure: Exception, queue: asyncio.Queue[Item]) -> EventKind:
+        """Report all sensors of the port as lost; return the kind of the event."""
+        self._is_connected = False
+        kind, _ = self._reported = _summary(failure)
         for name in self.names:
-            await queue.put(SensorLost("lost", Event(name, kind, self._said, self._clock.now())))
+            await queue.put(SensorLost(Event(name, kind, str(failure), self._clock.now())))
         return kind
 
     async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
-        """Hand on what the session yields; raise if nothing comes for too long."""
+        """Pass on what the session yields; raise NoAnswerError if it stalls."""
 
-        def say(name: str, stage: Stage, seconds: float) -> bool:
+        def report(name: str, state: OverdueState, seconds: float) -> bool:
             now = self._clock.now()
-            text = f"no block for {seconds:.2g} s"
-            event = Event(name, EventKind.LATE, f"{text}, two of its block periods", now)
-            if stage == "lost":
-                # One of several on a port: its driver looks after it; here it is said.
-                event = Event(name, EventKind.STALLED, f"{text}; others on the port go on", now)
+            item: SensorLate | SensorLost
+            if state is SensorState.LATE:
+                text = f"no block for {seconds:.2g} s, two of its block periods"
+                item = SensorLate(Event(name, EventKind.LATE, text, now))
+            else:  # one of several on the port: its driver is responsible for reconnecting it
+                text = f"no block for {seconds:.2g} s; other sensors on the port continue"
+                item = SensorLost(Event(name, EventKind.STALLED, text, now))
             try:
-                queue.put_nowait(SensorLost(stage, event))
+                queue.put_nowait(item)
             except asyncio.QueueFull:
                 return False
             return True
 
-        speed, begun_ns = self._clock.speed, self._clock.now().monotonic_ns
-        watch = StallDetector(
+        speed, started_ns = self._clock.speed, self._clock.now().monotonic_ns
+        detector = StallDetector(
             {s.name: s.sampling_rate * speed for s in self.sensors},
-            say,
-            recovers=lambda: getattr(session, "recovers", False),
+            report,
+            is_recovering=lambda: getattr(session, "recovers", False),
         )
-        checked = BlockValidator(self.driver, self.sensors)
+        validator = BlockValidator(self.driver, self.sensors)
         suspended = self._clock.suspended
         async with contextlib.aclosing(_generator(session)) as items:
             try:
-                async with watch:
+                async with detector:
                     while True:
-                        with watch.waiting():
+                        with detector.waiting():
                             item = await anext(items, None)
                         if item is None:
                             return
-                        item = checked.check(item)
+                        item = validator.validated(item)
                         if isinstance(item, Block):
-                            if self._clock.suspended > suspended + LEAST_SUSPENDED:
-                                suspended = await self._resume(item, suspended, queue)
-                            watch.block_came(item)
-                            lived_ns = item.received.monotonic_ns - begun_ns
-                            self._back_off.lived(lived_ns * 1e-9 / speed)
+                            if self._clock.suspended > suspended + MIN_SUSPENSION:
+                                suspended = await self._after_suspension(item, suspended, queue)
+                            detector.block_received(item)
+                            lasted_ns = item.received.monotonic_ns - started_ns
+                            self._back_off.session_lasted(lasted_ns * 1e-9 / speed)
                         await queue.put(item)
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise
                 raise NoAnswerError(
-                    f"{self.port}: stalled: no block for {watch.seconds:.2g} s"
+                    f"{self.port}: stalled: no block for {detector.seconds:.2g} s"
                 ) from error
 
-    async def _resume(self, block: Block, before: float, queue: asyncio.Queue[Item]) -> float:
-        """Say for how long the computer was suspended; raise if nobody counted what was missed."""
+    async def _after_suspension(
+        self, block: Block, before: float, queue: asyncio.Queue[Item]
+    ) -> float:
+        """Report that the computer was suspended; return for how long in all.
+
+        Raises
+        ------
+        NoAnswerError
+            If the device has neither counter nor sample times, so that nothing tells how many
+            samples are missing: a new session lets the host's clock tell.
+        """
         now = self._clock.suspended
         text = f"the computer was suspended for {now - before:.3g} s"
         if block.device_counter is None and block.instants_ns is None:
@@ -240,7 +265,7 @@ class Connection:
         return now
 
     def _check_identity(self, session: Session) -> None:
-        """Refuse another device than the bench file names, or than was there before."""
+        """Refuse another device than the bench file names, or than was recorded before."""
         found = tuple(session.information)
         known = {information.sensor: information for information in self.information}
         for sensor in self.sensors:
@@ -250,22 +275,22 @@ class Connection:
             if now.trouble and not known:
                 raise NoAnswerError(now.trouble)
             before = known.get(sensor.name)
-            require(sensor, now, serial_number=before.serial_number if before else "")
+            check_identity(sensor, now, serial_number=before.serial_number if before else "")
         self.information = self.information or found
 
-    def _introduced(self, session: Session, name: str) -> Event | SensorLost:
-        """Return who is there; one of several on a port may not be, and the others go on."""
+    def _first_item(self, session: Session, name: str) -> Event | SensorLost:
+        """Return that a sensor is connected, or that it does not answer while others do."""
         now = self._clock.now()
         found = next((i for i in session.information if i.sensor == name), None)
         if found is not None and found.trouble:
-            return SensorLost("lost", Event(name, EventKind.STALLED, found.trouble, now))
+            return SensorLost(Event(name, EventKind.STALLED, found.trouble, now))
         parts = (found.model, found.serial_number, found.firmware) if found else ()
         text = " ".join(("on", self.port, *(part for part in parts if part)))
         return Event(name, EventKind.CONNECTED, text, now)
 
 
 async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:
-    """Make of any asynchronous iterator a generator, which can be closed."""
+    """Return the items of a session as a generator, which can be closed."""
     items = session.read()
     try:
         async for item in items:
@@ -276,7 +301,9 @@ async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:
             await close()
 
 
-def _kind(failure: Exception) -> str:
+def _summary(failure: Exception) -> tuple[EventKind, object]:
+    """Return the kind of event that a failure becomes, and the device found instead."""
     if isinstance(failure, WrongDeviceError):
-        return "refused"
-    return "stalled" if isinstance(failure, NoAnswerError) else "disconnected"
+        return EventKind.REFUSED, failure.found
+    kind = EventKind.STALLED if isinstance(failure, NoAnswerError) else EventKind.DISCONNECTED
+    return kind, None

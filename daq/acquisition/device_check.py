@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from daq.acquisition.device_identity import require
+from daq.acquisition.device_identity import check_identity
 from daq.drivers.epson.driver import identify
 from daq.drivers.modbus.bus import TCP, RefusedError, open_bus
 from daq.drivers.registry import driver_type
@@ -175,7 +175,7 @@ def _wrong(
             yield NoAnswerError(found.trouble)
             continue
         try:
-            require(sensor, found)
+            check_identity(sensor, found)
         except WrongDeviceError as error:
             yield error
 

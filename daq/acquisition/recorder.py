@@ -1,11 +1,13 @@
-"""The recorder: all devices of a bench into one recording, until told to stop.
+"""The recorder: all devices of a bench into one recording, until it is stopped.
 
-Theory of operation ------------------- One task a port
-(:class:`daq.acquisition.connection.Connection`) puts what comes into one bounded queue; one writer
-takes it from there in batches, places it (:mod:`daq.acquisition.sample_index`) and hands it to the
-file in a thread of its own, so that neither compression nor ``fsync`` delays a port. About twice a
-second, and when a whole chunk of samples is written, it commits, and only then acknowledges. When
-writing lags, the queue fills, ports wait, and the system's buffers hold what comes.
+Theory of operation
+-------------------
+One task a port (:class:`daq.acquisition.connection.Connection`) puts items into one bounded queue.
+The recorder takes them from the queue in batches and writes them in a thread of its own
+(:class:`daq.acquisition.block_writer.BlockWriter`), so that neither compression nor ``fsync``
+delays a port. It commits about twice a second, sooner where a whole chunk of samples is waiting,
+and acknowledges only what is committed. When writing lags, the queue fills, the ports' tasks wait,
+and the operating system's buffers hold the data.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from daq.acquisition.block_writer import BlockWriter, SensorStatus
-from daq.acquisition.connection import LEAVE_TIMEOUT, Connection
+from daq.acquisition.block_writer import BlockWriter, SensorProgress
+from daq.acquisition.connection import CLOSE_TIMEOUT, Connection
 from daq.drivers.registry import driver_type
 from daq.errors import DeviceError
 from daq.host_clock import SystemClock
@@ -46,32 +48,33 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 QUEUE_LENGTH = 4096
-COMMIT_INTERVAL, LEAST_COMMIT_INTERVAL = 0.5, 0.25
-"""Between commits, s: the usual one, and the one where a whole chunk of samples waits for it."""
-CANCEL_TIMEOUT = LEAVE_TIMEOUT + 2.0
-"""For all connections to end, s."""
+COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 0.5, 0.25
+"""Seconds between commits: usually, and where a whole chunk of samples is waiting."""
+CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
+"""Seconds that all connections may take to end."""
 _BATCH_INTERVAL = 0.1
 _LAST_BLOCKS = 1.0
+"""Seconds after the end of a run in which its last blocks may arrive."""
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
-    """An acknowledgment: all this is safe on disk."""
+class RecorderStatus:
+    """An acknowledgment: everything it counts is safe on disk."""
 
     path: str
     elapsed: float
-    """Host time since the start, in s."""
-    sensors: dict[str, SensorStatus]
+    """Host time since the start, in seconds."""
+    sensors: dict[str, SensorProgress]
     closed: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """Return the status as a JSON object."""
         return asdict(self)
 
 
 def recording_path(bench: Bench, at: HostTime) -> Path:
-    """Return the usual path of a recording that starts now."""
+    """Return the default path of a recording that starts at this instant."""
     name = re.sub(r"[^\w.-]+", "-", bench.name).strip("-.") or "recording"
     utc = datetime.fromtimestamp(at.utc_ns / 1e9, tz=UTC)
     return bench.recording_directory / f"{name}-{utc:%Y%m%dT%H%M%SZ}.h5"
@@ -82,11 +85,11 @@ def run(
     path: str | Path,
     *,
     duration: float | None = None,
-    acknowledged: Callable[[Status], None] | None = None,
-) -> Status:
+    acknowledged: Callable[[RecorderStatus], None] | None = None,
+) -> RecorderStatus:
     """Record until done, SIGINT or SIGTERM, in the main thread; see :func:`record`."""
 
-    async def main() -> Status:
+    async def main() -> RecorderStatus:
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -100,7 +103,7 @@ def run(
     try:
         return runner.run(main())
     finally:
-        # Closing waits for ever for a driver that does not end, and no signal would help.
+        # Closing would wait for a driver that does not end, and no signal would interrupt it.
         if not asyncio.all_tasks(runner.get_loop()):
             runner.close()
 
@@ -112,41 +115,41 @@ async def record(
     duration: float | None = None,
     clock: HostClock | None = None,
     stop: asyncio.Event | None = None,
-    acknowledged: Callable[[Status], None] | None = None,
+    acknowledged: Callable[[RecorderStatus], None] | None = None,
     drivers: Callable[[str], DriverType] = driver_type,
-) -> Status:
+) -> RecorderStatus:
     """Record a bench.
 
     Parameters
     ----------
     bench : Bench
-        What to record.
+        Sensors to record.
     path : path
         The new file.
     duration : float, optional
-        How much of every sensor to record, in s of its own samples; a sensor that is lost is waited
-        for no longer than that in host time. Without it: until ``stop``.
+        Seconds to record of every sensor, by its own samples; the run ends after this much host
+        time even if a sensor is lost. Without it the run ends by ``stop``.
     clock : HostClock, optional
-        Where host times come from; the system's, at the bench's speed, if not given.
+        Source of host times; by default the system's, at the bench's speed.
     stop : asyncio.Event, optional
-        Ends the recording properly when set.
+        Ends the run properly when set.
     acknowledged : callable, optional
         Called after every commit, and when the state of a sensor has changed.
     drivers : callable
-        Finds drivers by name.
+        Returns the driver of a name.
 
     Returns
     -------
-    Status
-        Of the closed recording; not ``closed``, and without a file, if ``stop`` came before all
+    RecorderStatus
+        Of the closed recording; not ``closed``, and without a file, if ``stop`` was set before all
         devices were connected.
 
     Raises
     ------
     ExceptionGroup of DeviceError
-        If devices cannot be used at the start: all of them, each naming its sensor.
+        If devices cannot be used at the start: one error for each, naming its sensor.
     RecordingError
-        If the file cannot be written; what was acknowledged stays.
+        If the file cannot be written; everything acknowledged is safe.
     """
     clock = SystemClock(bench.speed) if clock is None else clock
     recorder = _Recorder(bench, Path(path), clock, stop or asyncio.Event(), acknowledged)
@@ -160,7 +163,7 @@ class _Recorder:
         path: Path,
         clock: HostClock,
         stop: asyncio.Event,
-        acknowledged: Callable[[Status], None] | None,
+        acknowledged: Callable[[RecorderStatus], None] | None,
     ) -> None:
         self._bench = bench
         self._path = path
@@ -169,52 +172,57 @@ class _Recorder:
         self._acknowledged = acknowledged
         self._queue: asyncio.Queue[Item] = asyncio.Queue(QUEUE_LENGTH)
         self._started = clock.now()
-        self._reason = "stopped"
-        self._status = Status(str(path), 0.0, {})
+        self._end_reason = "stopped"
+        self._status = RecorderStatus(str(path), 0.0, {})
 
-    async def run(self, duration: float | None, drivers: Callable[[str], DriverType]) -> Status:
+    async def run(
+        self, duration: float | None, drivers: Callable[[str], DriverType]
+    ) -> RecorderStatus:
         connections = [
             Connection(drivers(sensors[0].driver), sensors, self._clock)
             for sensors in self._bench.ports().values()
         ]
-        go = asyncio.Event()
+        start = asyncio.Event()
         async with control.serve(self._answer) as address:
-            tasks = [asyncio.create_task(c.run(self._queue, go), name=c.port) for c in connections]
+            tasks = [
+                asyncio.create_task(c.run(self._queue, start), name=c.port) for c in connections
+            ]
             try:
                 if not await self._all_connected(connections):
                     return self._status
                 with _WritingThread() as thread:
-                    intake = await thread.run(lambda: self._create(connections, address, duration))
+                    writer = await thread.run(lambda: self._create(connections, address, duration))
                     try:
-                        go.set()
-                        await self._write(intake, thread, duration, tasks)
+                        start.set()
+                        await self._write_until_end(writer, thread, duration, tasks)
                         await self._cancel(tasks)
-                        await self._finish(intake, thread)
+                        await self._finish(writer, thread)
                     except BaseException:
-                        await asyncio.shield(thread.run(intake.abandon))
+                        await asyncio.shield(thread.run(writer.abandon))
                         raise
             finally:
                 await self._cancel(tasks)
         return self._status
 
     async def _cancel(self, tasks: list[asyncio.Task[None]]) -> None:
-        """Cancel what is left of tasks; wait until they have left their devices quiet.
+        """Cancel the remaining tasks and wait until they have closed their sessions.
 
-        Not for ever: one that does not end is said to, and left alone.
+        A task that does not end in time is reported and abandoned.
         """
-        going = [task for task in tasks if not task.done()]
-        for task in going:
+        remaining = [task for task in tasks if not task.done()]
+        for task in remaining:
             task.cancel()
-        if not going:
+        if not remaining:
             return
-        _, stuck = await asyncio.wait(going, timeout=CANCEL_TIMEOUT)
+        _, stuck = await asyncio.wait(remaining, timeout=CANCEL_TIMEOUT)
         for task in stuck:
             tasks.remove(task)
-            text = f"the driver on {task.get_name()} does not end; it was left alone"
+            text = f"the driver on {task.get_name()} does not end; it was abandoned"
             with contextlib.suppress(asyncio.QueueFull):
                 self._queue.put_nowait(Event("", EventKind.STATUS, text, self._clock.now()))
 
     async def _all_connected(self, connections: list[Connection]) -> bool:
+        """Wait for all first sessions; return False if the run was stopped before."""
         stopped = asyncio.ensure_future(self._stop.wait())
         waiting = asyncio.gather(*(c.connected for c in connections), return_exceptions=True)
         try:
@@ -228,7 +236,7 @@ class _Recorder:
             await asyncio.wait([stopped])
         for failure in failures:
             if not isinstance(failure, (DeviceError, RemoteProtocolError)):
-                raise failure  # the bench's fault, or the program's, but no device's
+                raise failure  # an error in the bench file or in the program, not of a device
         if failures:
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
         return True
@@ -241,13 +249,13 @@ class _Recorder:
             information = {i.sensor: i for i in connection.information}
             for sensor in connection.sensors:
                 layout = SensorLayout.of(sensor, connection.driver)
-                said = information.get(sensor.name)
-                if said is not None:
+                found = information.get(sensor.name)
+                if found is not None:
                     layout = replace(
                         layout,
-                        sampling_rate=said.sampling_rate or layout.sampling_rate,
-                        model=said.model or layout.model,
-                        serial_number=said.serial_number or layout.serial_number,
+                        sampling_rate=found.sampling_rate or layout.sampling_rate,
+                        model=found.model or layout.model,
+                        serial_number=found.serial_number or layout.serial_number,
                     )
                 layouts[sensor.name] = layout
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
@@ -264,79 +272,76 @@ class _Recorder:
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
         return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
 
-    async def _write(
+    async def _write_until_end(
         self,
-        intake: BlockWriter,
+        writer: BlockWriter,
         thread: _WritingThread,
         duration: float | None,
         tasks: Sequence[asyncio.Task[None]],
     ) -> None:
-        """Take what comes from the queue until it is time to stop."""
+        """Write and commit what the connections deliver until the run ends."""
         loop = asyncio.get_running_loop()
         last_commit, n_committed = -math.inf, 0
         while not self._stop.is_set():
             batch = await self._batch()
-            await thread.run(partial(intake.take, batch))
+            await thread.run(partial(writer.write, batch))
             for task in tasks:
-                if task.done():  # a connection ends only by a fault in the code
+                if task.done():  # a connection ends only by an error in the program
                     task.result()
-            waits = intake.n_written > n_committed
-            if loop.time() >= last_commit + (LEAST_COMMIT_INTERVAL if waits else COMMIT_INTERVAL):
-                n_committed = intake.n_written
-                self._acknowledge(intake, await thread.run(intake.commit))
+            chunk_waits = writer.n_written > n_committed
+            interval = MIN_COMMIT_INTERVAL if chunk_waits else COMMIT_INTERVAL
+            if loop.time() >= last_commit + interval:
+                n_committed = writer.n_written
+                self._acknowledge(writer, await thread.run(writer.commit))
                 last_commit = loop.time()
-            elif (sensors := self._with_states(intake)) != self._status.sensors:
-                self._tell(replace(self._status, sensors=sensors))
-            if duration is not None and self._is_complete(intake, duration):
-                self._reason = "duration reached"
+            elif (sensors := self._with_current_states(writer)) != self._status.sensors:
+                self._publish(replace(self._status, sensors=sensors))
+            if duration is not None and self._is_complete(writer, duration):
+                self._end_reason = "duration reached"
                 return
 
     async def _batch(self) -> list[Item]:
-        """Return what has come in the next moment: one trip to the thread for many blocks."""
+        """Return the items of the next moment: one call of the writing thread for many blocks."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_BATCH_INTERVAL):
                 await self._stop.wait()
-        return self._waiting()
+        return self._queued()
 
-    def _waiting(self) -> list[Item]:
+    def _queued(self) -> list[Item]:
         batch: list[Item] = []
         while not self._queue.empty():
             batch.append(self._queue.get_nowait())
         return batch
 
-    async def _finish(self, intake: BlockWriter, thread: _WritingThread) -> None:
-        await thread.run(partial(intake.take, self._waiting()))
-        close = partial(intake.close, self._clock.now(), self._reason)
-        self._acknowledge(intake, await thread.run(close))
+    async def _finish(self, writer: BlockWriter, thread: _WritingThread) -> None:
+        await thread.run(partial(writer.write, self._queued()))
+        close = partial(writer.close, self._clock.now(), self._end_reason)
+        self._acknowledge(writer, await thread.run(close))
 
-    def _acknowledge(self, intake: BlockWriter, committed: Committed) -> None:
-        self._tell(
-            Status(str(self._path), self._elapsed(), intake.status(committed), committed.closed)
-        )
+    def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
+        sensors = writer.progress(committed)
+        self._publish(RecorderStatus(str(self._path), self._elapsed(), sensors, committed.closed))
 
-    def _tell(self, status: Status) -> None:
+    def _publish(self, status: RecorderStatus) -> None:
         self._status = status
         if self._acknowledged is not None:
             self._acknowledged(status)
 
-    def _with_states(self, intake: BlockWriter) -> dict[str, SensorStatus]:
-        """Return what was acknowledged last, with what the sensors' states are now."""
-        states = intake.states()
+    def _with_current_states(self, writer: BlockWriter) -> dict[str, SensorProgress]:
+        """Return the counts acknowledged last with the current states."""
+        states = writer.states()
         return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
 
     def _elapsed(self) -> float:
         return (self._clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
 
-    def _is_complete(self, intake: BlockWriter, duration: float) -> bool:
-        if intake.recorded() >= duration:
-            return True
-        # Blocks of the last moment are still on their way.
-        return self._elapsed() >= duration + _LAST_BLOCKS
+    def _is_complete(self, writer: BlockWriter, duration: float) -> bool:
+        return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
 
     async def _answer(self, command: str, text: str) -> dict[str, Any]:
-        """Do what came through the control channel."""
+        """Carry out a command of the control channel."""
         if command == "stop":
-            self._reason = "stopped by command"
+            self._end_reason = "stopped by command"
             self._stop.set()
         elif command == "mark":
             await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
@@ -344,7 +349,7 @@ class _Recorder:
 
 
 class _WritingThread:
-    """The one thread that touches the file."""
+    """The only thread that accesses the file."""
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
@@ -356,7 +361,7 @@ class _WritingThread:
         self._executor.shutdown()
 
     async def run(self, function: Callable[[], _Result]) -> _Result:
-        """Run a function there, to its end even if this task is cancelled meanwhile."""
+        """Run a function in the thread, to its end even if this task is cancelled meanwhile."""
         future = asyncio.get_running_loop().run_in_executor(self._executor, function)
         try:
             return await asyncio.shield(future)

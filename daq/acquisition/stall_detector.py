@@ -1,17 +1,17 @@
-"""When the blocks of a port's sensors are overdue: late first, then lost.
+"""Detects overdue blocks of the sensors on a port: first late, then stalled.
 
 Theory of operation
 -------------------
-A *block period* is the time the samples of a block take; as blocks may differ, the longest of late.
-A sensor whose next block has not come two periods after its last (and no less than ``LEAST_LATE``)
-is **late**. That is noticed by a timer at that very instant, and costs nothing but a word, for one
-block that is lost whole makes the next come just then. After further patience (``LATENESS``; more,
-if blocks came less evenly) it is **lost**: the one who waits for the port is interrupted, or, where
-others on the port go on, only told.
+The *block period* of a sensor is the duration of its blocks' samples: the longest of recent blocks.
+A sensor is **late** when its next block has not arrived two block periods after the last one, and
+not before ``MIN_LATE_AFTER``. A timer reports this at that instant. One lost block makes a sensor
+late, so lateness alone has no consequence. The sensor is **stalled** after a further margin
+(``STALL_MARGIN``; more where blocks have arrived less evenly). Then, if no other sensor on the port
+delivers, the task that waits for the port is interrupted; otherwise the stall is only reported.
 
-When the event loop was held up, or nobody waits because writing lags, no device is to blame. Nor is
-one that says it recovers, from an overflow of its buffer: for as long as ``LONGEST_RECOVERY`` it is
-late, and not lost.
+Nothing is overdue while the event loop is blocked, or while nobody waits for blocks because writing
+lags. A device that reports its recovery from a buffer overflow is late, but not stalled, for up to
+``MAX_RECOVERY``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self, TypeAlias
+
+from daq.recording.sensor_state import SensorState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -27,91 +29,93 @@ if TYPE_CHECKING:
 
     from daq.protocols.block import Block
 
-FIRST_PATIENCE = 10.0
-"""How long to wait for the first block of a session, in s, if it is short; drivers know better."""
-LONGEST_FIRST_BLOCK = 1100
-"""Samples a first block may have: one block of GCF holds up to a thousand."""
-PERIODS = 2
-"""How many block periods after the last block the next is late."""
-LEAST_LATE = 0.1
-LEAST_PATIENCE = 0.5
-LATENESS = 0.25
-"""What a late block may still come after, s: one that is lost whole must not look like a stall."""
-LONGEST_RECOVERY = 10.0
-"""How long no block may come from a device that says it recovers, s."""
-HELD_UP = 0.2
-"""A timer that comes so late, s, tells of a busy host."""
-_LEAST_INTERVAL = 0.02
-_FORGETTING = 0.98
+FIRST_BLOCK_TIMEOUT = 10.0
+"""Seconds to wait for a short first block of a session; drivers have tighter limits."""
+MAX_FIRST_BLOCK_SAMPLES = 1100
+"""Samples of the longest first block: a GCF block holds up to a thousand."""
+LATE_PERIODS = 2
+"""Block periods after the last block at which the next one is late."""
+MIN_LATE_AFTER = 0.1
+MIN_STALLED_AFTER = 0.5
+STALL_MARGIN = 0.25
+"""Seconds that a late block may still take: one lost block must not look like a stall."""
+MAX_RECOVERY = 10.0
+"""Seconds without blocks that a device may spend on its recovery."""
+BUSY_HOST_DELAY = 0.2
+"""A timer that fires this many seconds late shows that the event loop was blocked."""
+_MIN_TIMER_INTERVAL = 0.02
+_DECAY = 0.98
 
-Stage = Literal["late", "lost"]
+OverdueState: TypeAlias = Literal[SensorState.LATE, SensorState.STALLED]
 
 
 class BlockInterval:
-    """How long the next block may take, by those that came so far; times in s of one clock."""
+    """Time that the next block may take, learned from earlier blocks; seconds of one clock."""
 
-    def __init__(self, now: float, first: float) -> None:
+    def __init__(self, now: float, first_block_timeout: float) -> None:
         self.last = now
-        self._first = first
-        self._begun = False
+        """When the last block arrived; before the first, when the session began."""
+        self._first_block_timeout = first_block_timeout
+        self._has_blocks = False
         self._period = 0.0
         self._longest = 0.0
-        self.said: set[Stage] = set()
-        """Of what is overdue, since the last block."""
+        self.reported: set[OverdueState] = set()
+        """States reported since the last block."""
 
     @property
     def late_after(self) -> float:
-        """Seconds after the last block; never, before the first."""
-        return max(LEAST_LATE, PERIODS * self._period) if self._begun else math.inf
+        """Seconds from the last block until the next is late; infinite before the first block."""
+        return max(MIN_LATE_AFTER, LATE_PERIODS * self._period) if self._has_blocks else math.inf
 
     @property
-    def lost_after(self) -> float:
-        """Seconds after the last block."""
-        if not self._begun:
-            return self._first
-        return max(LEAST_PATIENCE, PERIODS * self._longest + LATENESS)
+    def stalled_after(self) -> float:
+        """Seconds from the last block until the sensor is stalled."""
+        if not self._has_blocks:
+            return self._first_block_timeout
+        return max(MIN_STALLED_AFTER, LATE_PERIODS * self._longest + STALL_MARGIN)
 
-    def block_came(self, now: float, duration: float) -> None:
-        """Learn from a block and the time its samples took; what was long is forgotten slowly."""
-        interval = now - self.last if self._begun else 0.0
-        self._period = max(_FORGETTING * self._period, duration)
-        self._longest = max(_FORGETTING * self._longest, interval, duration)
-        self._begun, self.last = True, now
-        self.said.clear()
+    def block_received(self, now: float, duration: float) -> None:
+        """Learn from a block and the duration of its samples; long intervals decay slowly."""
+        interval = now - self.last if self._has_blocks else 0.0
+        self._period = max(_DECAY * self._period, duration)
+        self._longest = max(_DECAY * self._longest, interval, duration)
+        self._has_blocks, self.last = True, now
+        self.reported.clear()
 
-    def excuse(self, now: float) -> None:
-        """Take it that half the time is left."""
-        self.last = max(self.last, now - min(self.late_after, self.lost_after) / 2)
+    def postpone(self, now: float) -> None:
+        """Allow at least another half of the time until the next block is overdue."""
+        self.last = max(self.last, now - min(self.late_after, self.stalled_after) / 2)
 
 
 class StallDetector:
-    """Tells of overdue blocks, and interrupts who waits for a port that is lost.
+    """Reports overdue blocks; interrupts the task that waits for a stalled port.
 
     Parameters
     ----------
     sampling_rates : mapping of str to float
         Of each sensor, in samples per second of the event loop's clock.
-    say : callable of sensor, stage and seconds since its last block
-        Called once a stage; returns whether it could be said, and is asked again if not.
-    recovers : callable
-        Whether the device has said that it lives, though it sends no samples for now.
+    report : callable of sensor, state and seconds since its last block
+        Called once for each state; returns whether it could take the report, and is called again
+        if not.
+    is_recovering : callable
+        Whether the device has reported that it works, though it sends no samples for now.
     """
 
     def __init__(
         self,
         sampling_rates: Mapping[str, float],
-        say: Callable[[str, Stage, float], bool],
+        report: Callable[[str, OverdueState, float], bool],
         *,
-        recovers: Callable[[], bool] = lambda: False,
+        is_recovering: Callable[[], bool] = lambda: False,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._rates = sampling_rates
-        self._say = say
-        self._recovers = recovers
+        self._report = report
+        self._is_recovering = is_recovering
         now = self._loop.time()
-        first = FIRST_PATIENCE + LONGEST_FIRST_BLOCK / min(sampling_rates.values())
-        self._port = BlockInterval(now, first)
-        self._each = {name: BlockInterval(now, first) for name in sampling_rates}
+        timeout = FIRST_BLOCK_TIMEOUT + MAX_FIRST_BLOCK_SAMPLES / min(sampling_rates.values())
+        self._port = BlockInterval(now, timeout)
+        self._sensors = {name: BlockInterval(now, timeout) for name in sampling_rates}
         self._timeout = asyncio.timeout(None)
         self._is_waiting = False
         self._due = now
@@ -119,12 +123,12 @@ class StallDetector:
 
     @property
     def seconds(self) -> float:
-        """Since the last block."""
+        """Seconds since the last block of any sensor."""
         return self._loop.time() - self._port.last
 
     async def __aenter__(self) -> Self:
         await self._timeout.__aenter__()
-        self._arm(self._loop.time())
+        self._set_timer(self._loop.time())
         return self
 
     async def __aexit__(
@@ -139,52 +143,52 @@ class StallDetector:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
-        """Interrupt only what happens within."""
+        """Detect overdue blocks, and interrupt the current task, only within this context."""
         self._is_waiting = True
         try:
             yield
         finally:
             self._is_waiting = False
 
-    def block_came(self, block: Block) -> None:
-        """Take note of a block."""
+    def block_received(self, block: Block) -> None:
+        """Note the arrival of a block."""
         now = self._loop.time()
         duration = block.n_samples / self._rates[block.sensor]
-        self._port.block_came(now, duration)
-        patience = self._each[block.sensor]
-        patience.block_came(now, duration)
-        if now + patience.late_after < self._due and self._timer is not None:
-            self._timer.cancel()  # the first block, or blocks become shorter
-            self._arm(now)
+        self._port.block_received(now, duration)
+        interval = self._sensors[block.sensor]
+        interval.block_received(now, duration)
+        if now + interval.late_after < self._due and self._timer is not None:
+            self._timer.cancel()  # the first block, or blocks became shorter
+            self._set_timer(now)
 
-    def _look(self) -> None:
+    def _on_timer(self) -> None:
         now = self._loop.time()
-        if now - self._due > HELD_UP or not self._is_waiting:
-            for patience in (self._port, *self._each.values()):
-                patience.excuse(now)
+        if now - self._due > BUSY_HOST_DELAY or not self._is_waiting:
+            for interval in (self._port, *self._sensors.values()):
+                interval.postpone(now)
         else:
-            self._tell(now, "late")
-            if now >= self._port.last + LONGEST_RECOVERY or not self._recovers():
-                if now >= self._port.last + self._port.lost_after:
+            self._report_overdue(now, SensorState.LATE)
+            if now >= self._port.last + MAX_RECOVERY or not self._is_recovering():
+                if now >= self._port.last + self._port.stalled_after:
                     self._timeout.reschedule(now)
                     return
-                self._tell(now, "lost")
-        self._arm(now)
+                self._report_overdue(now, SensorState.STALLED)
+        self._set_timer(now)
 
-    def _tell(self, now: float, stage: Stage) -> None:
-        for name, patience in self._each.items():
-            after = patience.late_after if stage == "late" else patience.lost_after
-            overdue = stage not in patience.said and now >= patience.last + after
-            if overdue and self._say(name, stage, now - patience.last):
-                patience.said.add(stage)
+    def _report_overdue(self, now: float, state: OverdueState) -> None:
+        for name, interval in self._sensors.items():
+            after = interval.late_after if state is SensorState.LATE else interval.stalled_after
+            overdue = state not in interval.reported and now >= interval.last + after
+            if overdue and self._report(name, state, now - interval.last):
+                interval.reported.add(state)
 
-    def _arm(self, now: float) -> None:
-        """Come back when the next could be overdue: blocks that come meanwhile cost nothing."""
-        due = self._port.last + self._port.lost_after
-        for patience in self._each.values():
-            if "late" not in patience.said:
-                due = min(due, patience.last + patience.late_after)
-            if "lost" not in patience.said:
-                due = min(due, patience.last + patience.lost_after)
-        self._due = max(due, now + _LEAST_INTERVAL)
-        self._timer = self._loop.call_at(self._due, self._look)
+    def _set_timer(self, now: float) -> None:
+        """Set the timer to when a block could next be overdue; blocks before then cost nothing."""
+        due = self._port.last + self._port.stalled_after
+        for interval in self._sensors.values():
+            if SensorState.LATE not in interval.reported:
+                due = min(due, interval.last + interval.late_after)
+            if SensorState.STALLED not in interval.reported:
+                due = min(due, interval.last + interval.stalled_after)
+        self._due = max(due, now + _MIN_TIMER_INTERVAL)
+        self._timer = self._loop.call_at(self._due, self._on_timer)

@@ -22,7 +22,7 @@ from daq.alignment.grid import SNAP, Grid
 from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import DelayMeasurement, SensorSource, main_columns
 from daq.errors import CannotAlignError
-from daq.timing.clock_model import ClockState, nominal
+from daq.timing.clock_model import ClockSource, ClockState, nominal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -216,7 +216,7 @@ class AlignedRecording:
                 rate = source.record.sampling_rate
                 source.clock = nominal(
                     source.record.name,
-                    "nominal rate",
+                    ClockSource.NOMINAL_RATE,
                     end_sample=source.end_sample,
                     sampling_rate=rate,
                     first=round(source.arrivals.start * rate),
@@ -242,11 +242,12 @@ class AlignedRecording:
                 ppm, ppm_std = source.arrivals.rate()
                 source.clock = nominal(
                     source.record.name,
-                    f"clock of {source.clock_name}",
+                    ClockSource.SHARED_CLOCK,
                     end_sample=source.end_sample,
                     sampling_rate=source.record.sampling_rate,
                     ppm=ppm,
                     ppm_std=ppm_std,
+                    shared_clock=source.clock_name,
                 )
             else:
                 clock = source.arrivals.solve(source.record.name, measured)

@@ -13,7 +13,7 @@ import numpy as np
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.timing.arrival_times import ArrivalTimes, MeasuredDelays
-from daq.timing.clock_model import from_instants
+from daq.timing.clock_model import OffsetSource, from_instants
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -249,7 +249,8 @@ class SensorSource:
                 else:
                     by_samples = False
             stretches.append((begin, end, round(apart)))
-        self.clock = known.shifted(name, stretches, by_samples=by_samples)
+        known_by = OffsetSource.SAMPLES if by_samples else OffsetSource.ARRIVAL_TIMES
+        self.clock = known.shifted(name, stretches, known_by=known_by)
 
 
 def main_columns(record: SensorRecord) -> list[int]:

@@ -38,7 +38,7 @@ from daq.estimation.noise_estimates import (
 from daq.estimation.recording_set import check_same, check_span, open_another
 from daq.estimation.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, Octave, SensorState, Snapshot
+from daq.estimation.snapshot import ChannelLabel, Octave, SensorTotals, Snapshot
 from estimator.errors import InsufficientDataError
 from estimator.spectra.segment_rejection import Reason, RejectionSettings
 
@@ -268,7 +268,7 @@ class Estimation:
                 taken=n_segments * first.welch.hop / first.welch.sampling_rate,
             ),
             start_utc_ns=first.aligned.start_utc_ns,
-            sensors=tuple(SensorState.of(record) for record in self._recordings[-1].sensors),
+            sensors=tuple(SensorTotals.of(record) for record in self._recordings[-1].sensors),
             clocks=last.aligned.clocks,
             drift=last.drift(),
             closed=all(recording.closed for recording in self._recordings),

@@ -199,14 +199,14 @@ class _Sensors:
 
     def look(self) -> None:
         """Pass on the state of the sensors."""
-        status = self._monitor.look()
-        if self._monitor.quiet():
-            status = self._monitor.with_states(status, self._recorder_states())
+        status = self._monitor.status()
+        if self._monitor.is_any_sensor_quiet():
+            status = self._monitor.with_late_sensors(status, self._recorder_states())
         self._observer.status(status)
 
     def look_closely(self) -> None:
-        """Pass on the state of the sensors, and which channels do not move."""
-        self._observer.status(self._monitor.look_closely())
+        """Pass on the state of the sensors, and which channels are stuck."""
+        self._observer.status(self._monitor.status_with_stuck_channels())
 
     def _recorder_states(self) -> dict[str, str]:
         """Ask the recorder: only it knows at once that a sensor is late."""

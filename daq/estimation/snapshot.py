@@ -29,8 +29,8 @@ class ChannelLabel:
 
 
 @dataclass(frozen=True, slots=True)
-class SensorState:
-    """What the recording says about a sensor now."""
+class SensorTotals:
+    """How much of a sensor has been recorded so far."""
 
     name: str
     sampling_rate: float
@@ -41,8 +41,8 @@ class SensorState:
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
     @classmethod
-    def of(cls, record: SensorRecord) -> SensorState:
-        """Return the state of a sensor of a recording."""
+    def of(cls, record: SensorRecord) -> SensorTotals:
+        """Return the totals of a sensor of a recording."""
         last = record.blocks[-1:]["utc_ns"]
         return cls(
             name=record.name,
@@ -140,7 +140,7 @@ class Snapshot:
     elapsed: float
     time_left: float | None
     start_utc_ns: int
-    sensors: tuple[SensorState, ...]
+    sensors: tuple[SensorTotals, ...]
     clocks: tuple[ClockState, ...]
     drift: FloatArray
     closed: bool

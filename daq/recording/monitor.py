@@ -1,4 +1,4 @@
-"""How a recording and its sensors are doing now: what is cheap to look at between segments."""
+"""Status of a recording and its sensors between estimates: cheap enough for every refresh."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import BlockFlag
+from daq.recording.sensor_state import STATE_AFTER, SensorState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,15 +17,12 @@ if TYPE_CHECKING:
     from daq.protocols.block import Event
     from daq.recording.reader import Recording, SensorRecord
 
-SILENT = 3.0
-"""Seconds without a sample after which a sensor is called silent, while others go on."""
-CLIPS = 5.0
-"""Seconds for which a sensor is said to clip after it did."""
-STUCK = 5.0
-"""Seconds without any change after which a channel is said to stand still."""
-OUT_OF_ORDER = frozenset({"late", "stalled", "disconnected", "refused"})
-"""Events after which a sensor is out of order until its next block."""
-_MARKS_STATE = OUT_OF_ORDER | {"connected"}
+SILENT_AFTER = 3.0
+"""Seconds without samples after which a sensor is silent, while other sensors continue."""
+CLIPPING_SHOWN = 5.0
+"""Seconds for which a sensor counts as clipping after a clipped block."""
+STUCK_AFTER = 5.0
+"""Seconds without any change after which a channel is stuck."""
 _NS = 1e-9
 
 
@@ -38,18 +36,17 @@ class SensorStatus:
     sampling_rate : float
         In Hz.
     n_samples, n_gaps, n_missing : int
-    state : str
-        ``waiting`` for its first block, ``live``, ``silent``, ``ended``, or one of `OUT_OF_ORDER`.
-    since : float
-        For how long it has been out of order; 0 where it is not.
-    why : str
-        What the recorder said of it.
-    clips : bool
-        Whether it was at the end of its range a moment ago.
+    state : SensorState
+    overdue_for : float
+        Time since the last block of a sensor that is late or lost; 0 in other states.
+    reason : str
+        The recorder's words on the state; empty where it gave none.
+    is_clipping : bool
+        Whether one of the latest blocks reached the end of the range.
     n_clipped : int
-        Blocks in which it was.
+        Number of clipped blocks.
     stuck, was_stuck : tuple of str
-        Channels that stand still, and those that did before.
+        Channels whose values do not change now, and those whose values did not for a while.
     """
 
     name: str
@@ -58,18 +55,13 @@ class SensorStatus:
     n_samples: int
     n_gaps: int
     n_missing: int
-    state: str
-    since: float = 0.0
-    why: str = ""
-    clips: bool = False
+    state: SensorState
+    overdue_for: float = 0.0
+    reason: str = ""
+    is_clipping: bool = False
     n_clipped: int = 0
     stuck: tuple[str, ...] = ()
     was_stuck: tuple[str, ...] = ()
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether it has begun and does not come any more."""
-        return self.state == "silent" or self.state in OUT_OF_ORDER
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +71,14 @@ class RecordingStatus:
     Attributes
     ----------
     elapsed : float
-        From its start to the latest that is in it, in seconds.
+        Seconds from its start to the latest block or event.
     started_utc_ns : int
     closed : bool
-    sensors : tuple of SensorNow
+    sensors : tuple of SensorStatus
     events : tuple of Event
         All of them.
     ends_in : float or None
-        Seconds until it ends by itself, if it does.
+        Seconds until the recording ends by itself; None where it does not.
     """
 
     elapsed: float
@@ -98,7 +90,7 @@ class RecordingStatus:
 
 
 class RecordingMonitor:
-    """Looks at a recording that somebody else refreshes.
+    """Derives the status of a recording that somebody else refreshes.
 
     Parameters
     ----------
@@ -107,79 +99,87 @@ class RecordingMonitor:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._seen = {sensor.name: _Seen(sensor) for sensor in recording.sensors}
+        self._blocks = {sensor.name: _BlockSummary(sensor) for sensor in recording.sensors}
         self._events: tuple[Event, ...] = ()
-        self._latest: dict[str, Event] = {}
-        self._counts: dict[str, int] = {}
+        self._latest: dict[str, tuple[Event, SensorState]] = {}
+        self._n_samples: dict[str, int] = {}
 
-    def look(self) -> RecordingStatus:
-        """Return how things are."""
+    def status(self) -> RecordingStatus:
+        """Return the current status."""
         recording = self._recording
-        self._take_events()
-        for seen in self._seen.values():
-            seen.take_blocks()
-        begun = recording.created_at.monotonic_ns
+        self._read_events()
+        for blocks in self._blocks.values():
+            blocks.update()
+        start_ns = recording.created_at.monotonic_ns
         latest_ns = max(
-            begun,
-            *(seen.last_ns for seen in self._seen.values()),
+            start_ns,
+            *(blocks.last_ns for blocks in self._blocks.values()),
             *(event.received.monotonic_ns for event in self._events[-1:]),
         )
-        elapsed = (latest_ns - begun) * _NS
-        ends = None if recording.closed else recording.duration
+        elapsed = (latest_ns - start_ns) * _NS
+        duration = None if recording.closed else recording.duration
         return RecordingStatus(
             elapsed=elapsed,
             started_utc_ns=recording.created_at.utc_ns,
             closed=recording.closed,
             sensors=tuple(
-                self._sensor(record, self._seen[record.name], latest_ns)
+                self._sensor(record, self._blocks[record.name], latest_ns)
                 for record in recording.sensors
             ),
             events=self._events,
-            ends_in=None if ends is None else max(0.0, ends - elapsed),
+            ends_in=None if duration is None else max(0.0, duration - elapsed),
         )
 
-    def quiet(self) -> bool:
-        """Whether a sensor that goes on has sent nothing since this was asked last."""
-        counts = {record.name: record.n_samples for record in self._recording.sensors}
-        before, self._counts = self._counts, counts
-        return any(count and before.get(name) == count for name, count in counts.items())
+    def status_with_stuck_channels(self) -> RecordingStatus:
+        """Return the current status; read the latest samples to find channels that are stuck."""
+        for blocks in self._blocks.values():
+            blocks.find_stuck()
+        return self.status()
 
-    def with_states(self, now: RecordingStatus, states: Mapping[str, str]) -> RecordingStatus:
-        """Return the same, with sensors late that the recorder says are; the file says it later.
+    def is_any_sensor_quiet(self) -> bool:
+        """Return whether a sensor with samples has got none since the last call."""
+        n_samples = {record.name: record.n_samples for record in self._recording.sensors}
+        before, self._n_samples = self._n_samples, n_samples
+        return any(count and before.get(name) == count for name, count in n_samples.items())
 
-        ``states`` are those of the recorder's status, by sensor.
+    def with_late_sensors(
+        self, status: RecordingStatus, states: Mapping[str, str]
+    ) -> RecordingStatus:
+        """Return a status in which sensors are late that the recorder calls late.
+
+        The recorder writes that a sensor was late only once it is lost.
+
+        Parameters
+        ----------
+        status : RecordingStatus
+        states : mapping
+            State of each sensor, by name, as the recorder answers.
         """
-        latest_ns = round(now.elapsed / _NS) + self._recording.created_at.monotonic_ns
-        return replace(
-            now,
-            sensors=tuple(
-                replace(
-                    sensor,
-                    state="late",
-                    since=max(0.0, (latest_ns - self._seen[sensor.name].last_ns) * _NS),
-                )
-                if sensor.state == "live" and states.get(sensor.name) == "late"
-                else sensor
-                for sensor in now.sensors
-            ),
-        )
+        latest_ns = round(status.elapsed / _NS) + self._recording.created_at.monotonic_ns
+        sensors = [
+            replace(
+                sensor,
+                state=SensorState.LATE,
+                overdue_for=max(0.0, (latest_ns - self._blocks[sensor.name].last_ns) * _NS),
+            )
+            if sensor.state is SensorState.LIVE and states.get(sensor.name) == SensorState.LATE
+            else sensor
+            for sensor in status.sensors
+        ]
+        return replace(status, sensors=tuple(sensors))
 
-    def look_closely(self) -> RecordingStatus:
-        """Return how things are, and which channels stand still: reads the latest samples."""
-        for seen in self._seen.values():
-            seen.find_stuck()
-        return self.look()
-
-    def _take_events(self) -> None:
+    def _read_events(self) -> None:
         new = self._recording.events_from(len(self._events))
-        if new:
-            self._events += new
-            self._latest |= {event.sensor: event for event in new if event.kind in _MARKS_STATE}
+        self._events += new
+        for event in new:
+            state = STATE_AFTER.get(event.kind)
+            if state is not None:
+                self._latest[event.sensor] = event, state
 
-    def _sensor(self, record: SensorRecord, seen: _Seen, latest_ns: int) -> SensorStatus:
-        state, since_ns, why = self._state(record, seen, latest_ns)
+    def _sensor(self, record: SensorRecord, blocks: _BlockSummary, latest_ns: int) -> SensorStatus:
+        state, since_ns, reason = self._state(record, blocks, latest_ns)
         gaps = record.gaps
-        clipped = (latest_ns - seen.clipped_ns) * _NS <= CLIPS and not self._recording.closed
+        recent = (latest_ns - blocks.clipped_ns) * _NS <= CLIPPING_SHOWN
         return SensorStatus(
             name=record.name,
             port=record.port,
@@ -188,44 +188,51 @@ class RecordingMonitor:
             n_gaps=len(gaps),
             n_missing=int(gaps["missing"].sum()),
             state=state,
-            since=max(0.0, (latest_ns - since_ns) * _NS),
-            why=why,
-            clips=seen.n_clipped > 0 and clipped,
-            n_clipped=seen.n_clipped,
-            stuck=seen.stuck,
-            was_stuck=tuple(name for name in seen.ever_stuck if name not in seen.stuck),
+            overdue_for=max(0.0, (latest_ns - since_ns) * _NS),
+            reason=reason,
+            is_clipping=blocks.n_clipped > 0 and recent and not self._recording.closed,
+            n_clipped=blocks.n_clipped,
+            stuck=blocks.stuck,
+            was_stuck=tuple(name for name in blocks.ever_stuck if name not in blocks.stuck),
         )
 
-    def _state(self, record: SensorRecord, seen: _Seen, latest_ns: int) -> tuple[str, int, str]:
-        event = self._latest.get(record.name)
-        if event is not None and event.received.monotonic_ns > seen.last_ns:
-            at = event.received.monotonic_ns
-            if event.kind in OUT_OF_ORDER:
-                return event.kind, at if seen.last_ns < 0 else seen.last_ns, event.text
-            if seen.last_ns >= 0 and not self._recording.closed:  # it is back, without a block yet
-                return "waiting", latest_ns, event.text
+    def _state(
+        self, record: SensorRecord, blocks: _BlockSummary, latest_ns: int
+    ) -> tuple[SensorState, int, str]:
+        """Return state, monotonic time in ns since when the sensor is overdue, and the reason."""
+        has_blocks = blocks.last_ns >= 0
+        event, state = self._latest.get(record.name, (None, SensorState.WAITING))
+        if event is not None and event.received.monotonic_ns > blocks.last_ns:
+            if state.is_overdue:
+                since_ns = blocks.last_ns if has_blocks else event.received.monotonic_ns
+                return state, since_ns, event.text
+            if has_blocks and not self._recording.closed:  # connected again
+                return state, latest_ns, event.text
         if self._recording.closed:
-            return "ended", latest_ns, ""
-        if seen.last_ns < 0:
-            return "waiting", latest_ns, ""
-        if (latest_ns - seen.last_ns) * _NS > SILENT:
-            return "silent", seen.last_ns, ""
-        return "live", latest_ns, ""
+            return SensorState.ENDED, latest_ns, ""
+        if not has_blocks:
+            return SensorState.WAITING, latest_ns, ""
+        if (latest_ns - blocks.last_ns) * _NS > SILENT_AFTER:
+            return SensorState.SILENT, blocks.last_ns, ""
+        return SensorState.LIVE, latest_ns, ""
 
 
-class _Seen:
-    """What has been seen of one sensor's blocks; each is looked at once."""
+class _BlockSummary:
+    """Time, clipping and stuck channels of one sensor; reads each block once."""
 
     def __init__(self, record: SensorRecord) -> None:
         self._record = record
         self._n_blocks = 0
         self.last_ns = -1
+        """Host monotonic time at which the last block was received; -1 before the first."""
         self.n_clipped = 0
         self.clipped_ns = 0
+        """The same of the last clipped block."""
         self.stuck: tuple[str, ...] = ()
         self.ever_stuck: dict[str, None] = {}
 
-    def take_blocks(self) -> None:
+    def update(self) -> None:
+        """Read the blocks that were committed since the last call."""
         new = self._record.blocks[self._n_blocks :]
         if len(new) == 0:
             return
@@ -237,14 +244,15 @@ class _Seen:
             self.clipped_ns = int(clipped["monotonic_ns"][-1])
 
     def find_stuck(self) -> None:
+        """Find the channels whose values have not changed for ``STUCK_AFTER``."""
         record = self._record
-        wanted = math.ceil(STUCK * record.sampling_rate)
+        wanted = math.ceil(STUCK_AFTER * record.sampling_rate)
         if record.n_samples < wanted:
             return
-        still = np.ptp(record.counts(record.n_samples - wanted), axis=0) == 0
+        constant = np.ptp(record.counts(record.n_samples - wanted), axis=0) == 0
         self.stuck = tuple(
             channel.name
-            for channel, is_still in zip(record.channels, still, strict=True)
-            if is_still and not channel.auxiliary
+            for channel, is_constant in zip(record.channels, constant, strict=True)
+            if is_constant and not channel.auxiliary
         )
         self.ever_stuck |= dict.fromkeys(self.stuck)

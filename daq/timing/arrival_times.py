@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.protocols.block import BlockFlag
-from daq.timing.clock_model import Clock, ClockState, Epoch
+from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.timing.usb_polling import BEATS_PER_WINDOW, Polls, shows
@@ -260,7 +260,7 @@ class ArrivalTimes:
             rates = np.diff(longest.index) / np.diff(longest.seconds) / self.sampling_rate
             ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
         state = ClockState(
-            sensor, "device UTC", epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
+            sensor, ClockSource.DEVICE_UTC, epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
         )
         return Clock(tuple(epochs), state)
 
@@ -385,7 +385,7 @@ class ArrivalTimes:
         drift = slope * self.sampling_rate + float(smoothed.rate.mean())
         state = ClockState(
             sensor=sensor,
-            source="arrival times",
+            source=ClockSource.ARRIVAL_TIMES,
             offset=epochs[0].start,
             ppm=-drift / (1 + drift) * 1e6,
             ppm_std=math.sqrt(12) * residual / duration * 1e6,  # as if all of it were a slope

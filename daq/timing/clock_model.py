@@ -9,6 +9,7 @@ the timeline itself where all sensors share one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,6 +63,30 @@ class Epoch:
         return float(self.at(np.array([float(self.end_sample - 1)]))[0])
 
 
+class ClockSource(StrEnum):
+    """How the times of a sensor's samples are known."""
+
+    ARRIVAL_TIMES = "arrival times"
+    """A clock model was fitted to the times at which blocks arrived."""
+    DEVICE_UTC = "device UTC"
+    """The device sends UTC with its blocks."""
+    SAMPLE_INSTANTS = "sample instants"
+    """The sensor is polled: the host's time of every sample is recorded."""
+    NOMINAL_RATE = "nominal rate"
+    """The sensor is taken to sample at its nominal rate from its first arrival on."""
+    SHARED_CLOCK = "shared clock"
+    """The sensor is sampled by the clock of another sensor, or of all sensors."""
+
+
+class OffsetSource(StrEnum):
+    """How it is known by how many whole samples two sensors of one clock are apart."""
+
+    SAMPLES = "samples"
+    """The motion that both recorded."""
+    ARRIVAL_TIMES = "arrival times"
+    """The times at which their blocks arrived."""
+
+
 @dataclass(frozen=True, slots=True)
 class ClockState:
     """What is known about one sensor's clock.
@@ -69,9 +94,7 @@ class ClockState:
     Attributes
     ----------
     sensor : str
-    source : str
-        "arrival times", "device UTC", "sample instants", "nominal rate", or "clock of …" for a
-        shared one.
+    source : ClockSource
     offset : float
         Time of the first sample in seconds from the recording's origin.
     ppm, ppm_std : float
@@ -85,10 +108,15 @@ class ClockState:
         One, plus the number of restarts.
     refined : bool
         Whether the common motion has been used.
+    shared_clock : str
+        Name of a shared clock, or of the sensor whose clock it is; empty where the clock is the
+        sensor's own.
+    offset_source : OffsetSource or None
+        For sensors of one clock that began to count at different samples.
     """
 
     sensor: str
-    source: str
+    source: ClockSource
     offset: float
     ppm: float
     ppm_std: float
@@ -96,6 +124,13 @@ class ClockState:
     residual: float
     n_epochs: int
     refined: bool = False
+    shared_clock: str = ""
+    offset_source: OffsetSource | None = None
+
+    def shared_by(self, sensor: str) -> ClockState:
+        """Return the state of a sensor that is sampled by this clock."""
+        name = self.shared_clock or self.sensor
+        return replace(self, sensor=sensor, source=ClockSource.SHARED_CLOCK, shared_clock=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,10 +182,10 @@ class Clock:
     def shared_by(self, sensor: str, *, end_sample: int) -> Clock:
         """Return the same clock for a sensor whose samples it counts alike."""
         clock = self.extended(end_sample)
-        return replace(clock, state=replace(self.state, sensor=sensor, source=self._shared))
+        return replace(clock, state=self.state.shared_by(sensor))
 
     def shifted(
-        self, sensor: str, stretches: Sequence[tuple[int, int, int]], *, by_samples: bool
+        self, sensor: str, stretches: Sequence[tuple[int, int, int]], *, known_by: OffsetSource
     ) -> Clock:
         """Return the same clock for a sensor that began to count at another sample.
 
@@ -159,8 +194,8 @@ class Clock:
         sensor : str
         stretches : sequence of (first_sample, end_sample, n)
             In which its sample i is taken with sample i + n of this clock.
-        by_samples : bool
-            Whether n is known from the samples, rather than from arrival times.
+        known_by : OffsetSource
+            How n is known.
         """
         ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
         starts = [-_NEVER, *ends[:-1]]
@@ -170,15 +205,13 @@ class Clock:
             for epoch, start, stop in zip(self.epochs, starts, ends, strict=True)
             if max(first, start - n) < min(end, stop - n)
         )
-        how = "samples" if by_samples else "arrival times"
-        source = f"{self._shared}, whole samples apart by {how}"
-        state = replace(self.state, sensor=sensor, source=source, offset=epochs[0].start)
-        return Clock(epochs, replace(state, n_epochs=len(epochs)))
-
-    @property
-    def _shared(self) -> str:
-        source, name = self.state.source, self.state.sensor
-        return source if source.startswith("clock of") else f"clock of {name}"
+        state = replace(
+            self.state.shared_by(sensor),
+            offset=epochs[0].start,
+            n_epochs=len(epochs),
+            offset_source=known_by,
+        )
+        return Clock(epochs, state)
 
     def _by_epoch(
         self,
@@ -219,13 +252,22 @@ def from_instants(
     covered = sum(epoch.end - epoch.start for epoch in epochs)
     intervals = len(seconds) - len(runs)
     ppm = (intervals / covered / sampling_rate - 1) * 1e6 if covered > 0 else float("nan")
-    state = ClockState(sensor, "sample instants", epochs[0].start, ppm, 0.0, 0.0, 0.0, len(epochs))
+    state = ClockState(
+        sensor=sensor,
+        source=ClockSource.SAMPLE_INSTANTS,
+        offset=epochs[0].start,
+        ppm=ppm,
+        ppm_std=0.0,
+        wander_ppm=0.0,
+        residual=0.0,
+        n_epochs=len(epochs),
+    )
     return Clock(tuple(epochs), state)
 
 
 def nominal(
     sensor: str,
-    source: str,
+    source: ClockSource,
     *,
     end_sample: int,
     sampling_rate: float,
@@ -233,11 +275,22 @@ def nominal(
     ppm: float = 0.0,
     ppm_std: float = 0.0,
     residual: float = 0.0,
+    shared_clock: str = "",
 ) -> Clock:
     """Return the clock that *is* the timeline: sample n is taken at (first + n) / sampling_rate."""
     index = np.array([0.0, max(float(end_sample), 1.0)])
     epoch = Epoch(0, end_sample, index, (first + index) / sampling_rate)
-    state = ClockState(sensor, source, epoch.start, ppm, ppm_std, 0.0, residual, 1)
+    state = ClockState(
+        sensor=sensor,
+        source=source,
+        offset=epoch.start,
+        ppm=ppm,
+        ppm_std=ppm_std,
+        wander_ppm=0.0,
+        residual=residual,
+        n_epochs=1,
+        shared_clock=shared_clock,
+    )
     return Clock((epoch,), state)
 
 

@@ -11,13 +11,14 @@ import numpy as np
 
 from daq.drivers.bench_file import parse
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, SensorState, Snapshot
+from daq.estimation.snapshot import ChannelLabel, SensorTotals, Snapshot
 from daq.host_clock import SystemClock
-from daq.protocols.block import Event, HostTime
+from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.monitor import RecordingStatus, SensorStatus
+from daq.recording.sensor_state import SensorState
 from daq.recording.writer import RecordingWriter
-from daq.timing.clock_model import ClockState
+from daq.timing.clock_model import ClockSource, ClockState
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
@@ -70,12 +71,13 @@ def made_snapshot(
         time_left=None if closed else 260.0,
         start_utc_ns=1_795_230_000_000_000_000,
         sensors=tuple(
-            SensorState(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
+            SensorTotals(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
             for name, n_gaps, last_seen in (("A", 0, 1000.0), ("B", 2, 1000.0), ("C", 0, 988.0))
         ),
         clocks=tuple(
             ClockState(
-                name, "arrival times", 0.0, ppm, 0.02, 0.1, residual, 1, refined=residual > 0
+                *(name, ClockSource.ARRIVAL_TIMES, 0.0, ppm, 0.02, 0.1, residual, 1),
+                refined=residual > 0,
             )
             for name, ppm, residual in zip(SENSORS, PPM, RESIDUALS, strict=True)
         ),
@@ -104,20 +106,23 @@ def made_drift() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
 def made_now(*, elapsed: float = 100.0, closed: bool = False) -> RecordingStatus:
     """Three sensors: one live, one with two gaps, one silent for 12 s."""
     begun = 1_795_230_000_000_000_000
+    state = SensorState.ENDED if closed else SensorState.LIVE
     return RecordingStatus(
         elapsed=elapsed,
         started_utc_ns=begun,
         closed=closed,
         sensors=(
-            SensorStatus("A", "/dev/ttyUSB0", RATE, 20000, 0, 0, "ended" if closed else "live"),
-            SensorStatus("B", "/dev/ttyUSB1", RATE, 20000, 2, 14, "ended" if closed else "live"),
-            SensorStatus("C", "/dev/ttyUSB2", RATE, 20000, 0, 0, "ended")
+            SensorStatus("A", "/dev/ttyUSB0", RATE, 20000, 0, 0, state),
+            SensorStatus("B", "/dev/ttyUSB1", RATE, 20000, 2, 14, state),
+            SensorStatus("C", "/dev/ttyUSB2", RATE, 20000, 0, 0, state)
             if closed
-            else SensorStatus("C", "/dev/ttyUSB2", RATE, 17600, 0, 0, "silent", since=12.0),
+            else SensorStatus(
+                "C", "/dev/ttyUSB2", RATE, 17600, 0, 0, SensorState.SILENT, overdue_for=12.0
+            ),
         ),
         events=(
-            Event("", "started", "3 sensors", HostTime(0, begun)),
-            Event("", "mark", "door slammed", HostTime(0, begun + 42_000_000_000)),
+            Event("", EventKind.STARTED, "3 sensors", HostTime(0, begun)),
+            Event("", EventKind.MARK, "door slammed", HostTime(0, begun + 42_000_000_000)),
         ),
     )
 
@@ -126,7 +131,7 @@ def waiting_now() -> RecordingStatus:
     """Return the same bench before its first sample."""
     now = made_now(elapsed=0.0)
     return replace(
-        now, sensors=tuple(replace(s, n_samples=0, state="waiting") for s in now.sensors)
+        now, sensors=tuple(replace(s, n_samples=0, state=SensorState.WAITING) for s in now.sensors)
     )
 
 

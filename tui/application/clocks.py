@@ -19,7 +19,9 @@ from daq.results.clock_effect import (
     reference,
     residuals,
 )
+from daq.timing.clock_model import ClockSource
 from tui.application.curves import Line
+from tui.output.vocabulary import clock_source
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
@@ -30,20 +32,22 @@ MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 STYLES = {"good": GOOD, "doubtful": DOUBTFUL, "bad": BAD}
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
 _MIN_POINTS = 3
+_FREE = {ClockSource.ARRIVAL_TIMES, ClockSource.DEVICE_UTC}
+"""Clocks that run freely, each at a rate of its own."""
 
 
 def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
     """Return one line on the clocks: rates, what is left between them, and whether it matters."""
     clocks = snapshot.clocks
-    free = [clock for clock in clocks if clock.source in {"arrival times", "device UTC"}]
+    free = [clock for clock in clocks if clock.source in _FREE]
     if settings.clocks == "nominal":
         return Text("clocks: samples taken at face value", DOUBTFUL)
     if not clocks:
         return Text("clocks: not known yet", MUTED)
     if not free:
-        shared = all(clock.source.startswith("clock of") for clock in clocks)
-        said = "all sensors share one" if shared else "the time of every sample is known"
-        return Text(f"clocks: {said}", MUTED)
+        shared = all(clock.source is ClockSource.SHARED_CLOCK for clock in clocks)
+        words = "all sensors share one" if shared else "the time of every sample is known"
+        return Text(f"clocks: {words}", MUTED)
     words, style = _verdict(snapshot, settings)
     left = f"within {microseconds(max(residuals(snapshot).values()))}"
     by = "by motion" if any(clock.refined for clock in free) else "by arrival times"
@@ -102,7 +106,7 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
 
 
 def _source(clock: ClockState, *, is_reference: bool) -> str:
-    source = clock.source.replace("arrival times", "arrivals")
+    source = clock_source(clock, short=True)
     motion = ", motion" if clock.refined else "; the reference" if is_reference else ""
     restarts = clock.n_epochs - 1
     return f"{source}{motion}" + (f"; {restarts} restart{'s' * (restarts > 1)}" * (restarts > 0))

@@ -10,10 +10,12 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means, correlation_of, decibels, reached_cov
 from estimator.self_noise.result import Flag
 from tui.application.curves import data_curve, noise_curve
 from tui.output.formatting import clock_time, roughly, several, time_left
+from tui.output.vocabulary import STATE_ALERTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -156,18 +158,19 @@ def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
 
 
 def state(sensor: SensorStatus) -> Text:
-    """Return how a sensor is, in a word or two."""
-    word = {"disconnected": "lost"}.get(sensor.state, sensor.state)
-    if sensor.is_lost:
-        late = sensor.state == "late"
-        return Text(f"○ {word} {clock_time(sensor.since)}", "yellow" if late else "bold #ff6b6b")
-    if sensor.state == "waiting":
-        return Text("○ waiting", "yellow")
+    """Return the state of a sensor, and for how long it has been overdue."""
+    state = sensor.state
+    if state.is_overdue:
+        style = "bold #ff6b6b" if state.is_lost else "yellow"
+        return Text(f"○ {state} {clock_time(sensor.overdue_for)}", style)
+    if state is SensorState.WAITING:
+        return Text(f"○ {state}", "yellow")
     if sensor.stuck:
-        return Text(f"▲ {' '.join(sensor.stuck)} still", "bold #ff6b6b")
-    if sensor.clips:
-        return Text("▲ clips", "bold #ff6b6b")
-    return Text("■ ended", "#9aa5b8") if word == "ended" else Text("● live", "green")
+        return Text(f"▲ {' '.join(sensor.stuck)} stuck", "bold #ff6b6b")
+    if sensor.is_clipping:
+        return Text("▲ clipping", "bold #ff6b6b")
+    ended = state is SensorState.ENDED
+    return Text(f"■ {state}", "#9aa5b8") if ended else Text(f"● {state}", "green")
 
 
 def _channel_noise(
@@ -214,7 +217,9 @@ def progress_line(
     cov, target = math.nan, settings.target_cov
     if choice.methods and choice.methods[0] in snapshot.results:
         cov = reached_cov(snapshot, settings, choice.methods[0])
-    waits = [sensor.name for sensor in now.sensors if sensor.is_lost] if not now.closed else []
+    waits = (
+        [sensor.name for sensor in now.sensors if sensor.state.is_overdue] if not now.closed else []
+    )
     if snapshot.n_segments == 0:
         text = f"waits for the first {settings.segment:g} s segment"
         if snapshot.n_dropped:
@@ -267,34 +272,28 @@ def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
     """Return what is wrong with which sensor, and what to do; the worst first."""
     found: list[tuple[int, str]] = []
     for sensor in now.sensors:
-        if sensor.is_lost:
-            found.append((2 if sensor.state == "late" else 1, _what_to_do(sensor, now)))
+        if sensor.state.is_overdue:
+            found.append((1 if sensor.state.is_lost else 2, _overdue_alert(sensor, now)))
         elif sensor.stuck:
             channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.stuck)
-            found.append((3, f"{channels} stands still: no signal; check the cable to it"))
-        elif sensor.clips:
-            text = f"{sensor.name} is at the end of its range: segments with that are "
+            found.append((3, f"{channels} is stuck: no signal; check the cable"))
+        elif sensor.is_clipping:
             kept = settings is not None and settings.reject is False
-            found.append((4, text + ("kept: do not trust its noise" if kept else "left out")))
+            effect = "are kept: do not trust its noise" if kept else "are left out"
+            found.append((4, f"{sensor.name} is clipping: segments with clipped samples {effect}"))
         if sensor.was_stuck:
             channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
-            found.append((5, f"{channels} stood still for a while: do not trust its noise"))
+            found.append((5, f"{channels} was stuck for a while: do not trust its noise"))
     styles = {2: "yellow", 4: "yellow", 5: "yellow"}
     return [Text(f"▲ {text}", styles.get(rank, "bold #ff6b6b")) for rank, text in sorted(found)]
 
 
-def _what_to_do(sensor: SensorStatus, now: RecordingStatus) -> str:
-    name, ago = sensor.name, clock_time(sensor.since)
+def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
+    time = clock_time(sensor.overdue_for)
     if now.closed:
-        return f"{name} was lost {ago} before the end: {sensor.why}"
-    again = "retried by itself"
-    return {
-        "late": f"{name} is late: no block for {ago}",
-        "stalled": f"{name} sends nothing for {ago}: check power and cable; {again}",
-        "disconnected": f"{name} is disconnected for {ago}: check cable and power; {again}",
-        "refused": f"{name} is refused: {sensor.why}",
-        "silent": f"{name} is silent for {ago}: check power and cable",
-    }[sensor.state]
+        return f"{sensor.name} was lost {time} before the end: {sensor.reason}"
+    alert = STATE_ALERTS[sensor.state]
+    return alert.format(sensor=sensor.name, time=time, reason=sensor.reason)
 
 
 def advice(snapshot: Snapshot, choice: Choice) -> Text:

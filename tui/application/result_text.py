@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of, channel_means, reached_cov
 from daq.results.limits import exceeded
 from estimator.self_noise.band_means import band_edges
@@ -170,7 +171,7 @@ def _events(now: RecordingStatus) -> Table:
     shown = now.events[-LATEST_EVENTS:]
     for event in reversed(shown):
         at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
-        style = "bold #f4a261" if event.kind == "mark" else ""
+        style = "bold #f4a261" if event.kind == EventKind.MARK else ""
         table.add_row(clock_time(at), event.sensor, Text(event.kind, style), Text(event.text))
     if len(shown) < len(now.events):
         table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")

@@ -12,6 +12,8 @@ from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
+from tui.output.vocabulary import STATE_MEANINGS
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -38,15 +40,9 @@ WORDS = (
     ("segment", "a piece of the recording that is averaged; more make noise surer"),
     ("left out", "segments with a gap, clipped, or disturbed"),
     ("gaps", "how often samples are missing, and (how many)"),
-    ("live", "samples come; ended: the recording is over"),
-    ("waiting", "connected, but no sample yet"),
-    ("late", "no block for twice as long as one takes"),
-    ("stalled", "connected but sends nothing; it is connected anew by itself"),
-    ("lost", "disconnected; tried again for as long as the recording lasts"),
-    ("refused", "another device than the bench file names, or before"),
-    ("silent", "no samples, while other sensors go on"),
-    ("clips", "at the end of its range: more motion than it can measure"),
-    ("still", "a channel that does not change at all: no signal"),
+    *((state.value, meaning) for state, meaning in STATE_MEANINGS.items()),
+    ("clipping", "the motion exceeds the sensor's range"),
+    ("stuck", "the values of a channel do not change: no signal"),
     ("no signal", "nothing but zero in its spectrum; a copy: equals another channel"),
     ("clocks", "each sensor counts time by its own; aligned by when samples"),
     ("", "arrive, then by the motion that the sensors share"),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from daq.acquisition.recorder import Status
+    from daq.acquisition.recorder import RecorderStatus
 
 _LOGGER = logging.getLogger(__name__)
 GAP_INTERVAL = 60.0
@@ -44,7 +44,7 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
     if screen.is_terminal:
         with Live(console=screen, refresh_per_second=2, transient=True) as live:
 
-            def show(now: Status) -> None:
+            def show(now: RecorderStatus) -> None:
                 gaps.look(now)
                 live.update(progress_line(now, duration))
 
@@ -70,7 +70,7 @@ class GapLog:
         self._next = -math.inf
         self._known: dict[str, int] = {}
 
-    def look(self, status: Status) -> None:
+    def look(self, status: RecorderStatus) -> None:
         """Take the recorder's state."""
         if self._now() < self._next and not status.closed:
             return
@@ -85,12 +85,12 @@ class GapLog:
                 )
 
 
-def progress_line(status: Status, duration: float | None = None) -> str:
+def progress_line(status: RecorderStatus, duration: float | None = None) -> str:
     """Return what is safe of every sensor, and when a run of this duration ends."""
     sensors = "  ".join(
         f"{name} {sensor.samples}"
         + (f" ({several(sensor.gaps, 'gap')}, {sensor.missing} missing)" if sensor.gaps else "")
-        + (f" {sensor.state}" if sensor.state in {"late", "lost"} else "")
+        + (f" {sensor.state}" if sensor.state.is_overdue else "")
         for name, sensor in status.sensors.items()
     )
     left = None if duration is None else max(0.0, duration - status.elapsed)

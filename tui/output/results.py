@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from daq.results.band_summary import band_of, channel_means, highest_known
+from daq.timing.clock_model import ClockSource
 from estimator.self_noise.band_means import band_edges
 from estimator.self_noise.result import Flag
 from tui.output.formatting import clock_time, level, level_with_error, several, utc
@@ -97,7 +98,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
         for sensor in snapshot.sensors
         if sensor.n_gaps
     ]
-    fitted = [clock for clock in snapshot.clocks if clock.source == "arrival times"]
+    fitted = [clock for clock in snapshot.clocks if clock.source is ClockSource.ARRIVAL_TIMES]
     if fitted:
         rates = ", ".join(f"{clock.sensor} {clock.ppm:+.1f} ppm" for clock in fitted)
         left = snapshot.diagnostics["synchronisation"]["residual"]  # between them

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.output.diagnostics import summary, why_not_tested
 from tui.output.formatting import several, utc
 from tui.output.results import faulty_channels, left_out
+from tui.output.vocabulary import clock_source
 from tui.report.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import model_test_plot
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""
-_USUAL = {"started", "connected", "stopped", "mark"}
+_USUAL = {EventKind.STARTED, EventKind.CONNECTED, EventKind.STOPPED, EventKind.MARK}
 
 
 def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
@@ -228,6 +230,7 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     if not happenings:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
         return Section("What happened", tuple(parts))
+    together = _together(happenings)
     rows = [
         (
             _when(each.utc_ns),
@@ -240,12 +243,14 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
                 else ""
             ),
         )
-        for each, count, last in _together(happenings)
+        for each, count, last in together
     ]
     left = len(rows) - LISTED
     header = ("when (UTC)", "sensor", "what", "in words")
     tones: dict[tuple[int, int], Tone] = {
-        (number, 2): "doubtful" for number, row in enumerate(rows[:LISTED]) if row[2] not in _USUAL
+        (number, 2): "doubtful"
+        for number, (each, _, _) in enumerate(together[:LISTED])
+        if each.kind not in _USUAL
     }
     parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4)), tones=tones))
     if left > 0:
@@ -287,7 +292,7 @@ def _clock_row(
     refined = "the others against it" if is_reference else "yes" if clock.refined else "no"
     return (
         clock.sensor,
-        clock.source
+        clock_source(clock)
         + (f", {several(clock.n_epochs - 1, 'restart')}" if clock.n_epochs > 1 else ""),
         plain_number(clock.offset * 1e3, ".3f"),
         plain_number(clock.ppm, "+.3f"),

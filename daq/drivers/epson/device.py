@@ -272,7 +272,7 @@ class Device:
         await self.wait_clear(commands.GLOB_CMD, commands.NOT_READY, "starting")
         model, serial_number = await self._identity()
         if refusal := self._refusal(model, serial_number):
-            raise WrongDeviceError(f"{self._stream.label}: {refusal}")
+            raise WrongDeviceError(f"{self._stream.label}: {refusal}", found=(model, serial_number))
         version = await self.read(commands.VERSION)
         high = await self.read(commands.TEMP_HIGH)
         low = await self.read(Register(commands.TEMP_HIGH.window, commands.TEMP_HIGH.address + 2))

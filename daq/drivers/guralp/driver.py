@@ -245,7 +245,9 @@ def _identity(streams: Streams, sensor: Sensor, label: str) -> DeviceInformation
         ("system ID", wanted, system),
     ):
         if expected and expected != found:
-            raise WrongDeviceError(f"{label}: expected {what} {expected!r}, got {found!r}")
+            raise WrongDeviceError(
+                f"{label}: expected {what} {expected!r}, got {found!r}", found=found
+            )
     if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-9:
         raise WrongDeviceError(
             f"{label}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz; set the digitizer, or"

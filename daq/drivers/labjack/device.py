@@ -252,7 +252,8 @@ async def identify(
         if sensor.serial_number and sensor.serial_number != str(serial):
             raise WrongDeviceError(
                 f"{registers.label}: expected serial number {sensor.serial_number!r}, got"
-                f" '{serial}'"
+                f" '{serial}'",
+                found=serial,
             )
     return product, DeviceInformation(
         sensor=sensors[0].name,

@@ -47,7 +47,7 @@ def checked() -> BlockValidator:
 def test_what_the_file_cannot_hold_is_named(case: str) -> None:
     changes, said = FAULTY[case]
     with pytest.raises(FaultyDriverError, match=f"^bus: driver 'played' yielded .*{said}"):
-        checked().check(replace(block("a", 100, 10, NOW), **changes))
+        checked().validated(replace(block("a", 100, 10, NOW), **changes))
 
 
 @pytest.mark.parametrize(
@@ -62,24 +62,24 @@ def test_what_the_file_cannot_hold_is_named(case: str) -> None:
 )
 def test_what_is_no_item_of_its_sensors_is_named(item: object, said: str) -> None:
     with pytest.raises(FaultyDriverError, match=said):
-        checked().check(item)
+        checked().validated(item)
 
 
 def test_instants_come_always_or_never() -> None:
     one = checked()
-    one.check(block("a", 0, 10, NOW))
-    one.check(block("b", 0, 10, NOW, instants_ns=np.arange(10)))
+    one.validated(block("a", 0, 10, NOW))
+    one.validated(block("b", 0, 10, NOW, instants_ns=np.arange(10)))
     with pytest.raises(FaultyDriverError, match="some without"):
-        one.check(block("a", 10, 10, NOW, instants_ns=np.arange(10)))
+        one.validated(block("a", 10, 10, NOW, instants_ns=np.arange(10)))
 
 
 @pytest.mark.parametrize("kind", ["i1", "u2", "i4", "i8", "u8", "f4", "f8"])
 def test_counts_of_any_type_that_fit_are_good(kind: str) -> None:
     one = block("a", 0, 5, NOW)
     item = replace(one, counts=one.counts.astype(kind))
-    assert checked().check(item) is item
+    assert checked().validated(item) is item
 
 
 def test_events_of_the_port_are_good() -> None:
     item = Event("", "status", "of the port", NOW)
-    assert checked().check(item) is item
+    assert checked().validated(item) is item

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from daq.acquisition.connection import LONGEST_DELAY, BackOff, Connection, SensorLost
+from daq.acquisition.connection import (
+    MAX_RETRY_DELAY,
+    BackOff,
+    Connection,
+    SensorLate,
+    SensorLost,
+)
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Event
@@ -51,7 +57,7 @@ class SlowToLeave(PlayedDriver):
 
 
 def _kind(item: Item) -> list[str]:
-    event = item.event if isinstance(item, SensorLost) else item
+    event = item.event if isinstance(item, SensorLate | SensorLost) else item
     return [event.kind] if isinstance(event, Event) else []
 
 
@@ -83,11 +89,11 @@ async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
 
 def test_only_a_session_that_lived_as_long_as_the_wait_shortens_it() -> None:
     back_off = BackOff()
-    assert [back_off.failed() for _ in range(6)] == [0.2, 0.4, 0.8, 1.6, 3.2, LONGEST_DELAY]
-    back_off.lived(LONGEST_DELAY - 0.1)
-    assert back_off.failed() == LONGEST_DELAY
-    back_off.lived(LONGEST_DELAY)
-    assert back_off.failed() == 0.2
+    assert [back_off.next_delay() for _ in range(6)] == [0.2, 0.4, 0.8, 1.6, 3.2, MAX_RETRY_DELAY]
+    back_off.session_lasted(MAX_RETRY_DELAY - 0.1)
+    assert back_off.next_delay() == MAX_RETRY_DELAY
+    back_off.session_lasted(MAX_RETRY_DELAY)
+    assert back_off.next_delay() == 0.2
 
 
 async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> None:
@@ -142,7 +148,7 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
         while n_blocks < (3 if counter is None else 4):
             item = await queue.get()
             n_blocks += isinstance(item, Block)
-            event = item.event if isinstance(item, SensorLost) else item
+            event = item.event if isinstance(item, SensorLate | SensorLost) else item
             if isinstance(event, Event) and event.kind != "connected":
                 said.append(event)
     running.cancel()

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from daq.acquisition.recorder import Status, record
+from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
 from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
 from daq.protocols.epson import commands
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
+from daq.recording.sensor_state import SensorState
 from tests.acceptance.sample_accounting import Log, accounts
 from tests.daq.acquisition.test_recorder_process import started
 from tests.sim_devices.simulated_bench import bench_of, device, sensors, spec
@@ -61,7 +62,7 @@ async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> Non
     stop = asyncio.Event()
     wanted = dict.fromkeys(CASES, 0)
 
-    def acknowledged(status: Status) -> None:
+    def acknowledged(status: RecorderStatus) -> None:
         for name, sensor in status.sensors.items():
             if sensor.gaps and not wanted[name]:
                 wanted[name] = sensor.samples + 800
@@ -106,7 +107,7 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "daq.acquisition.stall_detector.LATENESS", 1.0
+        "daq.acquisition.stall_detector.STALL_MARGIN", 1.0
     )  # however busy the machine is
     speed = 4.0
     told = spec(table("L", "labjack"), speed=speed, age=0.0)
@@ -116,15 +117,19 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
         {"kind": "stall", "at": 26.0, "every": 32.0, "duration": 10.0},
     ]
     stop = asyncio.Event()
-    statuses: list[Status] = []
+    statuses: list[RecorderStatus] = []
     until = 0
 
-    def acknowledged(status: Status) -> None:
+    def is_stalled(status: RecorderStatus) -> bool:
+        """Return whether the sensor has stalled; once connected again it is waiting."""
+        one = status.sensors["L"]
+        return one.samples > 0 and one.state in {SensorState.STALLED, SensorState.WAITING}
+
+    def acknowledged(status: RecorderStatus) -> None:
         nonlocal until
         statuses.append(status)
-        seen = [s.sensors["L"].state for s in statuses if s.sensors]
         now = status.sensors["L"]
-        if "lost" in seen and now.state == "recording":
+        if any(map(is_stalled, statuses)) and now.state is SensorState.LIVE:
             until = until or now.samples + 200
             if now.samples >= until:
                 stop.set()
@@ -138,7 +143,8 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
             sensors=tuple(sensors(one, table("L", "labjack"), settings=settings)),
         )
         await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
-    states = [status.sensors["L"].state for status in statuses if status.sensors]
+    states = [status.sensors["L"].state for status in statuses]
+    noticed_at = [is_stalled(status) for status in statuses].index(True)
     with Recording.open(path) as recording:
         (sensor,) = recording.sensors
         by_kind = {e.kind: e for e in recording.events if e.sensor == "L"}
@@ -150,7 +156,7 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
             (b"lost packet", 100, 0)
         ] * len(lost)
         if lost:  # the recorder had started before
-            assert "late" in states[: states.index("lost") - 1]
+            assert SensorState.LATE in states[: noticed_at - 1]
         before = sensor.blocks[sensor.blocks["first_sample"] < stalled["first_sample"]][-1]
         noticed = (by_kind["late"].received.monotonic_ns - before["monotonic_ns"]) / 1e9
         assert 2 * PERIOD - 0.01 < noticed < 2 * PERIOD + 1.0 * speed  # a busy machine's second
@@ -168,9 +174,9 @@ async def test_a_digitizer_that_recovers_from_an_overflow_is_waited_for(tmp_path
     told["faults"] = [{"kind": "overflow", "at": 12.0, "every": 40.0, "duration": 5.0}]
     stop = asyncio.Event()
 
-    def acknowledged(status: Status) -> None:
+    def acknowledged(status: RecorderStatus) -> None:
         if status.sensors and all(
-            s.gaps and s.state == "recording" for s in status.sensors.values()
+            s.gaps and s.state is SensorState.LIVE for s in status.sensors.values()
         ):
             stop.set()
 

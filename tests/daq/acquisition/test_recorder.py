@@ -12,18 +12,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.acquisition.block_writer import MOST_ALIKE
-from daq.acquisition.recorder import Status, record, recording_path
+from daq.acquisition.block_writer import MAX_EVENTS_PER_SECOND
+from daq.acquisition.recorder import RecorderStatus, record, recording_path
 from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDeviceError
-from daq.protocols.block import Event
+from daq.protocols.block import Event, EventKind
 from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import verify
+from daq.recording.sensor_state import SensorState
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+
+LOST = (SensorState.DISCONNECTED, SensorState.WAITING)
+"""Lost, and soon connected again."""
 
 
 class Run:
@@ -35,7 +40,7 @@ class Run:
         self.clock = ManualClock()
         self.driver = PlayedDriver({port: PlayedDevice() for port in self.bench.ports()})
         self.stop = asyncio.Event()
-        self.statuses: list[Status] = []
+        self.statuses: list[RecorderStatus] = []
         self.news = asyncio.Event()
         self.duration: float | None = None
 
@@ -43,7 +48,7 @@ class Run:
         """Return what is on a port."""
         return self.driver.devices[port]
 
-    async def record(self) -> Status:
+    async def record(self) -> RecorderStatus:
         """Run the recorder."""
         return await record(
             self.bench,
@@ -55,12 +60,12 @@ class Run:
             drivers=self.driver.find,
         )
 
-    def _acknowledged(self, status: Status) -> None:
+    def _acknowledged(self, status: RecorderStatus) -> None:
         self.statuses.append(status)
         self.news.set()
 
     @contextlib.asynccontextmanager
-    async def going(self) -> AsyncIterator[asyncio.Task[Status]]:
+    async def going(self) -> AsyncIterator[asyncio.Task[RecorderStatus]]:
         """Run it in the background until told to stop."""
         task = asyncio.create_task(self.record())
         try:
@@ -71,17 +76,17 @@ class Run:
             task.cancel()
             await asyncio.wait([task])
 
-    async def until(self, sensor: str, samples: int, state: str = "recording") -> None:
-        """Wait for an acknowledgment."""
-        while not self._is(sensor, samples, state):
+    async def until(self, sensor: str, samples: int, *states: SensorState) -> None:
+        """Wait for an acknowledgment with one of these states, ``LIVE`` if none is given."""
+        while not self._is(sensor, samples, states or (SensorState.LIVE,)):
             self.news.clear()
             await self.news.wait()
 
-    def _is(self, sensor: str, samples: int, state: str) -> bool:
+    def _is(self, sensor: str, samples: int, states: tuple[SensorState, ...]) -> bool:
         if not self.statuses:
             return False
         now = self.statuses[-1].sensors[sensor]
-        return now.samples >= samples and now.state == state
+        return now.samples >= samples and now.state in states
 
     def send(self, sensor: str, first: int, n: int) -> None:
         """Let a device take samples and send them."""
@@ -132,7 +137,7 @@ async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> No
         run.send("a", 0, 200)
         await run.until("a", 200)
         run.device("a").items.put_nowait(NotConnectedError("cable"))
-        await run.until("a", 200, "lost")
+        await run.until("a", 200, *LOST)
         run.send("b", 0, 400)
         await run.until("b", 400)
         # 400 samples went by meanwhile; these come in a session of their own.
@@ -159,8 +164,8 @@ async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -
         run.send("a", 100, 100)
         await run.until("a", 200)
         # Nothing comes any more, and nothing says so.
-        await run.until("a", 200, "late")
-        await run.until("a", 200, "lost")
+        await run.until("a", 200, SensorState.LATE)
+        await run.until("a", 200, SensorState.STALLED, SensorState.WAITING)
         run.send("a", 0, 100)
         await run.until("a", 300)
     with Recording.open(run.path) as recording:
@@ -172,13 +177,13 @@ async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "daq.acquisition.stall_detector.LATENESS", 5.0
+        "daq.acquisition.stall_detector.STALL_MARGIN", 5.0
     )  # however busy the machine is
     run = Run(tmp_path / "r.h5", "a")
     async with asyncio.timeout(60), run.going():
         run.send("a", 0, 50)
         run.send("a", 50, 50)
-        await run.until("a", 100, "late")
+        await run.until("a", 100, SensorState.LATE)
         run.clock.advance(0.5)
         run.send("a", 150, 100)
         await run.until("a", 200)
@@ -195,14 +200,14 @@ async def test_a_word_of_the_decoder_does_not_make_a_sensor_lost(tmp_path: Path)
     async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
-        for kind in ("refused", "stalled", "disconnected"):
+        for kind in (EventKind.REFUSED, EventKind.STALLED, EventKind.DISCONNECTED):
             run.device("a").items.put_nowait(Event("a", kind, "a block", run.clock.now()))
         run.device("a").items.put_nowait(Event("a", "status", "last", run.clock.now()))
         n_statuses = len(run.statuses)
         while len(run.statuses) < n_statuses + 2:
             run.news.clear()
             await run.news.wait()
-        assert run.statuses[-1].sensors["a"].state == "recording"
+        assert run.statuses[-1].sensors["a"].state is SensorState.LIVE
 
 
 async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> None:
@@ -213,7 +218,7 @@ async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> N
         await run.until("a", 100)
         wrong = replace(block("a", 100, 10, run.clock.now()), counts=np.full((10, 2), 0.5))
         run.device("a").items.put_nowait(wrong)
-        await run.until("a", 100, "lost")
+        await run.until("a", 100, *LOST)
         run.send("b", 100, 100)
         run.send("a", 0, 100)
         await run.until("a", 200)
@@ -244,7 +249,7 @@ async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> 
 async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daq.acquisition.connection.LEAVE_TIMEOUT", 0.2)
+    monkeypatch.setattr("daq.acquisition.connection.CLOSE_TIMEOUT", 0.2)
     run = Run(tmp_path / "r.h5", "a", "b")
     run.device("a").hangs = True
     async with asyncio.timeout(60), run.going():
@@ -253,7 +258,7 @@ async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
     assert run.statuses[-1].closed
     assert run.device("b").left_quiet
     with Recording.open(run.path) as recording:
-        assert "the driver did not leave the device within 0.2 s" in [
+        assert "the driver did not close its session within 0.2 s" in [
             e.text for e in recording.events if e.sensor == "a"
         ]
 
@@ -261,7 +266,7 @@ async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
 async def test_a_driver_that_cannot_be_ended_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daq.acquisition.connection.LEAVE_TIMEOUT", 0.2)
+    monkeypatch.setattr("daq.acquisition.connection.CLOSE_TIMEOUT", 0.2)
     monkeypatch.setattr("daq.acquisition.recorder.CANCEL_TIMEOUT", 0.5)
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").may_end = may_end = asyncio.Event()
@@ -270,7 +275,7 @@ async def test_a_driver_that_cannot_be_ended_is_left_alone(
         await run.until("a", 100)
     assert run.statuses[-1].closed
     with Recording.open(run.path) as recording:
-        assert "the driver on a does not end; it was left alone" in [
+        assert "the driver on a does not end; it was abandoned" in [
             e.text for e in recording.events
         ]
     (left,) = [task for task in asyncio.all_tasks() if task.get_name() == "a"]
@@ -376,7 +381,7 @@ async def test_a_lost_sensor_is_not_waited_for_beyond_the_duration(tmp_path: Pat
     async with run.going() as task:
         run.send("b", 0, 100)
         run.device("b").items.put_nowait(NotConnectedError("cable"))
-        await run.until("b", 100, "lost")
+        await run.until("b", 100, *LOST)
         run.device("b").failure = NotConnectedError("still away")
         run.clock.advance(5.0)
         status = await task
@@ -480,8 +485,12 @@ async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) ->
         await run.until("a", 100)
     with Recording.open(run.path) as recording:
         texts = [e.text for e in recording.events if e.sensor == "a" and e.kind != "connected"]
-    expected = [f"noise {k}" for k in range(MOST_ALIKE)]
-    assert texts == [*expected, "another kind", f"{1000 - MOST_ALIKE} more of these before"]
+    expected = [f"noise {k}" for k in range(MAX_EVENTS_PER_SECOND)]
+    assert texts == [
+        *expected,
+        "another kind",
+        f"{1000 - MAX_EVENTS_PER_SECOND} more events of this kind before",
+    ]
 
 
 FULL_DISK = """
@@ -531,7 +540,7 @@ def interrupt(status):
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
 
-connection.LEAVE_TIMEOUT, recorder.CANCEL_TIMEOUT = 0.1, 0.3
+connection.CLOSE_TIMEOUT, recorder.CANCEL_TIMEOUT = 0.1, 0.3
 if "windows" in sys.argv:
     def not_here(*_):
         raise NotImplementedError

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.acquisition.recorder import Status, record
+from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
 from daq.host_clock import SystemClock
 from daq.protocols.epson import commands
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import heal, verify
+from daq.recording.sensor_state import SensorState
 from sim_devices.world.world import World
 from tests.device_server import serving
 from tests.sim_devices.simulated_bench import bench_of, device, scenario, sensors, spec
@@ -144,12 +145,12 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
     tables = [TABLES[0]]
     link = tmp_path / "tty"
     stop = asyncio.Event()
-    news: asyncio.Queue[Status] = asyncio.Queue()
+    news: asyncio.Queue[RecorderStatus] = asyncio.Queue()
     told = spec(*tables, device("B"), speed=SPEED)
     only_a = {**told, "devices": told["devices"][:1]}
     clock = SystemClock(SPEED)
 
-    async def until(samples: int, state: str) -> Status:
+    async def until(samples: int, state: SensorState) -> RecorderStatus:
         while True:
             status = await news.get()
             a = status.sensors["A"]
@@ -169,14 +170,14 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
         task = asyncio.create_task(
             record(bench, tmp_path / "r.h5", clock=clock, stop=stop, acknowledged=news.put_nowait)
         )
-        before = (await until(1000, "recording")).sensors["A"].samples
+        before = (await until(1000, SensorState.LIVE)).sensors["A"].samples
         link.unlink()  # else it leads to the next terminal made here, of whatever test runs now
         first.kill()
-        await until(before, "lost")
+        await until(before, SensorState.DISCONNECTED)
         lost_for = clock.now().monotonic_ns
         async with started(only_a) as (again,):
             link.symlink_to(again.port)
-            await until(before + 1000, "recording")
+            await until(before + 1000, SensorState.LIVE)
             lost_for = clock.now().monotonic_ns - lost_for
             stop.set()
             await task

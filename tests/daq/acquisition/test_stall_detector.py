@@ -8,7 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from daq.acquisition.stall_detector import LATENESS, LEAST_LATE, BlockInterval, StallDetector
+from daq.acquisition.stall_detector import (
+    MIN_LATE_AFTER,
+    STALL_MARGIN,
+    BlockInterval,
+    StallDetector,
+)
 from daq.protocols.block import Block, HostTime
 
 RATE = 100.0
@@ -53,7 +58,7 @@ async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -
 
     async def wait() -> None:
         async with StallDetector({"a": RATE}, said) as watch:
-            watch.block_came(block("a", 20))
+            watch.block_received(block("a", 20))
             with watch.waiting():
                 await asyncio.Event().wait()
 
@@ -66,33 +71,33 @@ async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -
 
 async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
     async with StallDetector({"a": RATE}, said) as watch:
-        watch.block_came(block("a", 20))
+        watch.block_received(block("a", 20))
         with watch.waiting():
             await said.wait(1)
-            watch.block_came(block("a", 20))
+            watch.block_received(block("a", 20))
             await said.wait(2)
     assert [item[1] for item in said.items] == ["late", "late"]
 
 
 async def test_of_several_on_a_port_one_can_be_lost(said: Said) -> None:
     async with StallDetector({"a": RATE, "b": RATE}, said) as watch:
-        watch.block_came(block("a", 10))
+        watch.block_received(block("a", 10))
         with watch.waiting():
             while len(said.items) < 2:
-                watch.block_came(block("b", 10))
+                watch.block_received(block("b", 10))
                 said.news.clear()
                 try:
                     async with asyncio.timeout(0.1):
                         await said.news.wait()
                 except TimeoutError:
                     continue
-    assert [item[:2] for item in said.items if item[0] == "a"] == [("a", "late"), ("a", "lost")]
+    assert [item[:2] for item in said.items if item[0] == "a"] == [("a", "late"), ("a", "stalled")]
 
 
 async def test_what_could_not_be_said_is_said_later(said: Said) -> None:
     said.refused = 3
     async with StallDetector({"a": RATE}, said) as watch:
-        watch.block_came(block("a", 10))
+        watch.block_received(block("a", 10))
         with watch.waiting():
             await said.wait(1)
     assert said.refused == 0
@@ -100,18 +105,18 @@ async def test_what_could_not_be_said_is_said_later(said: Said) -> None:
 
 async def test_a_busy_host_is_no_devices_fault(said: Said) -> None:
     async with StallDetector({"a": RATE}, said) as watch:
-        watch.block_came(block("a", 10))
+        watch.block_received(block("a", 10))
         with watch.waiting():
             time.sleep(1.0)  # noqa: ASYNC251 -- the event loop is to be held up
             await asyncio.sleep(0.05)
-            watch.block_came(block("a", 10))
+            watch.block_received(block("a", 10))
     assert not said.items
 
 
 async def test_nobody_is_late_while_nobody_waits(said: Said) -> None:
     """Writing lags: blocks are there, and not asked for."""
     async with StallDetector({"a": RATE}, said) as watch:
-        watch.block_came(block("a", 10))
+        watch.block_received(block("a", 10))
         await asyncio.sleep(0.6)
     assert not said.items
 
@@ -119,22 +124,22 @@ async def test_nobody_is_late_while_nobody_waits(said: Said) -> None:
 async def test_a_device_that_recovers_is_late_and_not_lost(
     said: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daq.acquisition.stall_detector.LONGEST_RECOVERY", 1.0)
+    monkeypatch.setattr("daq.acquisition.stall_detector.MAX_RECOVERY", 1.0)
     rates = {"a": RATE, "b": RATE}
 
     async def wait(watch: StallDetector) -> None:
         async with watch:
             for sensor in rates:
-                watch.block_came(block(sensor, 10))
+                watch.block_received(block(sensor, 10))
             with watch.waiting():
                 await asyncio.Event().wait()
 
-    recovering = StallDetector(rates, said, recovers=lambda: True)
+    recovering = StallDetector(rates, said, is_recovering=lambda: True)
     with pytest.raises(TimeoutError):
         await wait(recovering)
     assert recovering.seconds >= 1.0  # not for ever
     assert sorted(item[:2] for item in said.items) == [("a", "late"), ("b", "late")]
-    stalled = StallDetector(rates, said, recovers=lambda: False)
+    stalled = StallDetector(rates, said, is_recovering=lambda: False)
     with pytest.raises(TimeoutError):
         await wait(stalled)
     assert stalled.seconds < 1.0
@@ -143,20 +148,20 @@ async def test_a_device_that_recovers_is_late_and_not_lost(
 def test_one_lost_block_is_no_stall() -> None:
     """The next of a second each comes two seconds after the last, and a little: no sooner."""
     patience = BlockInterval(0.0, 10.0)
-    assert patience.lost_after == 10.0
+    assert patience.stalled_after == 10.0
     for second in range(1, 6):
-        patience.block_came(float(second), 1.0)
+        patience.block_received(float(second), 1.0)
     assert patience.late_after == 2.0
-    assert 2.1 < patience.lost_after <= 2.5
+    assert 2.1 < patience.stalled_after <= 2.5
 
 
 def test_patience_follows_the_blocks() -> None:
     patience = BlockInterval(0.0, 10.0)
-    patience.block_came(1.0, 0.01)
-    assert patience.late_after == LEAST_LATE
-    patience.block_came(2.0, 0.2)  # it came late, which is no reason to wait longer with a word
+    patience.block_received(1.0, 0.01)
+    assert patience.late_after == MIN_LATE_AFTER
+    patience.block_received(2.0, 0.2)  # it came late, which is no reason to wait longer with a word
     assert patience.late_after == pytest.approx(0.4)
-    assert patience.lost_after == pytest.approx(2.0 + LATENESS)
+    assert patience.stalled_after == pytest.approx(2.0 + STALL_MARGIN)
     for k in range(200):
-        patience.block_came(2.0 + 0.1 * (k + 1), 0.1)
+        patience.block_received(2.0 + 0.1 * (k + 1), 0.1)
     assert patience.late_after == pytest.approx(0.2)

@@ -15,6 +15,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
+from daq.timing.clock_model import ClockSource, OffsetSource
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 if TYPE_CHECKING:
@@ -253,10 +254,10 @@ def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(
         assert valid.all()
         assert len(samples) == 4000 - 137
         assert np.array_equal(samples, np.repeat(raw[137:4000], 3, axis=1).astype(float))
-        assert [clock.source for clock in aligned.clocks] == [
-            "clock of one",
-            *["clock of one, whole samples apart by arrival times"] * 2,
-        ]
+        assert {clock.source for clock in aligned.clocks} == {ClockSource.SHARED_CLOCK}
+        assert {clock.shared_clock for clock in aligned.clocks} == {"one"}
+        by_arrivals = OffsetSource.ARRIVAL_TIMES
+        assert [clock.offset_source for clock in aligned.clocks] == [None, by_arrivals, by_arrivals]
 
 
 def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path: Path) -> None:
@@ -277,10 +278,12 @@ def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path:
     for clocks in ("arrivals", "refined"):
         snapshot = estimate([path], Settings(segment=4.0, clocks=clocks))
         apart[clocks] = -100.0 * (snapshot.drift[:, 3] - snapshot.drift[:, 1])
-        assert snapshot.clocks[1].source == "clock of one"  # with "a" in every block
+        beside = snapshot.clocks[1]  # with "a" in every block
+        assert (beside.shared_clock, beside.offset_source) == ("one", None)
     assert np.allclose(apart["arrivals"], -53.0)
     assert np.allclose(apart["refined"], -50.0)
-    assert snapshot.clocks[2].source == "clock of one, whole samples apart by samples"
+    apart_by = snapshot.clocks[2]
+    assert (apart_by.shared_clock, apart_by.offset_source) == ("one", OffsetSource.SAMPLES)
     assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
 
 

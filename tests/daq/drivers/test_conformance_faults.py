@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.acquisition.connection import LONGEST_DELAY
-from daq.acquisition.recorder import Status, record
+from daq.acquisition.connection import MAX_RETRY_DELAY
+from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
 from daq.errors import DeviceError
 from daq.host_clock import SystemClock
@@ -120,7 +120,7 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
     struck: dict[str, list[str]] = {}
     when_struck: dict[str, int] = {}
 
-    def look(status: Status) -> None:
+    def look(status: RecorderStatus) -> None:
         nonlocal begun, done, struck, when_struck
         now, samples = world.now(), {name: one.samples for name, one in status.sensors.items()}
         if begun == math.inf and min(samples.values()):
@@ -159,7 +159,7 @@ def test_each_sample_is_in_its_place(
     for module in ("sample_counter", "labjack.stream"):
         monkeypatch.setattr(f"daq.protocols.{module}.SLACK", 2 * HELD_UP * SPEED)
     monkeypatch.setattr("daq.drivers.labjack.device.SLACK", 2 * HELD_UP * SPEED)
-    monkeypatch.setattr("daq.acquisition.connection.LONGEST_DELAY", LONGEST_DELAY / SPEED)
+    monkeypatch.setattr("daq.acquisition.connection.MAX_RETRY_DELAY", MAX_RETRY_DELAY / SPEED)
     path = tmp_path / "all.h5"
     with serving_all(speed=SPEED, faults=script()) as served:
         struck = asyncio.run(_recorded(served, path))

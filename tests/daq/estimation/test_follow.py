@@ -128,11 +128,11 @@ class Bench:
 def looked_at(path: Path) -> Iterator[tuple[Bench, Callable[[], dict[str, SensorStatus]]]]:
     """Yield a bench that is recorded, and how its sensors are by name."""
     with growing(path) as writer, Recording.open(path) as recording:
-        lookout = RecordingMonitor(recording)
+        monitor = RecordingMonitor(recording)
 
         def look() -> dict[str, SensorStatus]:
             recording.refresh()
-            return {sensor.name: sensor for sensor in lookout.look_closely().sensors}
+            return {sensor.name: sensor for sensor in monitor.status_with_stuck_channels().sensors}
 
         yield Bench(writer), look
 
@@ -146,12 +146,12 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         assert look()["B"].state == "live"  # not so long yet
         bench.send("AC", 12)
         seen = look()["B"]
-        assert (seen.state, round(seen.since), seen.is_lost) == ("silent", 6, True)
+        assert (seen.state, round(seen.overdue_for), seen.state.is_lost) == ("silent", 6, True)
         bench.say("B", "late", 12.1, "no block for 2 s")
         assert look()["B"].state == "late"
         bench.say("B", "stalled", 12.5, "no block for 6.5 s")
         seen = look()["B"]
-        assert (seen.state, seen.why) == ("stalled", "no block for 6.5 s")
+        assert (seen.state, seen.reason) == ("stalled", "no block for 6.5 s")
         bench.say("B", "connected", 12.8)
         assert look()["B"].state == "waiting"
         bench.send("B", 14)
@@ -168,26 +168,28 @@ def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -
     with growing(path, duration=duration) as writer, Recording.open(path) as recording:
         Bench(writer).send("ABC", 8)
         recording.refresh()
-        now = RecordingMonitor(recording).look()
+        now = RecordingMonitor(recording).status()
         assert now.ends_in == (None if duration is None else pytest.approx(60 - now.elapsed))
         writer.close()
         recording.refresh()
-        assert RecordingMonitor(recording).look().ends_in is None
+        assert RecordingMonitor(recording).status().ends_in is None
 
 
 def test_a_sensor_is_late_when_its_recorder_says_so(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer, Recording.open(path) as recording:
-        bench, lookout = Bench(writer), RecordingMonitor(recording)
+        bench, monitor = Bench(writer), RecordingMonitor(recording)
         bench.send("ABC", 2)
         recording.refresh()
-        assert not lookout.quiet()
+        assert not monitor.is_any_sensor_quiet()
         bench.send("AC", 4)
         recording.refresh()
-        assert lookout.quiet()
-        now = lookout.with_states(lookout.look(), {"A": "recording", "B": "late", "C": "lost"})
+        assert monitor.is_any_sensor_quiet()
+        now = monitor.with_late_sensors(
+            monitor.status(), {"A": "live", "B": "late", "C": "waiting"}
+        )
         assert [sensor.state for sensor in now.sensors] == ["live", "late", "live"]
-        assert now.sensors[1].since == pytest.approx(2, abs=0.1)
+        assert now.sensors[1].overdue_for == pytest.approx(2, abs=0.1)
 
 
 def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -> None:
@@ -196,12 +198,12 @@ def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -
         bench.send("C", 6, dead=1)
         bench.send("A", 8, clipped=True)
         seen = look()
-        assert (seen["A"].clips, seen["A"].n_clipped) == (True, 2)
+        assert (seen["A"].is_clipping, seen["A"].n_clipped) == (True, 2)
         assert seen["C"].stuck == ("Y",)
-        assert not any((seen["B"].clips, seen["B"].stuck, seen["A"].stuck))
+        assert not any((seen["B"].is_clipping, seen["B"].stuck, seen["A"].stuck))
         bench.send("ABC", 20)
         seen = look()
-        assert (seen["A"].clips, seen["A"].n_clipped) == (False, 2)
+        assert (seen["A"].is_clipping, seen["A"].n_clipped) == (False, 2)
         assert (seen["C"].stuck, seen["C"].was_stuck) == ((), ("Y",))
 
 

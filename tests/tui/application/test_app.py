@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from textual.widgets import Static
 
+from daq.recording.sensor_state import SensorState
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.example_snapshot import (
     SETTINGS,
@@ -209,7 +210,13 @@ async def test_without_colours_everything_is_there(
         await pilot.press("c")
         await shown(pilot, app)
         assert "clock drift" in screen_text(app)
-    for said in ("● live", "○ silent", "no effect on noise", "▲ C is silent", "three-channel"):
+    for said in (
+        "● live",
+        "○ silent",
+        "no effect on noise",
+        "▲ C has been silent",
+        "three-channel",
+    ):
         assert said in text
 
 
@@ -219,21 +226,23 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Progress
     worse = replace(
         now,
         sensors=(
-            replace(first, clips=True),
-            replace(second, state="disconnected", since=75.0),
-            replace(third, state="live", stuck=("Y",)),
+            replace(first, is_clipping=True),
+            replace(second, state=SensorState.DISCONNECTED, overdue_for=75.0),
+            replace(third, state=SensorState.LIVE, stuck=("Y",)),
         ),
     )
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
         await shown(pilot, app, StatusUpdated(worse), SnapshotReady(made_snapshot(), SETTINGS))
         text = screen_text(app)
-        assert "▲ B is disconnected for 1:15: check cable and power" in text
+        assert "▲ B has been disconnected for 1:15: check cable and power" in text
         assert "+2: d" in text
-        assert [word in text for word in ("▲ clips", "○ lost 1:15", "▲ Y still")] == [True] * 3
+        assert [word in text for word in ("▲ clipping", "○ disconnected 1:15", "▲ Y stuck")] == [
+            True
+        ] * 3
         await pilot.resize_terminal(*WIDE)
         await shown(pilot, app)
-        assert "C.Y stands still: no signal" in screen_text(app)
+        assert "C.Y is stuck: no signal" in screen_text(app)
 
 
 @pytest.mark.parametrize("target", [0.05, None])
@@ -244,7 +253,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
     snapshot = replace(made_snapshot(), time_left=None if target is None else 260.0)
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        live = tuple(replace(sensor, state="live") for sensor in made_now().sensors)
+        live = tuple(replace(sensor, state=SensorState.LIVE) for sensor in made_now().sensors)
         now = replace(made_now(), sensors=live, ends_in=100.0)
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, settings))
         line = str(app.query_one("#progress", Static).content)

@@ -63,7 +63,7 @@ def test_line_says_most_where_there_is_room() -> None:
 
 def test_clocks_that_are_one_or_unknown() -> None:
     snapshot = made_snapshot()
-    shared = tuple(replace(clock, source="clock of lab") for clock in snapshot.clocks)
+    shared = tuple(clock.shared_by("lab") for clock in snapshot.clocks)
     one = clock_line(replace(snapshot, clocks=shared), SETTINGS, width=78)
     assert one.plain == "clocks: all sensors share one"
     unknown = clock_line(replace(snapshot, clocks=()), SETTINGS, width=78)

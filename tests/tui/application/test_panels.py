@@ -42,7 +42,7 @@ def test_what_becomes_of_clipped_segments_is_as_the_settings_say(
     reject: bool | None, said: str
 ) -> None:
     now = made_now()
-    now = replace(now, sensors=(replace(now.sensors[0], clips=True),))
+    now = replace(now, sensors=(replace(now.sensors[0], is_clipping=True),))
     (alert,) = alerts(now, replace(SETTINGS, reject=reject))
     assert said in alert.plain
 

@@ -16,6 +16,7 @@ from daq.protocols.block import BlockFlag
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
+from daq.recording.sensor_state import SensorState
 from sim_devices.errors import ServeError
 from tests.acceptance.run_bench import command
 from tests.device_server import serving
@@ -87,7 +88,7 @@ def wait_until(path: Path, recorder: subprocess.Popen[str], **wanted: Any) -> di
         if now and all(
             now[name]["state"] == what
             if isinstance(what, str)
-            else now[name]["state"] == "recording" and now[name]["samples"] >= what
+            else now[name]["state"] == SensorState.LIVE and now[name]["samples"] >= what
             for name, what in wanted.items()
         ):
             return now
@@ -111,7 +112,7 @@ def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
             wait_until(out, recorder, **dict.fromkeys(MODES, 600))
             for one in running[:2]:
                 one.kill()
-            before = wait_until(out, recorder, **dict.fromkeys(KILLED, "lost"))
+            before = wait_until(out, recorder, **dict.fromkeys(KILLED, SensorState.DISCONNECTED))
             wait_until(out, recorder, C=before["C"]["samples"] + 600)
             with serving(alone) as again:
                 assert [one.port for one in again] == [one.port for one in running[:2]]

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from daq.acquisition.block_writer import SensorStatus
-from daq.acquisition.recorder import Status
+from daq.acquisition.block_writer import SensorProgress
+from daq.acquisition.recorder import RecorderStatus
 from daq.python_process import python_command
+from daq.recording.sensor_state import SensorState
 from tui.cli.main import app
 from tui.commands.record import progress_line
 from tui.output.console import notices, progress, write_text
@@ -27,9 +28,12 @@ def test_a_full_disk_is_told_with_the_file_s_name(append: bool) -> None:
 
 
 def test_a_recorder_on_a_terminal_says_when_it_ends() -> None:
-    status = Status("a.h5", 20.0, {"A": SensorStatus("recording", 4000, 0, 0)})
+    status = RecorderStatus("a.h5", 20.0, {"A": SensorProgress(SensorState.LIVE, 4000, 0, 0)})
     assert progress_line(status) == "0:20  samples safe: A 4000"
     assert progress_line(status, 100.0) == "0:20  samples safe: A 4000  ends in 80 s"
+    for state in SensorState:
+        status = RecorderStatus("a.h5", 20.0, {"A": SensorProgress(state, 4000, 0, 0)})
+        assert (f"A 4000 {state}" in progress_line(status)) is state.is_overdue
 
 
 def test_lines_are_appended(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from daq.estimation.diagnosis import synchronisation
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.timing.clock_model import ClockState
+from daq.timing.clock_model import ClockSource, ClockState
 from sim_devices.world.scenario import Scenario
 from tui.cli.main import app
 from tui.output.results import remarks
@@ -100,7 +100,7 @@ def test_half_a_minute_is_stated_by_its_samples_not_by_its_arrivals(
 
 def test_a_clock_that_samples_could_not_refine_is_as_far_off_as_the_arrivals_leave_it() -> None:
     states = [
-        ClockState(name, "arrival times", 0.0, 0.0, 0.0, 0.0, residual, 1, refined)
+        ClockState(name, ClockSource.ARRIVAL_TIMES, 0.0, 0.0, 0.0, 0.0, residual, 1, refined)
         for name, residual, refined in (("A", 3e-6, False), ("B", 1e-6, True), ("C", 4e-6, False))
     ]
     told = synchronisation(

@@ -1,0 +1,55 @@
+"""The state of a sensor: one vocabulary from the recorder to screens, JSON and reports."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from daq.protocols.block import EventKind
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class SensorState(StrEnum):
+    """State of one sensor of a recording."""
+
+    WAITING = "waiting"
+    """Connected; no block has arrived since."""
+    LIVE = "live"
+    """Blocks arrive and are recorded."""
+    LATE = "late"
+    """No block has arrived for two block periods."""
+    STALLED = "stalled"
+    """The port is open, but no block has arrived for so long that the sensor counts as lost."""
+    DISCONNECTED = "disconnected"
+    """The connection ended; the recorder tries to connect again until the run ends."""
+    REFUSED = "refused"
+    """Another device answers than the bench file names, or than was recorded before."""
+    SILENT = "silent"
+    """The file has received no samples for some seconds, and the recorder has given no reason."""
+    ENDED = "ended"
+    """The recording is closed, and the sensor was not lost when it was."""
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the sensor delivers nothing any more."""
+        return self in _LOST
+
+    @property
+    def is_overdue(self) -> bool:
+        """Whether the sensor is late or lost."""
+        return self is SensorState.LATE or self in _LOST
+
+
+_LOST = frozenset(
+    {SensorState.STALLED, SensorState.DISCONNECTED, SensorState.REFUSED, SensorState.SILENT}
+)
+STATE_AFTER: Mapping[str, SensorState] = {
+    EventKind.CONNECTED: SensorState.WAITING,
+    EventKind.LATE: SensorState.LATE,
+    EventKind.STALLED: SensorState.STALLED,
+    EventKind.DISCONNECTED: SensorState.DISCONNECTED,
+    EventKind.REFUSED: SensorState.REFUSED,
+}
+"""State of a sensor after an event, until its next block; other kinds leave the state unchanged."""
