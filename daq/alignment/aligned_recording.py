@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
-    from daq.recording.reader import Recording, SensorRecord
+    from daq.recording.interface import ReadableRecording, ReadableSensor
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
@@ -44,7 +44,7 @@ class AlignedRecording:
 
     Parameters
     ----------
-    recording : Recording
+    recording : ReadableRecording
         Open; may still be growing.
     sampling_rate : float, optional
         Of the grid, in Hz; the lowest of the sensors' where not given.
@@ -61,7 +61,7 @@ class AlignedRecording:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: ReadableRecording,
         *,
         sampling_rate: float | None = None,
         start_utc_ns: int | None = None,
@@ -365,7 +365,7 @@ class AlignedRecording:
         return Grid(self.sampling_rate, start)
 
 
-def _grid_rate(records: list[SensorRecord], wanted: float | None) -> float:
+def _grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:
     rates = {record.name: record.sampling_rate for record in records}
     lowest = min(rates.values())
     if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):

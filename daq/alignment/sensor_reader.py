@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.recording.reader import SensorRecord
+    from daq.recording.interface import ReadableSensor
     from daq.timing.clock_model import Clock
 
     FloatArray = NDArray[np.float64]
@@ -59,7 +59,7 @@ class DelayMeasurement:
 class SensorSource:
     """One sensor of the recording: where its samples are, and when they were taken."""
 
-    record: SensorRecord
+    record: ReadableSensor
     columns: list[int]
     sensitivity: FloatArray
     arrivals: ArrivalTimes
@@ -125,7 +125,7 @@ class SensorSource:
         return present
 
     @classmethod
-    def of(cls, record: SensorRecord, monotonic_ns: int, utc_ns: int) -> SensorSource:
+    def of(cls, record: ReadableSensor, monotonic_ns: int, utc_ns: int) -> SensorSource:
         """Return the source of a sensor, nothing taken yet, times from this origin."""
         columns = main_columns(record)
         return cls(
@@ -253,6 +253,6 @@ class SensorSource:
         self.clock = known.shifted(name, stretches, known_by=known_by)
 
 
-def main_columns(record: SensorRecord) -> list[int]:
+def main_columns(record: ReadableSensor) -> list[int]:
     """Return the columns of the channels that take part in the huddle test."""
     return [column for column, channel in enumerate(record.channels) if not channel.auxiliary]

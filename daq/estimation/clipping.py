@@ -15,7 +15,7 @@ from daq.protocols.block import BlockFlag
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.recording.reader import SensorRecord
+    from daq.recording.interface import ReadableSensor
 
 _STRETCHES = 16
 _ROWS = 2048  # of each
@@ -24,7 +24,7 @@ _MIN_SAMPLES = 8  # samples at an end
 _TIMES = 5  # more often than the count beside it; a sine reaches 2.4
 
 
-def clipped_shares(record: SensorRecord) -> dict[str, float]:
+def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     """Return the share of samples at the end of the range, by name of the channel.
 
     Only channels of the huddle test that are cut off; blocks that say so themselves (the estimate
@@ -47,7 +47,7 @@ def clipped_shares(record: SensorRecord) -> dict[str, float]:
     return {name: share for name, share in shares.items() if share}
 
 
-def _rows(record: SensorRecord) -> NDArray[np.int64]:
+def _rows(record: ReadableSensor) -> NDArray[np.int64]:
     """First and last + 1 row of every stretch, shape (n, 2)."""
     n_rows = record.n_samples
     if n_rows <= _STRETCHES * _ROWS:

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daq.recording.reader import Recording
+    from daq.recording.interface import ReadableRecording
     from estimator.spectra.multiresolution import Band
 
 Progress = Callable[[int, int], None]
@@ -65,8 +65,9 @@ class Estimation:
 
     Parameters
     ----------
-    paths : sequence of path
-        Several recordings of the same sensors accumulate into one estimate.
+    paths : sequence of path or ReadableRecording
+        Several recordings of the same sensors accumulate into one estimate. Those that are open
+        already are closed with the estimate.
     settings : Settings, optional
         What the bench in the first recording says, where not given.
 
@@ -80,10 +81,12 @@ class Estimation:
         If one recording is given twice, or a unit or gain does not fit the sensors.
     """
 
-    def __init__(self, paths: Sequence[str | Path], settings: Settings | None = None) -> None:
+    def __init__(
+        self, paths: Sequence[str | Path | ReadableRecording], settings: Settings | None = None
+    ) -> None:
         if not paths:
             raise CannotAlignError("no recording given; expected at least one")
-        self._recordings: list[Recording] = []
+        self._recordings: list[ReadableRecording] = []
         try:
             for path in paths:
                 self._recordings.append(open_another(path, self._recordings))
@@ -113,7 +116,7 @@ class Estimation:
         self.close()
 
     @property
-    def recordings(self) -> tuple[Recording, ...]:
+    def recordings(self) -> tuple[ReadableRecording, ...]:
         """What is followed: as of the last `update`."""
         return tuple(self._recordings)
 
@@ -360,7 +363,7 @@ class Estimation:
 
 
 def estimate(
-    paths: Sequence[str | Path],
+    paths: Sequence[str | Path | ReadableRecording],
     settings: Settings | None = None,
     *,
     progress: Progress | None = None,
@@ -369,7 +372,7 @@ def estimate(
 
     Parameters
     ----------
-    paths : sequence of path
+    paths : sequence of path or ReadableRecording
         Several recordings of the same sensors accumulate into one estimate.
     settings : Settings, optional
         What the bench in the first recording says, where not given.

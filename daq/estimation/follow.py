@@ -20,7 +20,7 @@ from daq.estimation.estimation import Estimation
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
 from daq.recording.monitor import RecordingMonitor
-from daq.recording.reader import control_address
+from daq.recording.reader import Recording, control_address
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from daq.recording.reader import Recording
 
 STATUS_INTERVAL = 1.0
 """Seconds between looks at the sensors, where they are watched."""
@@ -127,8 +126,8 @@ def follow(
         If the whole recording is too little for any of the methods.
     """
     cancelled = threading.Event() if cancelled is None else cancelled
-    with Estimation([path], settings) as estimation:
-        (recording,) = estimation.recordings
+    recording = Recording.open(path)
+    with Estimation([recording], settings) as estimation:
         known = _RemoteRecorder(recording, cancelled, silence) if recorder is None else recorder
         sensors = _Sensors(recording, observer) if watch_sensors else None
         looks, estimates = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE)

@@ -16,10 +16,15 @@ if TYPE_CHECKING:
 
     from daq.estimation.segment_pass import Pass
     from daq.estimation.settings import Settings
+    from daq.recording.interface import ReadableRecording
 
 
-def open_another(path: str | Path, others: Sequence[Recording]) -> Recording:
+def open_another(
+    path: str | Path | ReadableRecording, others: Sequence[ReadableRecording]
+) -> ReadableRecording:
     """Open a recording that is none of the others, under whatever name.
+
+    One that is open already is returned.
 
     Raises
     ------
@@ -28,6 +33,8 @@ def open_another(path: str | Path, others: Sequence[Recording]) -> Recording:
     WrongSettingError
         If it is one of them or a copy: what is counted twice is not known any better.
     """
+    if not isinstance(path, (str, Path)):
+        return path
     path = Path(path)
     for other in others:  # two readers of a file in one process disturb each other
         if other.path.resolve() == path.resolve():
@@ -84,7 +91,7 @@ def check_span(passes: Sequence[Pass], settings: Settings) -> None:
         )
 
 
-def _twice(path: Path, other: Recording) -> WrongSettingError:
+def _twice(path: Path, other: ReadableRecording) -> WrongSettingError:
     return WrongSettingError(
         f"{path} and {other.path} are the same recording (run {other.run_id});"
         " give it once: twice the same samples say no more than once"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.estimation.settings import Settings
-    from daq.recording.reader import Recording
+    from daq.recording.interface import ReadableRecording
 
     FloatArray = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgiv
 class Pass:
     """Segments of one recording, taken in order."""
 
-    def __init__(self, recording: Recording, settings: Settings) -> None:
+    def __init__(self, recording: ReadableRecording, settings: Settings) -> None:
         self.recording = recording
         self.aligned = AlignedRecording(
             recording,

@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daq.recording.reader import SensorRecord
+    from daq.recording.interface import ReadableSensor
     from daq.timing.clock_model import ClockState
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -41,7 +41,7 @@ class SensorTotals:
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
 
     @classmethod
-    def of(cls, record: SensorRecord) -> SensorTotals:
+    def of(cls, record: ReadableSensor) -> SensorTotals:
         """Return the totals of a sensor of a recording."""
         last = record.blocks[-1:]["utc_ns"]
         return cls(

@@ -118,9 +118,9 @@ def test_what_is_shown_live_at_the_end_is_the_estimate_from_the_file(
             if number % 50 == 49:
                 writer.commit()
                 lacked, had = live.lacking, live.n_seen
-                grown = -live.recordings[0].sensor("a").n_samples
+                grown = -live.recordings[0].sensors[0].n_samples
                 live.update()
-                grown += live.recordings[0].sensor("a").n_samples
+                grown += live.recordings[0].sensors[0].n_samples
                 # when to look next: not before it is there, and never long after
                 assert (live.n_seen > had) <= (grown / 100 >= lacked - 1)
                 assert 0 < live.lacking <= (SETTINGS.segment if had else 2 * SETTINGS.segment)
