@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -18,36 +17,19 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    InstanceOf,
+    PlainSerializer,
     PrivateAttr,
+    create_model,
     model_validator,
 )
 
 from daq.bench.durations import parse_duration
+from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.toml_text import to_toml
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-
-METHODS = ("two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
-WINDOWS = (
-    "rectangular",
-    "boxcar",
-    "bartlett",
-    "barthann",
-    "blackman",
-    "blackmanharris",
-    "bohman",
-    "cosine",
-    "flattop",
-    "hamming",
-    "hann",
-    "nuttall",
-    "parzen",
-    "triang",
-)
-PARAMETRIC_WINDOWS = ("chebwin", "dpss", "gaussian", "general_hamming", "kaiser", "tukey")
-"""Of one parameter each, as in ``kaiser,8``."""
 
 
 def _name(value: str) -> str:
@@ -55,31 +37,6 @@ def _name(value: str) -> str:
         raise ValueError("expected a printable name without '/' and outer spaces")
     if not 0 < len(value.encode()) <= 64:
         raise ValueError("expected a name of 1 to 64 bytes")
-    return value
-
-
-def _method(value: str) -> str:
-    return _one_of(value, METHODS)
-
-
-def _window(value: str) -> str:
-    name, _, parameter = value.partition(",")
-    if name not in PARAMETRIC_WINDOWS:
-        return _one_of(value, WINDOWS)
-    try:
-        positive = 0 < float(parameter) < math.inf
-    except ValueError:
-        positive = False
-    if not positive:
-        raise ValueError(f"expected its parameter as well, above 0, as in {name},0.5")
-    return value
-
-
-def _one_of(value: str, known: tuple[str, ...]) -> str:
-    if value not in known:
-        close = difflib.get_close_matches(value.lower(), known, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"expected one of {', '.join(known)}{hint}")
     return value
 
 
@@ -110,20 +67,6 @@ def _pair_to_complex(value: object) -> object:
     if isinstance(value, (int, float, complex)) and not isinstance(value, bool):
         return complex(value)
     raise ValueError("expected a number or [real, imaginary], in rad/s")
-
-
-def _dimension(value: object) -> object:
-    if value is None or value == "auto":
-        return value
-    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
-        return value
-    raise ValueError('expected "auto", or a number of dimensions such as 3')
-
-
-def _gain(value: object) -> object:
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
-        return float(value)
-    raise ValueError("expected a number other than 0, such as 1.02")
 
 
 Number = Annotated[float, Field(strict=True)]
@@ -222,27 +165,29 @@ class Sensor(Table):
         return sum(not channel.auxiliary for channel in self.channels)
 
 
-class EstimateSettings(Table):
-    """How the self-noise is estimated, unless the command says otherwise."""
+_ESTIMATE_FIELDS: dict[str, Any] = {
+    key: (Annotated[Any, BeforeValidator(OPTIONS[name].check)], None)
+    for key, name in table_keys().items()
+}
+EstimateTable = create_model("EstimateTable", __base__=Table, **_ESTIMATE_FIELDS)
+"""The ``[estimate]`` table, each key with the check of its option."""
 
-    segment: Duration = 10.0
-    overlap: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.5
-    window: Annotated[str, AfterValidator(_window)] = "hann"
-    detrend: Literal["none", "constant", "linear"] = "constant"
-    method: Annotated[str, AfterValidator(_method)] = "three-sensor"
-    correct: bool = True
-    target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
-    """Wanted coefficient of variation of the noise PSD within ``band``."""
-    band: tuple[PositiveNumber, PositiveNumber] | None = None
-    """Lowest and highest frequency of interest, in Hz."""
-    reject: Annotated[bool, Field(strict=True)] | None = None
-    """Whether segments with transients are left out; those that are clipped, if not given."""
-    octaves: Annotated[bool, Field(strict=True)] = False
-    """Whether each octave has segments of its own length."""
-    dimension: Annotated[int | Literal["auto"] | None, BeforeValidator(_dimension)] = None
-    """Dimensions of the common motion, for maximum likelihood; a sensor's, if not given."""
-    gains: dict[str, Annotated[float, BeforeValidator(_gain)]] = Field(default_factory=dict)
-    """What sensors ("B") or channels ("B.X") make of the motion, for the two-channel method."""
+
+def estimate_settings(table: object) -> EstimateSettings:
+    """Return the settings of an ``[estimate]`` table.
+
+    Raises
+    ------
+    ValidationError
+        With every fault of the table.
+    """
+    if isinstance(table, EstimateSettings):
+        return table
+    checked = EstimateTable.model_validate(table)
+    names = table_keys()
+    return EstimateSettings(
+        **{names[key]: getattr(checked, key) for key in checked.model_fields_set}
+    )
 
 
 class RecordingSettings(Table):
@@ -285,7 +230,11 @@ class Bench(Table):
     sampling_rate: PositiveNumber = Field(description="the sampling rate in Hz")
     """In Hz, of the common grid, and of every sensor that does not say its own."""
     sensors: tuple[Sensor, ...] = Field(min_length=1, description="[[sensors]] tables")
-    estimate: EstimateSettings = EstimateSettings()
+    estimate: Annotated[
+        InstanceOf[EstimateSettings],
+        BeforeValidator(estimate_settings),
+        PlainSerializer(to_table),
+    ] = EstimateSettings()
     recording: RecordingSettings = RecordingSettings()
     schedule: Schedule = Schedule()
     limits: tuple[Limit, ...] = ()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -12,7 +11,15 @@ from pydantic import BaseModel, ValidationError
 
 from daq.bench.driver_rules import Checking
 from daq.bench.durations import format_duration
-from daq.bench.model import EstimateSettings, Limit, RecordingSettings, Sensor, valid_rate
+from daq.bench.estimate_settings import OPTIONS, EstimateSettings, misfits, shortest_duration
+from daq.bench.model import (
+    EstimateTable,
+    Limit,
+    RecordingSettings,
+    Sensor,
+    estimate_settings,
+    valid_rate,
+)
 from daq.errors import BenchFileError
 
 if TYPE_CHECKING:
@@ -20,7 +27,6 @@ if TYPE_CHECKING:
 
     from daq.bench.driver_rules import DriverRules
 
-_MIN_SEGMENT_SAMPLES = 16
 _TableT = TypeVar("_TableT", bound=BaseModel)
 
 
@@ -94,6 +100,8 @@ def _fields(model: type[BaseModel], location: Sequence[int | str]) -> dict[str, 
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
+    if annotation is EstimateSettings:
+        return EstimateTable
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((m for m in map(_model_in, get_args(annotation)) if m is not None), None)
@@ -140,7 +148,10 @@ def cross_faults(table: Mapping[str, Any], drivers: Mapping[str, DriverRules]) -
     default = {"sampling_rate": rate or 1.0}
     found = [_valid(Sensor, default | e) if isinstance(e, dict) else None for e in entries]
     sensors = [sensor for sensor in found if sensor is not None]
-    estimate = _valid(EstimateSettings, table.get("estimate", {}))
+    try:
+        estimate = estimate_settings(table.get("estimate", {}))
+    except ValidationError:
+        estimate = None
 
     for entry in entries:
         yield from _driver_faults(entry, drivers)
@@ -154,7 +165,7 @@ def cross_faults(table: Mapping[str, Any], drivers: Mapping[str, DriverRules]) -
     if estimate is not None:
         yield from _set_faults(sensors, len(entries), estimate)
         yield from _method_faults(estimate)
-        if len(sensors) == len(entries):
+        if sensors and len(sensors) == len(entries):
             yield from _option_faults(estimate, sensors)
     if rate is not None:
         yield from _rate_faults(sensors, rate)
@@ -237,12 +248,12 @@ def _device_faults(
 def _set_faults(
     sensors: Sequence[Sensor], n_named: int, estimate: EstimateSettings
 ) -> Iterator[Fault]:
-    needed = 2 if estimate.method == "two-channel" else 3
+    needed = 2 if estimate.methods == ("two-channel",) else 3
     if n_named < needed:
         yield Fault(
             "sensors",
             f"{n_named} sensor{'' if n_named == 1 else 's'}",
-            f"expected at least {needed} for method {estimate.method!r}",
+            f"expected at least {needed} for method {', '.join(estimate.methods)}",
         )
     counts = Counter(sensor.n_main_channels for sensor in sensors)
     if len(counts) > 1:
@@ -262,34 +273,20 @@ def _method_faults(estimate: EstimateSettings) -> Iterator[Fault]:
         ("dimension", estimate.dimension, "maximum-likelihood"),
         ("gains", estimate.gains or None, "two-channel"),
     ):
-        if value is not None and estimate.method not in {method, "all"}:
+        if value is not None and not {method, "all"} & set(estimate.methods):
             yield Fault(
                 f"estimate.{key}",
                 value,
-                f'expected with method = "{method}" or "all" only, not "{estimate.method}"',
+                f'expected with method = "{method}" or "all" only, not'
+                f' "{", ".join(estimate.methods)}"',
             )
 
 
 def _option_faults(estimate: EstimateSettings, sensors: Sequence[Sensor]) -> Iterator[Fault]:
     """Yield options that these sensors do not allow."""
-    channels = [
-        f"{sensor.name}.{channel.name}"
-        for sensor in sensors
-        for channel in sensor.channels
-        if not channel.auxiliary
-    ]
-    known = (*(sensor.name for sensor in sensors), *channels)
-    for name, gain in estimate.gains.items():
-        if name not in known:
-            yield Fault(f'estimate.gains["{name}"]', gain, _expected(name, known))
-    most = math.floor(len(channels) - math.sqrt(len(channels)))  # (p - q)² ≥ p
-    if isinstance(estimate.dimension, int) and estimate.dimension > most:
-        yield Fault(
-            "estimate.dimension",
-            estimate.dimension,
-            f"expected at most {most}: more cannot be told from the noise of {len(channels)} "
-            "channels",
-        )
+    for misfit in misfits(estimate, sensors):
+        key = OPTIONS[misfit.name].key or misfit.name
+        yield Fault(f"estimate.{key}", misfit.value, misfit.expected)
 
 
 def _rate_faults(sensors: Sequence[Sensor], rate: float) -> Iterator[Fault]:
@@ -309,14 +306,6 @@ def _estimate_faults(
     sensors: Sequence[Sensor],
     rate: float,
 ) -> Iterator[Fault]:
-    shortest = _MIN_SEGMENT_SAMPLES / rate
-    if estimate.segment < shortest:
-        yield Fault(
-            "estimate.segment",
-            format_duration(estimate.segment),
-            f"expected at least {format_duration(shortest)}, {_MIN_SEGMENT_SAMPLES} samples at"
-            f" {rate:g} Hz",
-        )
     if estimate.band is not None:
         low, high = estimate.band
         if not (1 / estimate.segment <= low < high <= rate / 2):
@@ -326,18 +315,15 @@ def _estimate_faults(
                 f"expected [low, high] Hz from {1 / estimate.segment:.4g} (one over the segment)"
                 f" to {rate / 2:.4g} (half the sampling rate)",
             )
-    if recording is None or recording.duration is None:
+    if recording is None or recording.duration is None or not sensors:
         return
-    hop = estimate.segment * (1 - estimate.overlap)
-    n_segments = max(0, int((recording.duration - estimate.segment) / hop + 1 + 1e-9))
-    n_channels = sum(sensor.n_main_channels for sensor in sensors)
-    if n_segments < n_channels:
-        needed = estimate.segment + (n_channels - 1) * hop
+    n_segments, shortest = shortest_duration(estimate, sensors)
+    if recording.duration < shortest:
         yield Fault(
             "recording.duration",
             format_duration(recording.duration),
-            f"expected at least {format_duration(needed)}: {n_segments} segments of"
-            f" {format_duration(estimate.segment)} are fewer than the {n_channels} channels",
+            f"expected at least {format_duration(shortest)}: fewer than {n_segments} segments of"
+            f" {format_duration(estimate.segment)} allow no estimate",
         )
 
 

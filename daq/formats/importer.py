@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Channel, Sensor
-from daq.errors import ImportFormatError
+from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.csv_reader import read_delimited
 from daq.formats.foreign_sensor import NS_PER_S
 from daq.formats.npz import read_mat, read_npz
@@ -54,6 +55,7 @@ def import_files(
     bench: Bench | None = None,
     response: Path | None = None,
     sampling_rate: float | None = None,
+    estimate: EstimateSettings | None = None,
 ) -> tuple[Imported, ...]:
     """Write a recording from files of other programs.
 
@@ -70,6 +72,9 @@ def import_files(
         RESP or StationXML, used for every channel; overrules the bench.
     sampling_rate : float, optional
         In Hz, where a file does not say.
+    estimate : EstimateSettings, optional
+        How the recording is to be estimated, unless said otherwise later; as the bench says, if not
+        given.
 
     Raises
     ------
@@ -77,6 +82,8 @@ def import_files(
         A file is not understood, or files, bench and response do not fit together.
     RecordingError
         The recording cannot be written.
+    WrongSettingError
+        `estimate` does not fit the sensors.
     """
     found = _by_name(_read(sources, sampling_rate))
     if bench is not None:
@@ -87,7 +94,7 @@ def import_files(
 
         responses = read_responses(response)
     described = {name: _described(sensor, bench, responses) for name, sensor in found.items()}
-    written = _bench(out, bench, tuple(described.values()))
+    written = _bench(out, bench, tuple(described.values()), estimate)
     start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
     with ArrayWriter(
         out,
@@ -200,13 +207,19 @@ def _matched(foreign: ForeignSensor, listed: Sensor) -> Sequence[Channel]:
     )
 
 
-def _bench(out: Path, bench: Bench | None, sensors: tuple[Sensor, ...]) -> Bench:
+def _bench(
+    out: Path, bench: Bench | None, sensors: tuple[Sensor, ...], estimate: EstimateSettings | None
+) -> Bench:
     if bench is None:
         rate = min(sensor.sampling_rate for sensor in sensors)
-        made = Bench(name=out.stem[:64] or "import", sampling_rate=rate, sensors=sensors)
-    else:
-        made = bench.model_copy(update={"sensors": sensors})
-    return parse(dump(made), str(out))
+        bench = Bench(name=out.stem[:64] or "import", sampling_rate=rate, sensors=sensors)
+    changes: dict[str, object] = {"sensors": sensors}
+    if estimate is not None:
+        misfit = next(misfits(estimate, sensors), None)
+        if misfit is not None:
+            raise WrongSettingError(f"{misfit.name} {misfit.value}: {misfit.expected}")
+        changes["estimate"] = estimate
+    return parse(dump(bench.model_copy(update=changes)), str(out))
 
 
 def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:

@@ -3,42 +3,35 @@
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tui.cli.examples import examples
 from tui.cli.logging_options import with_log_file, with_logging
 from tui.cli.options import (
-    BandOption,
     BenchArgument,
     CsvOption,
     DiagnosticsOption,
-    DimensionOption,
     DurationOption,
+    EndOption,
     FileArgument,
-    GainOption,
     JsonOption,
-    MethodOption,
-    OctavesOption,
     OutOption,
-    RejectOption,
-    UnitOption,
-    factors,
-    frequencies,
-    gains,
+    StartOption,
+    with_estimate_options,
 )
 
 
 @examples("huddle tui lab.toml", "huddle tui recordings/lab-20261121T030000Z.h5")
 @with_log_file
+@with_estimate_options
 def tui(
     source: Annotated[
         Path | None,
         typer.Argument(metavar="BENCH", help="Bench file, or a recording to look at."),
     ] = None,
-    *,
-    method: MethodOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application: start, watch and stop a huddle test.
 
@@ -53,7 +46,7 @@ def tui(
         )
     from tui.commands.tui import open_application
 
-    open_application(source, method=method)
+    open_application(source, **wanted)
 
 
 @examples(
@@ -62,6 +55,7 @@ def tui(
     "huddle run lab.toml -d 20min --json result.json --report result.pdf",
 )
 @with_logging
+@with_estimate_options
 def run(
     bench: BenchArgument,
     *,
@@ -73,17 +67,10 @@ def run(
             min=0.001,
             max=1.0,
             metavar="COV",
-            help="Stop when the noise is known this well: its coefficient of variation.",
+            help="Stop when the noise in the band is known to this coefficient of variation.",
         ),
     ] = None,
     out: OutOption = None,
-    method: MethodOption = None,
-    unit: UnitOption = None,
-    band: BandOption = None,
-    reject: RejectOption = None,
-    octaves: OctavesOption = None,
-    dimension: DimensionOption = None,
-    gain: GainOption = None,
     diagnostics: DiagnosticsOption = False,
     report: Annotated[
         Path | None,
@@ -93,6 +80,7 @@ def run(
     ] = None,
     json: JsonOption = None,
     csv: CsvOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run one huddle test without a screen: record, estimate live, print the result.
 
@@ -106,17 +94,11 @@ def run(
         duration=duration,
         until_cov=until_cov,
         out=out,
-        method=method,
-        unit=unit,
-        band=frequencies(band),
-        reject=reject,
-        octaves=octaves,
-        dimension=factors(dimension),
-        gains=gains(gain),
         diagnostics=diagnostics,
         report=report,
         json=json,
         csv=csv,
+        **wanted,
     )
 
 
@@ -137,15 +119,28 @@ def record(
 
 @examples("huddle watch night.h5", "huddle watch night.h5 --json -   (a line of JSON each update)")
 @with_logging
-def watch(file: FileArgument, *, method: MethodOption = None, json: JsonOption = None) -> None:
-    """Look on while another process writes a recording."""
+@with_estimate_options
+def watch(
+    file: FileArgument,
+    *,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Watch a recording that another process writes."""
     from tui.commands.watch import watch_recording
 
-    watch_recording(file, method=method, json=json)
+    watch_recording(file, start=start, end=end, json=json, **wanted)
 
 
-@examples("huddle serve lab.toml", "huddle serve lab.toml --list")
+@examples(
+    "huddle serve lab.toml",
+    "huddle serve lab.toml --list",
+    "huddle serve lab.toml --method all --reject",
+)
 @with_logging
+@with_estimate_options
 def serve(
     bench: BenchArgument,
     *,
@@ -153,8 +148,12 @@ def serve(
         bool, typer.Option("--list", help="Show when the next runs start, and exit.")
     ] = False,
     json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Run huddle tests at the times that the bench file's cron lines give, until Ctrl-C."""
+    """Run huddle tests at the times that the bench file's cron lines give, until Ctrl-C.
+
+    Options of the estimate hold for every run.
+    """
     from tui.commands.serve import serve_bench
 
-    serve_bench(bench, show=show, json=json)
+    serve_bench(bench, show=show, json=json, wanted=wanted)

@@ -13,9 +13,11 @@ from tui.cli.options import (
     CsvOption,
     DiagnosticsOption,
     DurationOption,
+    EndOption,
     FileArgument,
     FilesArgument,
     JsonOption,
+    StartOption,
     with_estimate_options,
 )
 
@@ -30,10 +32,12 @@ from tui.cli.options import (
 def estimate(
     files: FilesArgument,
     *,
+    start: StartOption = None,
+    end: EndOption = None,
     diagnostics: DiagnosticsOption = False,
     json: JsonOption = None,
     csv: CsvOption = None,
-    **wanted: Any,  # noqa: ANN401 - fields of Settings
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate the self-noise of every channel from recordings.
 
@@ -41,7 +45,9 @@ def estimate(
     """
     from tui.commands.estimate import estimate_recordings
 
-    estimate_recordings(files, diagnostics=diagnostics, json=json, csv=csv, **wanted)
+    estimate_recordings(
+        files, start=start, end=end, diagnostics=diagnostics, json=json, csv=csv, **wanted
+    )
 
 
 @examples(
@@ -63,7 +69,9 @@ def report(
             "where not given.",
         ),
     ] = None,
-    **wanted: Any,  # noqa: ANN401 - fields of Settings
+    start: StartOption = None,
+    end: EndOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Write the calibration report of a huddle test, for the screen and for paper.
 
@@ -76,7 +84,7 @@ def report(
     """
     from tui.commands.report import report_recordings
 
-    report_recordings(files, out=out, **wanted)
+    report_recordings(files, out=out, start=start, end=end, **wanted)
 
 
 @examples(
@@ -85,6 +93,7 @@ def report(
     "huddle import arrays.npz --sampling-rate 200 --out lab.h5",
 )
 @with_logging
+@with_estimate_options
 def import_(
     sources: Annotated[
         list[Path],
@@ -113,6 +122,7 @@ def import_(
         typer.Option("--sampling-rate", metavar="HZ", min=1e-6, help="Where no file says it."),
     ] = None,
     json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Make a recording from files of other programs.
 
@@ -132,6 +142,7 @@ def import_(
         response=response,
         sampling_rate=sampling_rate,
         json=json,
+        **wanted,
     )
 
 

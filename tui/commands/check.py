@@ -116,7 +116,7 @@ def _summary(bench: Bench) -> str:
     return (
         f"{bench.name}: the bench file is right.\n"
         f"  sensors   {sensors}\n"
-        f"  estimate  {estimate.method}, {format_duration(estimate.segment)} segments, "
+        f"  estimate  {', '.join(estimate.methods)}, {format_duration(estimate.segment)} segments, "
         f"{estimate.window}, {estimate.overlap:.0%} overlap"
     )
 

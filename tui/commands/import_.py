@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
 from daq.bench.loading import parse
+from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from tui.output.console import for_people, write_json
 from tui.output.formatting import several, utc
+from tui.runs.estimate_settings import chosen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,12 +27,20 @@ def import_recording(
     response: Path | None,
     sampling_rate: float | None,
     json: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Write a recording from foreign files and tell what is in it."""
+    """Write a recording from files of other programs, and show what it holds.
+
+    Options of the estimate become part of the bench file in the recording.
+    """
+    described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
+    given = any(value is not None for value in wanted.values())
+    settings = chosen(Settings.of(described), **wanted) if given else None
     imported = import_files(
         sources,
         out,
-        bench=None if bench is None else parse(bench.read_text(encoding="utf-8"), bench),
+        bench=described,
+        estimate=settings,
         response=response,
         sampling_rate=sampling_rate,
     )

@@ -30,7 +30,7 @@ def report_recordings(
     out: Path | None,
     start: str | None,
     end: str | None,
-    **wanted: Any,  # noqa: ANN401 - fields of Settings
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate, and write the report.
 

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, TextColumn
 
 from daq.acquisition.recorder import recording_path
 from daq.bench.durations import format_duration
+from daq.bench.estimate_settings import shortest_duration
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
@@ -23,10 +24,11 @@ from daq.recording.repair import heal
 from daq.results.band_summary import reached_cov
 from daq.results.store import store_results
 from estimator.errors import EstimatorError
-from tui.commands.estimate import LIMIT_NOT_MET, check_fit, chosen, show_result
+from tui.commands.estimate import LIMIT_NOT_MET, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
 from tui.output.formatting import clock_time, time_left
+from tui.runs.estimate_settings import check_fit, chosen
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
 
@@ -54,7 +56,7 @@ def run_test(
     csv: str | None,
     diagnostics: bool = False,
     report: Path | None = None,
-    **wanted: Any,  # noqa: ANN401 - fields of Settings
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Run one huddle test and show its result.
 
@@ -180,13 +182,12 @@ def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) ->
     typer.BadParameter
         With how long it must be.
     """
-    needed = max(sensor.n_main_channels for sensor in bench.sensors) + 1
-    shortest = settings.segment * (1 + (needed - 1) * (1 - settings.overlap))
+    n_segments, shortest = shortest_duration(settings, bench.sensors)
     if duration is not None and duration < shortest:
         raise typer.BadParameter(
-            f"{format_duration(duration)} hold fewer than {needed} segments of "
-            f"{format_duration(settings.segment)}, too few for {needed - 1} channels per sensor; "
-            f"expected {format_duration(math.ceil(shortest))} at least, or shorter segments"
+            f"{format_duration(duration)} hold fewer than {n_segments} segments of"
+            f" {format_duration(settings.segment)}, which allow no estimate; expected at least"
+            f" {format_duration(math.ceil(shortest))}, or shorter segments"
         )
 
 

@@ -12,16 +12,20 @@ from typing import TYPE_CHECKING
 
 from daq.acquisition.recorder import recording_path
 from daq.acquisition.schedule import due_times, remove_old, serve, utc_now
+from daq.bench.estimate_settings import to_arguments
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, HuddleError, RecordingError
+from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
 from tui.output import logs
 from tui.output.console import for_people, write_json
 from tui.runs.child_log import ChildLog
+from tui.runs.estimate_settings import check_fit, chosen
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
+    from collections.abc import Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
 
@@ -37,15 +41,22 @@ class RunFailedError(HuddleError):
     """A scheduled run ended in trouble; the message is what it said."""
 
 
-def serve_bench(path: Path, *, show: bool, json: str | None) -> None:
+def serve_bench(
+    path: Path, *, show: bool, json: str | None, wanted: Mapping[str, object] | None = None
+) -> None:
     """Run huddle tests when the bench file's cron lines say, until SIGINT or SIGTERM.
 
     Raises
     ------
     BenchFileError
         It has no cron lines.
+    typer.BadParameter
+        If an option of the estimate does not fit the others or the sensors.
     """
     bench = load(path)
+    wanted = wanted or {}
+    settings = chosen(Settings.of(bench), **wanted)
+    check_fit(settings, bench.sensors)
     if not bench.schedule.cron:
         raise BenchFileError(
             f'{path}: schedule.cron: is missing; expected cron lines such as ["0 22 * * *"]'
@@ -61,10 +72,10 @@ def serve_bench(path: Path, *, show: bool, json: str | None) -> None:
             for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}")
         write_json(json, {"next": [due.isoformat() for due in times]})
         return
-    asyncio.run(_serve(path, bench))
+    asyncio.run(_serve(path, bench, to_arguments(wanted)))
 
 
-async def _serve(path: Path, bench: Bench) -> None:
+async def _serve(path: Path, bench: Bench, arguments: Sequence[str]) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -73,7 +84,7 @@ async def _serve(path: Path, bench: Bench) -> None:
 
     async def run(_: datetime) -> None:
         _remove_old(bench)  # first: a full disk would end the run before it has begun
-        await run_once(path, bench, stop)
+        await run_once(path, bench, stop, arguments)
         _remove_old(bench)
 
     await serve(bench.schedule, run, stop=stop, notice=_tell)
@@ -95,7 +106,9 @@ def _remove_old(bench: Bench) -> None:
         _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 
 
-async def run_once(path: Path, bench: Bench, stop: asyncio.Event) -> None:
+async def run_once(
+    path: Path, bench: Bench, stop: asyncio.Event, arguments: Sequence[str] = ()
+) -> None:
     """Do one ``huddle run``; on `stop`, interrupt it and wait until it has written its result.
 
     Raises
@@ -106,7 +119,7 @@ async def run_once(path: Path, bench: Bench, stop: asyncio.Event) -> None:
     out = recording_path(bench, SystemClock().now())
     process = await asyncio.create_subprocess_exec(
         *python_command("tui", "run", str(path)),
-        *("--out", str(out), "--json", str(out.with_suffix(".json"))),
+        *("--out", str(out), "--json", str(out.with_suffix(".json")), *arguments),
         *logs.arguments_for_child(),
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,  # the result is in the recording and the JSON file

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.table import Table
@@ -19,13 +19,15 @@ from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.results.store import store_results
 from tui.application.app import HuddleApp
-from tui.commands.estimate import chosen
 from tui.output.console import notices
 from tui.output.logs import screen_taken
+from tui.runs.estimate_settings import check_fit, chosen, settings_for
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
 
@@ -151,7 +153,7 @@ def _report(
     return out
 
 
-def open_application(source: Path, *, method: str | None) -> None:
+def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
     """Open the application on a bench file, or on a recording (``.h5``).
 
     Raises
@@ -162,7 +164,7 @@ def open_application(source: Path, *, method: str | None) -> None:
         There is no terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
-        open_recording(source, method=method)
+        open_recording(source, **wanted)
     elif source.suffix.lower() in FOREIGN:
         raise BenchFileError(
             f"{source}: neither a bench file (.toml) nor a recording (.h5); make a recording of it"
@@ -174,14 +176,15 @@ def open_application(source: Path, *, method: str | None) -> None:
             " see one at work with huddle demo"
         )
     else:
-        open_bench(source, methods=None if method is None else (str(method),))
+        open_bench(source, **wanted)
 
 
-def open_bench(path: Path, *, methods: tuple[str, ...] | None = None) -> None:
+def open_bench(path: Path, **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
     """Open the application on a bench file."""
     bench = load(path)
-    settings = Settings.of(bench)
-    settings = replace(settings, methods=methods or _beside(settings.methods))
+    settings = chosen(Settings.of(bench), **wanted)
+    check_fit(settings, bench.sensors)
+    settings = _with_comparison(settings, wanted)
     controls = BenchControls(path, bench, settings)
     try:
         _run(HuddleApp(controls), again=path)
@@ -230,17 +233,21 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     return controls.started[-1].out if controls.started else None
 
 
-def open_recording(path: Path, *, method: str | None = None) -> None:
+def open_recording(
+    path: Path,
+    *,
+    start: str | None = None,
+    end: str | None = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
     """Open the application on a recording, growing or closed."""
-    with Recording.open(path) as recording:
-        bench = recording.bench
-        settings = chosen(Settings.of(bench), method=method)
-    if method is None:
-        settings = replace(settings, methods=_beside(settings.methods))
+    settings, bench = settings_for(path, start=start, end=end, **wanted)
+    settings = _with_comparison(settings, wanted)
     _run(HuddleApp(RecordingControls(path, settings, bench), path=path), again=path)
 
 
-def _beside(methods: tuple[str, ...]) -> tuple[str, ...]:
-    if "all" in methods:
-        return methods
-    return tuple(dict.fromkeys((*methods, *ALWAYS)))
+def _with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:
+    """Add methods that cost little, for comparison, unless the user chose the methods."""
+    if wanted.get("methods") is not None or "all" in settings.methods:
+        return settings
+    return replace(settings, methods=tuple(dict.fromkeys((*settings.methods, *ALWAYS))))

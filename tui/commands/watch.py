@@ -8,21 +8,28 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from daq.estimation.follow import follow
-from daq.estimation.settings import Settings
-from daq.recording.reader import Recording
 from daq.results.band_summary import band_of, channel_means, reached_cov
-from tui.commands.estimate import chosen, show_result
+from tui.commands.estimate import show_result
 from tui.output.console import console, finite, write_text
 from tui.output.formatting import clock_time, time_left
+from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
 
 
-def watch_recording(file: Path, *, method: str | None, json: str | None) -> None:
+def watch_recording(
+    file: Path,
+    *,
+    start: str | None,
+    end: str | None,
+    json: str | None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
     """Show a recording while it grows: on a screen, as lines, or as lines of JSON.
 
     Raises
@@ -33,10 +40,9 @@ def watch_recording(file: Path, *, method: str | None, json: str | None) -> None
     if json is None and sys.stdout.isatty() and sys.stdin.isatty():
         from tui.commands.tui import open_recording  # noqa: PLC0415 - Textual where it is shown
 
-        open_recording(file, method=method)
+        open_recording(file, start=start, end=end, **wanted)
         return
-    with Recording.open(file) as recording:
-        settings = chosen(Settings.of(recording.bench), method=method)
+    settings, _ = settings_for(file, start=start, end=end, **wanted)
     lines = _Lines(json)
     try:
         follow(file, settings, lines)

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import re
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 import typer
+from typer.testing import CliRunner
 
+from daq.bench import loading
+from daq.bench.estimate_settings import (
+    METHODS,
+    OPTIONS,
+    EstimateSettings,
+    max_dimension,
+    table_keys,
+    to_arguments,
+    to_table,
+)
 from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from estimator.likelihood.factor_analysis import max_factors
 from estimator.spectra.welch import WelchSettings
-from tui.cli.options import factors, gains
-from tui.commands.estimate import check_fit, chosen
+from tui.cli.main import app
+from tui.cli.options import with_estimate_options
+from tui.runs.estimate_settings import check_fit, chosen
 from tui.simulation.write_recording import simulate_recording
 
 if TYPE_CHECKING:
@@ -24,6 +39,23 @@ if TYPE_CHECKING:
 
 TEMPLATE = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
 KEYS = ("reject", "octaves", "dimension", "gains")
+VALUES: dict[str, Any] = {
+    "methods": ("maximum-likelihood", "two-channel"),
+    "segment": 90.5,
+    "overlap": 0.75,
+    "window": "kaiser,8",
+    "detrend": "linear",
+    "correct": False,
+    "clocks": "arrivals",
+    "reject": True,
+    "octaves": True,
+    "dimension": 2,
+    "gains": {"B": 1.02, "C.Z": 0.1 + 0.2},
+    "unit": "µg",
+    "band": (1 / 3, 20.0),
+    "target_cov": 0.07,
+}
+COMMANDS = ("estimate", "report", "run", "watch", "tui", "serve", "import")
 
 
 def bench(*, method: str = "all") -> Bench:
@@ -36,8 +68,74 @@ def bench(*, method: str = "all") -> Bench:
 def test_the_template_names_every_option_and_means_nothing_by_it() -> None:
     plain = parse(TEMPLATE, "bench.toml")
     assert Settings.of(plain).reject is None
-    for key in KEYS:
-        assert re.search(rf"^# {key} = ", TEMPLATE, re.MULTILINE), key
+    for key in table_keys():
+        assert re.search(rf"^(# )?{key} = ", TEMPLATE, re.MULTILINE), key
+
+
+def test_every_command_that_estimates_has_every_option() -> None:
+    commands = typer.main.get_group(app).commands
+    for name in COMMANDS:
+        flags = {
+            flag for each in commands[name].params for flag in (*each.opts, *each.secondary_opts)
+        }
+        for option in OPTIONS.values():
+            assert set("/".join(option.flags).split("/")) <= flags, (name, option.flags)
+
+
+def given(arguments: list[str]) -> dict[str, Any]:
+    """Return what a command receives for these arguments."""
+    received: dict[str, Any] = {}
+
+    def command(file: str, **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
+        assert file == "file"
+        received.update(wanted)
+
+    probe = typer.Typer()
+    probe.command()(with_estimate_options(command))
+    result = CliRunner().invoke(probe, ["file", *arguments])
+    if result.exit_code:
+        raise ValueError(result.output)
+    return received
+
+
+def test_an_option_means_the_same_in_the_bench_file_and_on_the_command_line() -> None:
+    assert set(VALUES) == set(OPTIONS)  # a new option has an example here
+    assert given([]) == dict.fromkeys(OPTIONS)
+    by_arguments = given(to_arguments(VALUES))
+    assert by_arguments == VALUES
+    wanted = EstimateSettings(**VALUES)
+    table = to_table(wanted)
+    assert set(table) == set(table_keys())
+    filed = parse(TEMPLATE, "bench.toml").model_copy(update={"estimate": wanted})
+    settings = Settings.of(loading.parse(filed.dump(), "bench.toml"))
+    assert settings == chosen(Settings(), **by_arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--method", "three_sensor"], "(did you mean 'three-sensor'?)"),
+        (["--segment", "fast"], "--segment 'fast': expected a positive duration"),
+        (["--overlap", "1"], "--overlap '1': expected a fraction from 0 to less than 1"),
+        (["--window", "kaiser"], "expected its parameter as well, above 0, as in kaiser,0.5"),
+        (["--window", "hann,1"], "expected one of rectangular"),
+        (["--band", "20:1"], "expected two rising frequencies"),
+        (["--band", "20"], "expected two rising frequencies"),
+        (["--band", "a:b"], "expected two frequencies in Hz such as 1:20"),
+        (["--dimension", "9" * 20], 'expected "auto", or a number of dimensions'),
+        (["--gain", "A=1", "--gain", "A=3"], "A has 1 already"),
+        (["--gain", "A=0"], "expected a number other than 0"),
+        (["--gain", "1.5"], "expected a sensor and a number as in B=1.02"),
+        (["--target-cov", "5"], "expected a number between 0 and 1"),
+    ],
+)
+def test_a_wrong_value_is_refused_with_what_was_expected(
+    arguments: list[str], expected: str
+) -> None:
+    with pytest.raises(ValueError, match="Invalid value") as caught:
+        given(arguments)
+    said = " ".join(str(caught.value).replace("│", " ").split())
+    assert expected in said
 
 
 def test_a_bench_file_sets_what_options_set() -> None:
@@ -52,7 +150,7 @@ def test_options_go_before_the_bench_file() -> None:
     settings = Settings.of(bench())
     found = chosen(
         settings,
-        method="two-channel",
+        methods=("two-channel",),
         reject=False,
         octaves=False,
         dimension=None,
@@ -64,19 +162,14 @@ def test_options_go_before_the_bench_file() -> None:
     plain = Settings.of(parse(TEMPLATE, "bench.toml"))
     assert chosen(plain, dimension=2).methods == ("maximum-likelihood",)
     with pytest.raises(typer.BadParameter, match="maximum-likelihood"):
-        chosen(settings, method="three-sensor", dimension=2)
+        chosen(settings, methods=("three-sensor",), dimension=2)
 
 
-def test_a_window_may_have_a_parameter_and_one_that_lacks_it_is_told_so() -> None:
-    settings = chosen(Settings(), window="kaiser,8")
-    filed = TEMPLATE.replace('window = "hann"', 'window = "kaiser,8"')
-    assert Settings.of(parse(filed, "bench.toml")).window == settings.window
-    spectra = WelchSettings(100.0, 64, window=settings.window)
+def test_a_window_that_no_segment_can_have_is_refused() -> None:
+    spectra = WelchSettings(100.0, 64, window=chosen(Settings(), window="kaiser,8").window)
     assert spectra.window == "kaiser,8"
-    said = "--window 'kaiser': 'kaiser' must have parameters.*kaiser,8"
-    for wrong, why in {"kaiser": said, "hann,1": "does not allow", "kaiser,x": "float"}.items():
-        with pytest.raises(typer.BadParameter, match=why):
-            chosen(Settings(), window=wrong)
+    with pytest.raises(typer.BadParameter, match=r"--window 'gaussian,1e-200'.*finite"):
+        chosen(Settings(), window="gaussian,1e-200")
 
 
 def test_what_the_sensors_do_not_allow_is_refused_with_what_they_do() -> None:
@@ -89,21 +182,17 @@ def test_what_the_sensors_do_not_allow_is_refused_with_what_they_do() -> None:
         ),
         (
             Settings(dimension=7, methods=("all",)),
-            "--dimension 7: expected at most 6: .* 9 channels",
+            "--dimension 7: expected at most 6: 9 channels cannot tell",
         ),
-        (Settings(gains={"Z": 1.0}), "--gain Z=1: expected one of the sensors A, B, C"),
+        (Settings(gains={"Z": 1.0}), "--gain Z=1: expected one of A, B, C, A.X"),
     ):
         with pytest.raises(typer.BadParameter, match=said):
             check_fit(settings, sensors)
 
 
-def test_numbers_beyond_reason_and_two_for_one_are_refused() -> None:
-    assert factors("999") == 999
-    with pytest.raises(typer.BadParameter, match="--dimension"):
-        factors("9" * 20)
-    assert gains(["A=1", "A.X=2"]) == {"A": 1.0, "A.X": 2.0}
-    with pytest.raises(typer.BadParameter, match="'A=3': A has 1 already"):
-        gains(["A=1", "A=3"])
+@pytest.mark.parametrize("n_channels", range(1, 40))
+def test_the_most_dimensions_are_those_of_the_estimator(n_channels: int) -> None:
+    assert max_dimension(n_channels) == max_factors(n_channels)
 
 
 def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
@@ -122,3 +211,37 @@ def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
         "three-sensor",
         "maximum-likelihood",
     }
+
+
+def huddle(*arguments: str) -> Any:  # noqa: ANN401 - JSON
+    """Run a command that succeeds, and return the JSON that it writes last."""
+    result = CliRunner().invoke(app, [*arguments, "--json", "-"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+def test_options_of_an_import_hold_for_what_is_estimated_from_it(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    motion = rng.standard_normal(6000)
+    a, b, c = (motion[:, None] + 0.1 * rng.standard_normal((6000, 1)) for _ in range(3))
+    np.savez(tmp_path / "a.npz", sampling_rate=100.0, A=a, B=b, C=c)
+    out = str(tmp_path / "a.h5")
+    options = ("--segment", "500ms", "--method", "three-channel", "--band", "2:20")
+    huddle("import", str(tmp_path / "a.npz"), "--out", out, *options)
+    estimated = huddle("estimate", out)
+    assert estimated["method"] == "three-channel"
+    assert estimated["frequency_hz"][1] == 2.0
+    watched = huddle("watch", out)
+    assert watched["band_hz"] == [2.0, 20.0]
+    assert set(watched["noise"]) == {"three-channel"}
+    assert watched["segments"] == estimated["segments"]
+    watched = huddle("watch", out, "--method", "all", "--segment", "1s", "--start", "20s")
+    assert set(watched["noise"]) == {*METHODS} - {"all"}
+    later = huddle("estimate", out, "--method", "all", "--segment", "1s", "--start", "20s")
+    assert watched["segments"] == later["results"][0]["segments"] < estimated["segments"] / 2
+    refused = CliRunner().invoke(
+        app, ["import", str(tmp_path / "a.npz"), "--out", f"{out}.h5", "--gain", "D=2"]
+    )
+    assert refused.exit_code == 2
+    assert "expected one of A, B, C" in refused.output
+    assert not (tmp_path / "a.h5.h5").exists()

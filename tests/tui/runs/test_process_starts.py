@@ -82,9 +82,12 @@ def test_runs_of_a_service_execute_none(record: Path) -> None:
         Path("bench.toml").write_text(dump(bench), encoding="utf-8")
         placed = parse(dump(bench), "bench.toml")
         placed.recording_directory.mkdir(parents=True, exist_ok=True)
-        asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event()))
-    (result,) = placed.recording_directory.glob("*.json")
-    assert json.loads(result.read_text(encoding="utf-8"))["segments"] >= 5
+        options = ["--method", "three-channel"]
+        asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event(), options))
+    (path,) = placed.recording_directory.glob("*.json")
+    result = json.loads(path.read_text(encoding="utf-8"))
+    assert result["segments"] >= 5
+    assert result["method"] == "three-channel"
     assert not record.exists()
 
 
