@@ -23,10 +23,10 @@ from estimator.diagnostics.relative_response import (
 )
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood import fisher
-from estimator.likelihood.chi_square import upper_tail
+from estimator.likelihood.chi_square import critical_value
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maximum, maximise
-from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool
+from estimator.likelihood.goodness_of_fit import ModelTest, model_test, p_values, pool
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise.coherency import (
     check_averages,
@@ -264,7 +264,7 @@ def _test(maximum: Maximum | None, there: Presence, n_effective: float, n_freqs:
     information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
     idle = (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
     degrees = test.degrees + idle
-    return ModelTest(test.statistic, degrees, upper_tail(degrees, test.statistic))
+    return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic))
 
 
 def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:
@@ -283,8 +283,9 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
         scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
         statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
         r = np.arange(coherence.shape[1])
-        chance = upper_tail(2 * (dims[j] - r) * (dims[k] - r), statistic)
-        found = np.maximum(found, (chance < DIMENSION_LEVEL / len(pairs)).sum(axis=1))
+        degrees = 2 * (dims[j] - r) * (dims[k] - r)
+        limit = [critical_value(n, DIMENSION_LEVEL / len(pairs)) for n in degrees.tolist()]
+        found = np.maximum(found, (statistic > limit).sum(axis=1))
     return np.where(usable, found, np.nan)
 
 

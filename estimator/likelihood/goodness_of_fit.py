@@ -122,7 +122,12 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     degrees = order**2 - estimated
     mean = -2 * averages * logs - estimated * (1 + 1 / (6 * averages))
     statistic = 2 * averages * maximum.discrepancy * degrees / mean
-    return ModelTest(statistic, degrees, upper_tail(degrees, statistic))
+    return ModelTest(statistic, degrees, p_values(degrees, statistic))
+
+
+def p_values(degrees: FloatArray, statistic: FloatArray) -> FloatArray:
+    """Probability of so large a statistic under the model, at every frequency."""
+    return np.array(list(map(upper_tail, degrees.tolist(), statistic.tolist())))
 
 
 def _estimated_parameters(maximum: Maximum) -> FloatArray:
@@ -208,7 +213,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
         return BandTest(total, degrees, float("nan"), count)
     pairs = np.array([np.sum(taken[h:] & taken[:-h]) for h in range(1, len(r) + 1)])
     spread = 1 + 2 * float(pairs @ r**2) / count
-    p_value = float(upper_tail(degrees / spread, total / spread))
+    p_value = upper_tail(degrees / spread, total / spread)
     return BandTest(total, degrees, p_value, count)
 
 

@@ -16,6 +16,7 @@ exit  meaning
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import sys
@@ -181,8 +182,19 @@ def _options(
     configure()
 
 
+def _spare_the_processor() -> None:
+    """Set what libraries read when they are imported."""
+    # The matrices are small: BLAS's own threads would only wait for each other, at full load.
+    for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    # Plug-ins would be looked for in every installed package.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    gc.set_threshold(10_000)  # imports make many objects, and all of them stay
+
+
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command and exit with its code."""
+    _spare_the_processor()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # files and pipes hold UTF-8 everywhere
             stream.reconfigure(
