@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import canonical_coherence
+from estimator.diagnostics.relative_response import CanonicalCoherence, own_channels
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood.fisher import cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
@@ -238,9 +238,11 @@ def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> 
         found = np.stack(seen, axis=1)
     else:
         over_pairs = np.max if method == "maximum-likelihood" else np.min
+        canonical = CanonicalCoherence(csm)
+        own = [own_channels(dims, i) for i in range(len(dims))]
         pairs = {
-            pair: canonical_coherence(csm, dims, *pair)[:, -1]
-            for pair in combinations(range(len(dims)), 2)
+            (i, j): canonical.between(own[i], own[j])[:, -1]
+            for i, j in combinations(range(len(dims)), 2)
         }
         others = [[g for pair, g in pairs.items() if i not in pair] for i in range(len(dims))]
         found = np.stack([over_pairs(each, axis=0) for each in others], axis=1)[:, sensor]

@@ -16,9 +16,10 @@ import numpy as np
 from estimator.diagnostics.advice import Advice, advise
 from estimator.diagnostics.band import BandDiagnosis
 from estimator.diagnostics.relative_response import (
+    CanonicalCoherence,
     RelativeResponse,
-    canonical_coherence,
     matched_coherence,
+    own_channels,
     relative_response,
 )
 from estimator.errors import EstimatorError, InsufficientDataError
@@ -175,22 +176,23 @@ def diagnose(
     if fit is not None:
         known = standard_error(fit, n_effective=n_effective) < fit.psi
         snr = there.spread(np.where(known, 1 / fit.psi - 1, np.nan), sum(dims))
-    dimension = _dimension(matrix, there.dims, n_effective)
+    canonical = CanonicalCoherence(matrix)
+    dimension = _dimension(canonical, matrix, there.dims, n_effective)
     number = bands(frequency)
     found = tuple(
         BandDiagnosis(
             low=float(frequency[inside][0]),
             high=float(frequency[inside][-1]),
-            coherence=_median(_least(coherence[inside])),
-            condition=_median(-_least(-condition[inside])),
-            dimension=_median(dimension[inside]),
-            snr=np.array([_median(channel) for channel in snr[inside].T]),
+            coherence=float(_median(_least(coherence[inside]))),
+            condition=float(_median(-_least(-condition[inside]))),
+            dimension=float(_median(dimension[inside])),
+            snr=_median(snr[inside]),
             test=pool(model, inside, neighbours=neighbours),
         )
         for inside in (number == b for b in np.unique(number))
     )
     alive = np.ix_(range(len(csm)), there.channels, there.channels)
-    responses = _responses(csm[alive], frequency, there, vertical)
+    responses = _responses(csm[alive], frequency, there, vertical, canonical)
     return Diagnostics(
         frequency=frequency,
         pairs=pairs,
@@ -222,9 +224,13 @@ def _least(values: FloatArray) -> FloatArray:
     return np.where(np.isnan(values).all(axis=1), np.nan, least)
 
 
-def _median(values: FloatArray) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if len(known) else float("nan")
+def _median(values: FloatArray) -> FloatArray:
+    """Median of the numbers of each column, along the first axis; NaN where there is none."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.sum(~np.isnan(ordered), axis=0)
+    middle = (np.maximum(count - 1, 0) // 2, count // 2)
+    low, high = (np.take_along_axis(ordered, np.asarray(at)[None], axis=0)[0] for at in middle)
+    return np.asarray((low + high) / 2)
 
 
 def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
@@ -267,7 +273,9 @@ def _test(maximum: Maximum | None, there: Presence, n_effective: float, n_freqs:
     return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic))
 
 
-def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:
+def _dimension(
+    canonical: CanonicalCoherence, matrix: ComplexArray, dims: tuple[int, ...], n_effective: float
+) -> FloatArray:
     """Canonical coherences between sensors that are not zero by their sampling noise.
 
     Bartlett's test that all but the r largest are zero, for complex averages:
@@ -279,7 +287,9 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
     if not pairs or n_effective <= 2 * max(dims):
         return np.full(len(matrix), np.nan)
     for j, k in pairs:
-        coherence = np.minimum(canonical_coherence(matrix, dims, j, k), 1 - 1e-15)
+        coherence = np.minimum(
+            canonical.between(own_channels(dims, j), own_channels(dims, k)), 1 - 1e-15
+        )
         scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
         statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
         r = np.arange(coherence.shape[1])
@@ -290,7 +300,11 @@ def _dimension(matrix: ComplexArray, dims: tuple[int, ...], n_effective: float) 
 
 
 def _responses(
-    csm: ComplexArray, frequency: FloatArray, there: Presence, vertical: int | None
+    csm: ComplexArray,
+    frequency: FloatArray,
+    there: Presence,
+    vertical: int | None,
+    coherence: CanonicalCoherence,
 ) -> tuple[RelativeResponse, ...]:
     found = []
     for first, second in combinations(range(len(there.sensors)), 2):
@@ -299,7 +313,13 @@ def _responses(
             continue
         try:
             response = relative_response(
-                csm, frequency, dims=there.dims, first=first, second=second, vertical=vertical
+                csm,
+                frequency,
+                dims=there.dims,
+                first=first,
+                second=second,
+                vertical=vertical,
+                coherence=coherence,
             )
         except InsufficientDataError:  # nothing to compare them by
             continue

@@ -16,7 +16,7 @@ from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.self_noise.coherency import check_dims, check_frequency, coherency
 
 if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 LEAST_COHERENCE = 0.5
 """Below it a frequency says nothing of the response, and its phase could mislead the delay."""
@@ -100,6 +100,54 @@ def matched_coherence(
     return np.where(power > 0, cross / np.where(power > 0, power, 1.0), np.nan)
 
 
+class CanonicalCoherence:
+    """Magnitude squared coherence of groups of channels, direction by direction.
+
+    Each root and each pair is computed once.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Coherency or cross-spectral matrix.
+    """
+
+    def __init__(self, csm: ComplexArray) -> None:
+        self._n_freqs = len(csm)
+        self._usable = np.isfinite(csm).all(axis=(1, 2))
+        self._csm = csm[self._usable]
+        self._roots: dict[tuple[int, ...], ComplexArray] = {}
+        self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
+
+    def between(self, first: range | IntArray, second: range | IntArray) -> FloatArray:
+        """Return the coherence of two groups of channels.
+
+        Returns
+        -------
+        float64, shape (n_freqs, min(len(first), len(second)))
+            Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``. Whatever
+            way the sensors point, the same. Zero where the matrix is not finite.
+        """
+        one, two = sorted((tuple(first), tuple(second)), key=len)
+        pair = frozenset((one, two))
+        if pair not in self._found:
+            # The squares are eigenvalues: half the work of singular values.
+            whitened = self._root(one) @ self._csm[:, np.array(one)[:, None], two] @ self._root(two)
+            squares = np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))
+            found = np.zeros((self._n_freqs, len(one)))
+            found[self._usable] = squares[:, ::-1]
+            self._found[pair] = np.clip(found, 0.0, 1.0)
+        return self._found[pair]
+
+    def _root(self, channels: tuple[int, ...]) -> ComplexArray:
+        """Inverse root of a group's own matrix; a direction without power stays without."""
+        if channels not in self._roots:
+            w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
+            alive = w > 1e-12 * w[:, -1:]
+            root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+            self._roots[channels] = (u * root[:, None, :]) @ u.conj().swapaxes(1, 2)
+        return self._roots[channels]
+
+
 def canonical_coherence(
     csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
 ) -> FloatArray:
@@ -115,23 +163,14 @@ def canonical_coherence(
     Returns
     -------
     float64, shape (n_freqs, min(dims[first], dims[second]))
-        Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``. Whatever
-        way the sensors point, the same. Zero where the matrix is not finite.
+        As `CanonicalCoherence.between` gives it.
     """
-    usable = np.isfinite(csm).all(axis=(1, 2))
-    found = np.zeros((len(csm), min(dims[first], dims[second])))
-    a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (first, second))
-    left, right = (_inverse_root(csm[usable, own, own]) for own in (a, b))
-    found[usable] = np.linalg.svd(left @ csm[usable, a, b] @ right, compute_uv=False) ** 2
-    return np.clip(found, 0.0, 1.0)
+    return CanonicalCoherence(csm).between(own_channels(dims, first), own_channels(dims, second))
 
 
-def _inverse_root(matrix: ComplexArray) -> ComplexArray:
-    """Inverse root of Hermitian matrices; a direction without power stays without."""
-    w, u = np.linalg.eigh(matrix)
-    alive = w > 1e-12 * w[:, -1:]
-    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
-    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
+def own_channels(dims: tuple[int, ...], sensor: int) -> range:
+    """Return which channels are a sensor's."""
+    return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))
 
 
 def relative_response(
@@ -143,6 +182,7 @@ def relative_response(
     second: int,
     band: tuple[float, float] | None = None,
     vertical: int | None = None,
+    coherence: CanonicalCoherence | None = None,
 ) -> RelativeResponse:
     """Rotation, gains, non-orthogonality and delay of one sensor against another.
 
@@ -163,6 +203,8 @@ def relative_response(
     vertical : int, optional
         The channel of every sensor that is vertical. By default none of two channels is, and of
         three nothing is known.
+    coherence : CanonicalCoherence, optional
+        Of the same matrix, where several pairs of sensors are compared.
 
     Returns
     -------
@@ -205,16 +247,15 @@ def relative_response(
     low, high = band or (0.0, np.inf)
     usable = (frequency > 0) & (frequency >= low) & (frequency <= high)
     usable &= ~(given.flags != 0).any(axis=1)
-    own = [np.arange(d) + sum(dims[:sensor]) for sensor in (first, second)]
+    coherence = coherence or CanonicalCoherence(given.matrix)
+    own = [np.array(own_channels(dims, sensor)) for sensor in (first, second)]
     rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
     if len(rest) < d:
         raise InsufficientDataError(
             f"sensors {first} and {second}: the others have {len(rest)} channels, {d} are needed"
         )
-    g = canonical_coherence(given.matrix, dims, first, second)[:, -1]
-    among = np.concatenate([own[0], rest])
-    with_rest = given.matrix[:, among[:, None], among]
-    seen = canonical_coherence(with_rest, (d, len(rest)), 0, 1)[:, -1]
+    g = coherence.between(*own)[:, -1]
+    seen = coherence.between(own[0], rest)[:, -1]
     weight = g / np.maximum(1 - g, 1e-9)
     weight[~usable | (np.minimum(g, seen) < LEAST_COHERENCE)] = 0.0
     if not weight.any():
@@ -323,8 +364,9 @@ def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
         nearest = u @ v
         if np.linalg.det(nearest) > 0:
             candidates.append((float(np.trace(nearest)), signs, nearest))
-    plain = [entry for entry in candidates if entry[1].min() > 0]
-    _, signs, nearest = plain[0] if plain else max(candidates, key=lambda entry: entry[0])
+            if code == 0:  # nothing is reversed
+                break
+    _, signs, nearest = max(candidates, key=lambda entry: entry[0])
     return nearest, tuple(int(channel) for channel in np.flatnonzero(signs < 0))
 
 
