@@ -7,7 +7,6 @@ faster by the same factor, so that everything downstream sees the times of a ben
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
@@ -16,8 +15,7 @@ from daq.protocols.block import HostTime
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_awake: Callable[[], int] = time.monotonic_ns
-# Of the same rate, but it counts on while the computer is suspended.
+# Counts on while the computer is suspended, unlike time.monotonic_ns.
 _always: Callable[[], int] = (
     partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
     if hasattr(time, "CLOCK_BOOTTIME")
@@ -43,7 +41,6 @@ class HostClock(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
 class SystemClock:
     """The system's monotonic clock and UTC, both ``speed`` times as fast from construction on.
 
@@ -51,23 +48,40 @@ class SystemClock:
     the middle of a run neither tears the recording nor moves its times. While the computer is
     suspended its monotonic clock stands still (Linux, ``CLOCK_MONOTONIC``); sensors do not, and
     where the system tells for how long, this one does not either.
+
+    Parameters
+    ----------
+    speed : float
+        Host seconds that pass in one second of the monotonic clock.
+    monotonic_ns : callable
+        The monotonic clock, which stands still while the computer is suspended.
+    always_ns : callable
+        A clock of the same rate that counts on while the computer is suspended.
+    utc_ns : callable
+        UTC in ns since 1970.
     """
 
-    speed: float = 1.0
-    always_ns: Callable[[], int] = _always
-    """Counts on while the computer is suspended."""
-    _monotonic_ns: int = field(default_factory=_awake)
-    _began_ns: int = field(default_factory=_always)
-    _utc_ns: int = field(default_factory=time.time_ns)
+    def __init__(
+        self,
+        speed: float = 1.0,
+        *,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        always_ns: Callable[[], int] = _always,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.speed = speed
+        self._now_ns, self._always_ns = monotonic_ns, always_ns
+        self._monotonic_ns, self._began_ns, self._utc_ns = monotonic_ns(), always_ns(), utc_ns()
 
     @property
     def suspended(self) -> float:
         """Seconds for which the computer has been suspended since construction."""
-        return (self.always_ns() - self._began_ns - _awake() + self._monotonic_ns) * 1e-9
+        awake = self._now_ns() - self._monotonic_ns
+        return (self._always_ns() - self._began_ns - awake) * 1e-9
 
     def now(self) -> HostTime:
         """Return the present instant."""
-        elapsed = self.always_ns() - self._began_ns
+        elapsed = self._always_ns() - self._began_ns
         if self.speed != 1.0:
             elapsed = round(elapsed * self.speed)
         return HostTime(self._monotonic_ns + elapsed, self._utc_ns + elapsed)

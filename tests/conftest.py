@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.device_server import server_pids, stop_server
+from tests import devices
+from tests.devices import device_loop
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -61,7 +62,7 @@ def nothing_left_behind() -> Iterator[None]:
     ]
     if left:
         pytest.fail(f"threads left behind: {left}")
-    born = _children() - children - server_pids()
+    born = _children() - children - devices.server_pids()
     if born:
         pytest.fail(f"processes left behind: {sorted(born)}")
     opened = {n: t for n, t in _open_descriptors().items() if descriptors.get(n) != t}
@@ -89,9 +90,18 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_asyncio_loop_factories(
+    item: pytest.Item,
+) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Run a test by the clock that its marker names."""
+    if item.get_closest_marker("devices"):
+        return {"devices": device_loop}
+    return {"system": asyncio.new_event_loop}
+
+
 def pytest_sessionfinish() -> None:
     """End what served simulated devices to all tests."""
-    stop_server()
+    devices.stop()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

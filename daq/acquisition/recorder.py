@@ -85,6 +85,8 @@ def run(
     path: str | Path,
     *,
     duration: float | None = None,
+    clock: HostClock | None = None,
+    loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
     acknowledged: Callable[[RecorderStatus], None] | None = None,
 ) -> RecorderStatus:
     """Record until done, SIGINT or SIGTERM, in the main thread; see :func:`record`."""
@@ -97,9 +99,11 @@ def run(
                 loop.add_signal_handler(number, stop.set)
             except NotImplementedError:  # Windows
                 signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
-        return await record(bench, path, duration=duration, stop=stop, acknowledged=acknowledged)
+        return await record(
+            bench, path, duration=duration, clock=clock, stop=stop, acknowledged=acknowledged
+        )
 
-    runner = asyncio.Runner()
+    runner = asyncio.Runner(loop_factory=loop_factory)
     try:
         return runner.run(main())
     finally:

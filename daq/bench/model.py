@@ -239,7 +239,7 @@ class Bench(Table):
     schedule: Schedule = Schedule()
     limits: tuple[Limit, ...] = ()
     simulation: dict[str, Any] = Field(default_factory=dict)
-    """Handed to the simulated devices unread, but for ``speed``."""
+    """Handed to the simulated devices unread, but for ``speed`` and ``clock``."""
 
     @model_validator(mode="before")
     @classmethod
@@ -284,6 +284,11 @@ class Bench(Table):
     def speed(self) -> float:
         """How many times as fast as life the (simulated) bench runs."""
         return float(self.simulation.get("speed", 1.0))
+
+    @property
+    def simulated_clock(self) -> str:
+        """File of the clock by which simulated devices run; empty for a bench of real ones."""
+        return str(self.simulation.get("clock", ""))
 
     def sensor(self, name: str) -> Sensor:
         """Return the sensor of this name."""

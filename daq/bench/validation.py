@@ -357,3 +357,6 @@ def _simulation_faults(table: Mapping[str, Any]) -> Iterator[Fault]:
     speed = simulation.get("speed", 1.0) if isinstance(simulation, dict) else 1.0
     if not isinstance(speed, (int, float)) or isinstance(speed, bool) or not 0 < speed < 1e6:
         yield Fault("simulation.speed", speed, "expected a positive number")
+    clock = simulation.get("clock", "") if isinstance(simulation, dict) else ""
+    if not isinstance(clock, str):
+        yield Fault("simulation.clock", clock, "expected a path; huddle devices writes it")

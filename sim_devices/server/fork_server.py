@@ -23,11 +23,13 @@ import sys
 import tempfile
 import time
 import traceback
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from sim_devices.errors import ScenarioError, ServeError
+from sim_devices.server.paced_clock import PacedClock, PacedLoop
 from sim_devices.server.serve import FAMILIES, serve
 
 if TYPE_CHECKING:
@@ -114,7 +116,9 @@ class ForkServer:
             tempfile.tempdir = str(folder)  # removed by the caller, also after a device was killed
             code = 0
             try:
-                asyncio.run(serve(spec, index, announce=announce, lifeline=0))
+                clock = PacedClock(spec["clock"])
+                with asyncio.Runner(loop_factory=partial(PacedLoop, clock)) as runner:
+                    runner.run(serve(spec, index, clock, announce=announce, lifeline=0))
             except BaseException as error:  # noqa: BLE001 -- nothing may return to the server's loop
                 code = 1
                 expected = isinstance(error, (OSError, ScenarioError, ServeError))

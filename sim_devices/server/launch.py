@@ -15,9 +15,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from daq.python_process import python_command
 from sim_devices.errors import ServeError
+from sim_devices.server.paced_clock import PacedClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+HEAD_START_NS = 200_000_000
+"""World time 0 lies this far ahead, so that every device is there when it begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,8 @@ class RunningDevice:
     settings: dict[str, Any]
     """To be added to the settings of its sensors."""
     pid: int
+    clock: str
+    """File of the clock by which the device runs (:mod:`sim_devices.server.paced_clock`)."""
 
     def kill(self) -> None:
         """Kill the device's process: the device has lost its power."""
@@ -77,7 +83,8 @@ class DeviceServer:
         Parameters
         ----------
         spec
-            As described in :mod:`sim_devices.server.serve`.
+            As described in :mod:`sim_devices.server.serve`. Without ``clock``, the devices get one
+            of their own; without ``epoch_ns``, their world begins when all of them are there.
 
         Raises
         ------
@@ -85,8 +92,12 @@ class DeviceServer:
             A device could not be served; the message says why.
         """
         with tempfile.TemporaryDirectory(prefix="huddle-") as folder:
+            path = spec.get("clock") or f"{folder}/clock"
+            clock = PacedClock(path) if "clock" in spec else PacedClock.create(path)
+            epoch = {"clock": path, "epoch_ns": clock.now_ns() + HEAD_START_NS}
+            clock.close()
             file = Path(folder) / "spec.json"
-            file.write_text(json.dumps(spec), encoding="utf-8")
+            file.write_text(json.dumps({**epoch, **spec}), encoding="utf-8")
             answer = self._ask({"serve": str(file)})
             if "error" in answer:
                 raise ServeError(f"a simulated device did not start: {answer['error']}")
@@ -98,6 +109,7 @@ class DeviceServer:
                         port=device["port"],
                         settings=device["settings"],
                         pid=device["pid"],
+                        clock=path,
                     )
                     for device in answer["devices"]
                 )

@@ -2,8 +2,9 @@
 
 The specification is one JSON object::
 
-    {"epoch_ns": 123,              instant of the system's monotonic clock at which world time is 0
-     "speed": 1.0,                 world seconds that pass in one second
+    {"clock": "FILE",              the clock of the bench, see sim_devices.server.paced_clock
+     "epoch_ns": 123,              instant of that clock, in ns, at which world time is 0
+     "speed": 1.0,                 world seconds that pass in one second of that clock
      "scenario": {...},            see sim_devices.world.scenario
      "faults": [...],              what goes wrong, see sim_devices.faults
      "fault_log": "FILE",          where each fault is noted when it strikes, a JSON object a line
@@ -53,11 +54,13 @@ from sim_devices.devices.interface import (
 )
 from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
 from sim_devices.server.ports import Wire, make_wire
-from sim_devices.server.world_clock import WorldClock, utc_of
+from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.scenario import Scenario
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
+    from sim_devices.server.paced_clock import PacedClock
 
 FAMILIES = {
     "epson": "sim_devices.devices.epson:create",
@@ -179,6 +182,7 @@ class Served:
 async def serve(
     spec: Mapping[str, Any],
     index: int,
+    paced: PacedClock,
     *,
     announce: Callable[[Mapping[str, Any]], None],
     lifeline: int,
@@ -191,15 +195,18 @@ async def serve(
         As described in this module.
     index : int
         Of the device in the specification.
+    paced : PacedClock
+        By which the running event loop runs.
     announce : callable
         Called once, when the device can be connected to.
     lifeline : int
         File descriptor, open for reading.
     """
     epoch_ns = int(spec["epoch_ns"])
-    device = replace(device_spec(spec["devices"][index]), utc_ns=utc_of(epoch_ns))
+    utc_ns = paced.utc_of(epoch_ns)
+    device = replace(device_spec(spec["devices"][index]), utc_ns=utc_ns)
     scenario = Scenario.from_dict(spec["scenario"], sampling_rate=device.sampling_rate)
-    clock = WorldClock(epoch_ns, float(spec.get("speed", 1.0)))
+    clock = WorldClock(epoch_ns, float(spec.get("speed", 1.0)), paced.now_ns)
     module, _, function = FAMILIES[device.driver].partition(":")
     faults = parse(spec.get("faults", ()), device.sensors)
     for fault in faults:

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from sim_devices.arrays import FloatArray
     from sim_devices.world.spectrum import Spectrum
 
-ELSEWHERE = frozenset({"speed", "devices", "faults"})
+ELSEWHERE = frozenset({"speed", "clock", "devices", "faults"})
 """Keys of the `[simulation]` table that others read: they say nothing about the world."""
 
 
@@ -79,7 +79,7 @@ class Scenario(Table):
         Parameters
         ----------
         table
-            The schema of this module. `speed`, `devices` and `faults` are others' keys.
+            The schema of this module. `speed`, `clock`, `devices` and `faults` are others' keys.
         sampling_rate
             Of the sensors that do not state their own, in Hz.
 

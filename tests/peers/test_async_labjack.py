@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sim_devices.world.world import World
-from tests.device_server import serving
+from tests.devices import serving
 from tests.sim_devices.simulated_bench import scenario, spec
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from daq.protocols.epson.commands import COUNTS_PER_G, FILTERS, NOT_ON_A370
-from tests.device_server import serving
+from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
 
 if TYPE_CHECKING:

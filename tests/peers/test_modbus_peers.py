@@ -12,10 +12,9 @@ import pytest
 
 from daq.bench.model import Channel, Sensor
 from daq.drivers.registry import driver_type
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block
 from sim_devices.world.world import World
-from tests.device_server import serving
+from tests.devices import host_clock, serving
 from tests.peers.libmodbus import build, ready, running, serial_cable
 from tests.sim_devices.simulated_bench import device, scenario, spec
 
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from sim_devices.server.launch import RunningDevice
 
-pytestmark = pytest.mark.peer
+pytestmark = [pytest.mark.devices, pytest.mark.peer]
 
 RATE = 50.0
 STILL = 1e-6  # a world so slow that every reading is the same
@@ -133,7 +132,7 @@ async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
         channels=tuple(Channel(name=name, sensitivity=1.0) for name in ("n", "a", "b")),
     )
     rows: list[list[int]] = []
-    async with driver_type("registers").open([sensor], SystemClock()) as session:
+    async with driver_type("registers").open([sensor], host_clock()) as session:
         async for item in session.read():
             assert isinstance(item, Block), item
             rows += item.counts.tolist()

@@ -7,14 +7,13 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from sim_devices.world.world import World
-from tests.device_server import serving
+from tests.devices import paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, spec
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def test_rsudp_reads_our_packets(tmp_path: Path) -> None:
         port.bind(("127.0.0.1", int(one.port.rpartition(":")[2])))
         port.settimeout(10)
         packets = [port.recv(4096) for _ in range(30)]
-    began = time.time_ns() - (time.monotonic_ns() - made["epoch_ns"])
+    began = paced_clock().utc_of(made["epoch_ns"])
     found = parsed_by_rsudp(packets, tmp_path)
     assert len(found) == 30
     assert {name for name, _, _ in found} == set(NAMES)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.model import Bench, Channel, Sensor
 from daq.protocols.epson import commands
 from sim_devices.world.scenario import Scenario
+from tests.devices import paced_clock
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +45,7 @@ def spec(
     """Specification of a world that began ``age`` seconds of world time ago."""
     names = [name for one in devices for name in one["sensors"]]
     return {
-        "epoch_ns": time.monotonic_ns() - round(age / speed * 1e9),
+        "epoch_ns": paced_clock().now_ns() - round(age / speed * 1e9),
         "speed": speed,
         "scenario": scenario(names, sampling_rate=sampling_rate).to_dict(),
         "devices": list(devices),

@@ -10,15 +10,13 @@ import pytest
 from daq.bench.driver_rules import Checking
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
-from sim_devices.server.world_clock import utc_of
 from sim_devices.world.scenario import Scenario
 from tests.daq.drivers.reading import record
-from tests.device_server import serving
+from tests.devices import host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -28,6 +26,8 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 DRIVER = driver_type("epson")
@@ -96,7 +96,7 @@ async def mismatch(sensor: Sensor, truth: Source) -> float:
 @pytest.mark.parametrize("edge", ["rising", "falling"])
 async def test_samples_are_in_step_with_the_seconds(running: Running, edge: str) -> None:
     sensor = connecting(running, "pps", settings={"external": f"pps-{edge}"})
-    whole_seconds = -utc_of(running.spec["epoch_ns"]) % 10**9 / 1e9
+    whole_seconds = -paced_clock().utc_of(running.spec["epoch_ns"]) % 10**9 / 1e9
     # The system's UTC at world time 0 is known to some µs, and is another one here and there.
     truth = running.source("pps").disciplined(whole_seconds)
     alone = await mismatch(sensor, running.source("pps"))
@@ -192,9 +192,9 @@ async def test_the_register_says_so(running: Running, external: str, bits: int) 
 
 async def low_byte(sensor: Sensor, register: commands.Register) -> int:
     """Return what a register holds after a session."""
-    async with DRIVER.open([sensor], SystemClock(SPEED)):
+    async with DRIVER.open([sensor], host_clock(SPEED)):
         pass
-    async with open_port(sensor.port, SystemClock()) as stream:
+    async with open_port(sensor.port, host_clock()) as stream:
         await stream.write(commands.read(register))
         received = b""
         while (value := commands.find_reply(received, register.address)) is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,21 +11,22 @@ import pytest
 
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
 from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
-from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tests.device_server import serving
+from tests.devices import device_at, host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.bench.model import Sensor
+    from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 DRIVER = driver_type("epson")
@@ -45,7 +45,7 @@ def running() -> Iterator[tuple[RunningDevice, ...]]:
 
 async def blocks(sensor: Sensor, n_samples: int) -> list[Block]:
     found: list[Block] = []
-    async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+    async with DRIVER.open([sensor], host_clock(SPEED)) as session:
         async for item in session.read():
             assert isinstance(item, Block), item
             found.append(item)
@@ -56,7 +56,7 @@ async def blocks(sensor: Sensor, n_samples: int) -> list[Block]:
 
 async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
     (sensor,) = sensors(running[2], TABLES[2], model="M-A352")
-    async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+    async with DRIVER.open([sensor], host_clock(SPEED)) as session:
         (information,) = session.information
     assert information.model == "A352AD10"
     assert information.serial_number == "C0000007"
@@ -69,7 +69,7 @@ async def test_three_devices_at_once_without_a_gap_feel_one_motion(
 ) -> None:
     n = 1000
     # world time, and with it the index of a sample, from before anything was started
-    before = int((time.monotonic_ns() - SPEC["epoch_ns"]) * 1e-9 * SPEED * 200)
+    before = int((paced_clock().now_ns() - SPEC["epoch_ns"]) * 1e-9 * SPEED * 200)
     found = await asyncio.gather(
         *(blocks(sensors(one, t)[0], n) for one, t in zip(running, TABLES, strict=True))
     )
@@ -92,7 +92,7 @@ async def test_the_device_is_left_quiet_and_found_streaming(
 ) -> None:
     (sensor,) = sensors(running[0], TABLES[0])
     assert await blocks(sensor, 50)
-    async with open_port(sensor.port, SystemClock()) as stream:
+    async with open_port(sensor.port, host_clock()) as stream:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(0.05):  # what was on its way may still come
                 await stream.read()
@@ -144,7 +144,7 @@ async def test_a_serial_number_changed_on_the_way_is_not_believed(
     async with await asyncio.start_server(relay, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         (sensor,) = sensors(running[2], TABLES[2], port=port)
-        async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+        async with DRIVER.open([sensor], host_clock(SPEED)) as session:
             (information,) = session.information
         await asyncio.gather(*filter(None, tasks))
     assert changed
@@ -191,7 +191,7 @@ async def test_silence_and_strangers_are_told_apart() -> None:
     async with await asyncio.start_server(stranger, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A")
-        quiet = RunningDevice(("A",), "epson", port, {}, None)  # type: ignore[arg-type]  # no process
+        quiet = device_at(port, "A", "epson")
         (sensor,) = sensors(quiet, table)
         with pytest.raises(NoAnswerError, match=r"'A' on socket://.* got nothing; check cable"):
             await blocks(sensor, 1)
@@ -205,7 +205,7 @@ async def test_a_device_that_vanishes_ends_the_session() -> None:
     table = device("A")
     with serving(spec(table, speed=SPEED)) as (one,):
         (sensor,) = sensors(one, table)
-        async with DRIVER.open([sensor], SystemClock(SPEED)) as session:
+        async with DRIVER.open([sensor], host_clock(SPEED)) as session:
             stream = session.read()
             assert isinstance(await anext(stream), Block)
             one.kill()

@@ -13,7 +13,7 @@ import pytest
 
 from sim_devices.errors import ServeError
 from sim_devices.server.launch import DeviceServer
-from tests.device_server import server_pids, serving
+from tests.devices import server_pids, serving
 from tests.sim_devices.simulated_bench import device, spec
 
 if TYPE_CHECKING:

@@ -11,13 +11,15 @@ import pytest
 from daq.drivers.registry import driver_type
 from daq.protocols.block import Block, BlockFlag, Event
 from tests.daq.drivers.reading import reading, record
-from tests.device_server import serving
+from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 RATE = 200.0

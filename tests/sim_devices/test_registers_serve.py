@@ -13,11 +13,9 @@ import pytest
 from daq.drivers.modbus.bus import open_bus
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.modbus import rtu
-from sim_devices.server.launch import RunningDevice
-from tests.device_server import serving
+from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -25,6 +23,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Sensor
+    from daq.host_clock import SystemClock
+    from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 4.0
 DRIVER = driver_type("registers")
@@ -83,7 +85,7 @@ async def read(
 async def test_two_slaves_on_one_bus_at_the_instants_they_tell(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    found = await read(on_bus(running[0]), 150, SystemClock(SPEED))
+    found = await read(on_bus(running[0]), 150, host_clock(SPEED))
     for blocks in found.values():
         assert blocks[0].flags == BlockFlag.CLOCK_RESTART
         instants = np.concatenate([b.instants_ns for b in blocks if b.instants_ns is not None])
@@ -100,7 +102,7 @@ async def test_two_slaves_on_one_bus_at_the_instants_they_tell(
 
 async def test_floats_over_tcp(running: tuple[RunningDevice, ...]) -> None:
     chosen = sensors(running[1], TABLES[1], settings={"preset": "labjack-ain"})
-    found = await read(chosen, 40, SystemClock(SPEED))
+    found = await read(chosen, 40, host_clock(SPEED))
     counts = np.concatenate([block.counts for block in found["C"]])
     assert counts.dtype == np.float32
     assert 1e-3 < counts.std() < 1.0  # a white motion of 1e-6 (m/s²)²/Hz below 22.5 Hz
@@ -118,13 +120,13 @@ async def test_registers_with_others_between_are_read_apart() -> None:
     table = device("H", "registers", port="tcp", channels={"H": VOLTS}, settings=settings)
     with serving(spec(table, speed=SPEED)) as (one,):
         (sensor,) = sensors(one, table, settings=settings, sampling_rate=50.0)
-        found = await read([sensor], 40, SystemClock(SPEED))
+        found = await read([sensor], 40, host_clock(SPEED))
         counts = np.concatenate([block.counts for block in found["H"]])
         assert counts.shape[1] == 3
         assert 1e-3 < counts.std(axis=0).min() <= counts.std(axis=0).max() < 1.0
         (whole,) = sensors(one, table, settings={"address": 0, "data_type": "float64"})
         with pytest.raises(WrongDeviceError, match=r"registers 0 to 11 of .*illegal data address"):
-            await read([whole], 1, SystemClock(SPEED))
+            await read([whole], 1, host_clock(SPEED))
 
 
 async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> None:
@@ -133,16 +135,16 @@ async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> 
         for s in on_bus(running[0])
     ]
     with pytest.raises(NoAnswerError, match=r"'A': expected registers 48 to 54 of device 7; .*'A'"):
-        await read(absent, 1, SystemClock(SPEED))
+        await read(absent, 1, host_clock(SPEED))
     other = sensors(running[1], TABLES[1], settings={"address": 900})
     with pytest.raises(WrongDeviceError, match=r"900 to 902.*exception 2 \(illegal data address\)"):
-        await read(other, 1, SystemClock(SPEED))
+        await read(other, 1, host_clock(SPEED))
     nowhere = sensors(running[1], TABLES[1], port="modbus-tcp://127.0.0.1:1")
     nowhere = [s.model_copy(update={"settings": {"address": 0}}) for s in nowhere]
     with pytest.raises(NotConnectedError, match=r"'C' on modbus-tcp://.*: nothing listens there"):
-        await read(nowhere, 1, SystemClock(SPEED))
+        await read(nowhere, 1, host_clock(SPEED))
     with pytest.raises(BenchFileError, match=r"'C': settings: address is missing"):
-        await read(sensors(running[1], TABLES[1], settings={}), 1, SystemClock(SPEED))
+        await read(sensors(running[1], TABLES[1], settings={}), 1, host_clock(SPEED))
 
 
 async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path) -> None:
@@ -151,7 +153,7 @@ async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path)
     log = tmp_path / "sent"
     world = spec(TABLES[0], speed=SPEED, sampling_rate=50.0)
     with serving(world | {"faults": [off], "sent_log": str(log)}) as (one,):
-        clock = SystemClock(SPEED)
+        clock = host_clock(SPEED)
         blocks: dict[str, list[Block]] = {"A": [], "B": []}
         events: list[Event] = []
         back_at = 0
@@ -197,7 +199,7 @@ def _n_set(log: Path) -> int:
 async def test_a_cancellation_is_not_lost_to_a_reply_that_comes_with_it(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    async with open_bus(running[1].port, SystemClock(), label="bus", reply_timeout=1.0) as bus:
+    async with open_bus(running[1].port, host_clock(), label="bus", reply_timeout=1.0) as bus:
         loop = asyncio.get_running_loop()
         reading = asyncio.create_task(bus.read(4, 1, 0, 2))
 
@@ -219,7 +221,7 @@ async def test_a_bus_is_taken_up_again_without_the_one_who_is_silent(
     both = on_bus(running[0], timeout=0.05)
     settings = {**both[1].settings, "device_id": 9}
     both[1] = both[1].model_copy(update={"settings": settings})
-    async with DRIVER.open(both, SystemClock(SPEED)) as session:
+    async with DRIVER.open(both, host_clock(SPEED)) as session:
         there, absent = session.information
         assert not there.trouble
         assert "registers 48 to 54 of device 9" in absent.trouble
@@ -249,10 +251,10 @@ async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
     async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS})
-        here = RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
+        here = device_at(port, "A", "registers")
         (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
         events: list[str] = []
-        async with DRIVER.open([sensor], SystemClock()) as session:
+        async with DRIVER.open([sensor], host_clock()) as session:
             async for item in session.read():
                 if isinstance(item, Event):
                     events.append(f"{item.kind}: {item.text}")
@@ -273,7 +275,7 @@ async def test_a_bus_that_vanishes_ends_the_session() -> None:
     table = device("C", "registers", port="tcp", settings={"preset": "labjack-ain"})
     with serving(spec(table)) as (one,):
         (sensor,) = sensors(one, table, settings={"preset": "labjack-ain", "timeout": 0.1})
-        async with DRIVER.open([sensor], SystemClock()) as session:
+        async with DRIVER.open([sensor], host_clock()) as session:
             stream = session.read()
             assert isinstance(await anext(stream), Block)
             one.kill()
@@ -307,10 +309,10 @@ async def test_a_late_reply_never_answers_the_next_request() -> None:
     async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
         port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
         table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS[:1]})
-        here = RunningDevice(("A",), "registers", port, {}, None)  # type: ignore[arg-type]  # no process
+        here = device_at(port, "A", "registers")
         (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
         values: list[int] = []
-        async with DRIVER.open([sensor], SystemClock()) as session:
+        async with DRIVER.open([sensor], host_clock()) as session:
             async for item in session.read():
                 if isinstance(item, Block):
                     values += item.counts[:, 0].tolist()

@@ -18,6 +18,7 @@ from daq.host_clock import SystemClock
 from tui.output.console import check_places, console, for_people, write_json, write_text
 from tui.output.formatting import signed
 from tui.output.results import plain
+from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -60,7 +61,9 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
     found: list[SensorCheck] = []
     errors: list[DeviceError] = []
     if devices:
-        found, errors = asyncio.run(probe_bench(bench, SystemClock(bench.speed)))
+        clock, loop_factory = host_time(bench)
+        with asyncio.Runner(loop_factory=loop_factory) as runner:
+            found, errors = runner.run(probe_bench(bench, clock))
         if found:
             screen.print(_device_table(found))
             for entry in found:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rich.live import Live
@@ -14,6 +15,7 @@ from daq.drivers.bench_file import load
 from daq.host_clock import SystemClock
 from tui.output.console import notices, write_json
 from tui.output.formatting import clock_time, roughly, several
+from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,6 +41,8 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
         duration = bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())
+    clock, loop_factory = host_time(bench)
+    record = partial(run, bench, out, duration=duration, clock=clock, loop_factory=loop_factory)
     screen = notices()
     gaps = GapLog()
     if screen.is_terminal:
@@ -48,9 +52,9 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
                 gaps.look(now)
                 live.update(progress_line(now, duration))
 
-            status = run(bench, out, duration=duration, acknowledged=show)
+            status = record(acknowledged=show)
     else:
-        status = run(bench, out, duration=duration, acknowledged=gaps.look)
+        status = record(acknowledged=gaps.look)
     if status.closed:
         _LOGGER.info("%s closed: %s", out, progress_line(status), extra={"recording": str(out)})
     write_json(json, status.to_dict())

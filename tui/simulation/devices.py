@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from sim_devices.server.launch import RunningDevice
 
 _LOGGER = logging.getLogger(__name__)
-HEAD_START_NS = 200_000_000
-"""World time 0 lies this far ahead, so that every process is there when it begins."""
 
 
 def scenario_of(bench: Bench) -> Scenario:
@@ -74,7 +72,6 @@ def specification(bench: Bench, *, speed: float, log: Path | None = None) -> dic
     for sensor in bench.sensors:
         scenario["sensors"][sensor.name]["sampling_rate"] = sensor.sampling_rate
     return {
-        "epoch_ns": time.monotonic_ns() + HEAD_START_NS,
         "speed": speed,
         "scenario": scenario,
         "faults": faults,
@@ -147,7 +144,7 @@ def connected(bench: Bench, running: Sequence[RunningDevice], *, speed: float) -
         )
         for sensor in bench.sensors
     )
-    simulation = bench.simulation | {"speed": speed}
+    simulation = bench.simulation | {"speed": speed, "clock": running[0].clock}
     changed = bench.model_copy(update={"sensors": sensors, "simulation": simulation})
     return parse(dump(changed), str(bench.source or "simulated"))
 

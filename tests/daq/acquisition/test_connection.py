@@ -160,7 +160,7 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
 
 def test_host_time_goes_on_while_the_computer_is_suspended() -> None:
     asleep_ns = 0
-    clock = SystemClock(2.0, lambda: time.monotonic_ns() + asleep_ns, _began_ns=time.monotonic_ns())
+    clock = SystemClock(2.0, always_ns=lambda: time.monotonic_ns() + asleep_ns)
     before = clock.now()
     assert clock.suspended < 1.0
     asleep_ns = 3_600_000_000_000

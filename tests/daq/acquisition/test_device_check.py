@@ -21,9 +21,8 @@ from daq.acquisition.device_check import (
 from daq.bench.loading import parse
 from daq.drivers.registry import driver_names
 from daq.errors import NotConnectedError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, HostTime
-from tests.device_server import serving
+from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 from tui.cli.main import app
 
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 4.0
 RATE = 50.0
@@ -42,7 +43,7 @@ POLLED: dict[str, Any] = device(
     channels={"P": [{"name": axis, "sensitivity": 2e5} for axis in "xyz"]},
 )
 TABLES = [device("A", serial_number="A0000007"), POLLED]
-CLOCK = SystemClock(SPEED)
+CLOCK = host_clock(SPEED)
 FAULTS = [
     {"kind": "dead", "at": 0.0, "duration": 1e6, "channel": 1, "sensors": ["A"]},
     {"kind": "clip", "at": 0.0, "duration": 1e6, "channel": 2, "sensors": ["A"], "level": 100.0},

@@ -14,7 +14,6 @@ import pytest
 
 from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
-from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
 from daq.protocols.epson import commands
 from daq.recording.reader import Recording
@@ -22,10 +21,13 @@ from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
 from tests.acceptance.sample_accounting import Log, accounts
 from tests.daq.acquisition.test_recorder_process import started
+from tests.devices import host_clock
 from tests.sim_devices.simulated_bench import bench_of, device, sensors, spec
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 EPSON = [{"name": axis, "sensitivity": commands.COUNTS_PER_UNIT} for axis in "xyz"]
@@ -72,7 +74,7 @@ async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> Non
     async with started(told) as running:
         bench = bench_of(running, tables)
         path = tmp_path / "r.h5"
-        clock = SystemClock(SPEED)
+        clock = host_clock(SPEED)
         while not stop.is_set():  # a cable may just be out
             with contextlib.suppress(ExceptionGroup):
                 await record(bench, path, clock=clock, stop=stop, acknowledged=acknowledged)
@@ -142,7 +144,7 @@ async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_st
             sampling_rate=200.0,
             sensors=tuple(sensors(one, table("L", "labjack"), settings=settings)),
         )
-        await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
+        await record(bench, path, clock=host_clock(speed), stop=stop, acknowledged=acknowledged)
     states = [status.sensors["L"].state for status in statuses]
     noticed_at = [is_stalled(status) for status in statuses].index(True)
     with Recording.open(path) as recording:
@@ -183,7 +185,7 @@ async def test_a_digitizer_that_recovers_from_an_overflow_is_waited_for(tmp_path
     path = tmp_path / "r.h5"
     async with started(told) as running:
         bench = bench_of(running, tables)
-        await record(bench, path, clock=SystemClock(speed), stop=stop, acknowledged=acknowledged)
+        await record(bench, path, clock=host_clock(speed), stop=stop, acknowledged=acknowledged)
     with Recording.open(path) as recording:
         for sensor in recording.sensors:
             kinds = [e.kind for e in recording.events if e.sensor == sensor.name]

@@ -16,14 +16,13 @@ import pytest
 
 from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
-from daq.host_clock import SystemClock
 from daq.protocols.epson import commands
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.repair import heal, verify
 from daq.recording.sensor_state import SensorState
 from sim_devices.world.world import World
-from tests.device_server import serving
+from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import bench_of, device, scenario, sensors, spec
 
 if TYPE_CHECKING:
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 NAMES = ("A", "B", "C")
@@ -148,7 +149,7 @@ async def test_a_device_loses_power_and_returns(tmp_path: Path) -> None:
     news: asyncio.Queue[RecorderStatus] = asyncio.Queue()
     told = spec(*tables, device("B"), speed=SPEED)
     only_a = {**told, "devices": told["devices"][:1]}
-    clock = SystemClock(SPEED)
+    clock = host_clock(SPEED)
 
     async def until(samples: int, state: SensorState) -> RecorderStatus:
         while True:

@@ -18,7 +18,7 @@ from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.scenario import Scenario
-from tests.device_server import serving
+from tests.devices import paced_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -143,9 +143,17 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
         source = Source(world, described)
         if described.driver == "guralp":  # on whole seconds of UTC
             source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
-        end = WorldClock(self._world["epoch_ns"], self._world["speed"]).now() + 1.0
+        end = (
+            WorldClock(self._world["epoch_ns"], self._world["speed"], paced_clock().now_ns).now()
+            + 1.0
+        )
         self[name] = source.counts(name, 0, round(end * rate))
         return self[name]
+
+
+def world_clock(world: dict[str, Any]) -> WorldClock:
+    """Return the clock of a specification's world."""
+    return WorldClock(world["epoch_ns"], world["speed"], paced_clock().now_ns)
 
 
 @contextlib.contextmanager

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, cast
 
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Event
+from tests.devices import host_clock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
@@ -21,7 +21,7 @@ async def reading(
 ) -> AsyncIterator[AsyncIterator[Block | Event]]:
     """Open a session and its reading; both are closed on exit."""
     async with (
-        driver.open(sensors, SystemClock(speed)) as session,
+        driver.open(sensors, host_clock(speed)) as session,
         contextlib.aclosing(cast("AsyncGenerator[Block | Event]", session.read())) as items,
     ):
         yield items

@@ -11,16 +11,18 @@ import pytest
 
 from daq.drivers.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.errors import RemoteProtocolError
 from tests.daq.drivers.driver_modes import CASES, RATE, Served, serving_all
 from tests.daq.drivers.reading import reading
+from tests.devices import host_clock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 
     from daq.bench.model import Sensor
+
+pytestmark = pytest.mark.devices
 
 SPEED = 4.0
 N = 150
@@ -43,7 +45,7 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
     wanted = round(N * chosen[0].sampling_rate / RATE)
     by_name = {sensor.name: sensor for sensor in chosen}
     found: dict[str, list[Block]] = {name: [] for name in by_name}
-    clock = SystemClock(SPEED)
+    clock = host_clock(SPEED)
     begin = clock.now()
     for _ in range(2):  # the port is free again after a session, and a session begins anew
         found = {name: [] for name in by_name}

@@ -20,18 +20,17 @@ from daq.acquisition.connection import MAX_RETRY_DELAY
 from daq.acquisition.recorder import RecorderStatus, record
 from daq.bench.model import Bench
 from daq.errors import DeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
 from daq.recording.reader import Recording
-from sim_devices.server.world_clock import WorldClock
-from tests.daq.drivers.driver_modes import CASES, Served, serving_all
+from tests.daq.drivers.driver_modes import CASES, Served, serving_all, world_clock
+from tests.devices import host_clock, run
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.recording.reader import SensorRecord
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.devices, pytest.mark.timeout(240)]
 
 SPEED = 4.0
 BEGIN = 44.0
@@ -114,7 +113,7 @@ def script() -> list[dict[str, Any]]:
 
 async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
     """Record all modes; return the faults of each one's device since all were being recorded."""
-    world = WorldClock(served.world["epoch_ns"], SPEED)
+    world = world_clock(served.world)
     stop = asyncio.Event()
     begun = done = math.inf
     struck: dict[str, list[str]] = {}
@@ -141,7 +140,7 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
     async with asyncio.timeout(PATIENCE):
         while True:
             try:
-                await record(bench, path, clock=SystemClock(SPEED), stop=stop, acknowledged=look)
+                await record(bench, path, clock=host_clock(SPEED), stop=stop, acknowledged=look)
             except* DeviceError:  # something went wrong just when it was to begin
                 await asyncio.to_thread(path.unlink, missing_ok=True)
             else:
@@ -162,7 +161,7 @@ def test_each_sample_is_in_its_place(
     monkeypatch.setattr("daq.acquisition.connection.MAX_RETRY_DELAY", MAX_RETRY_DELAY / SPEED)
     path = tmp_path / "all.h5"
     with serving_all(speed=SPEED, faults=script()) as served:
-        struck = asyncio.run(_recorded(served, path))
+        struck = run(_recorded(served, path))
         with Recording.open(path) as recording:
             for mode, sensor in itertools.product(CASES, recording.sensors):
                 if sensor.name not in served.device(mode).sensors:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -13,7 +12,6 @@ from daq.drivers.interface import DeviceInformation
 from daq.drivers.modbus.fifo import FifoSession, FifoSettings
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import FifoDecoder
@@ -25,7 +23,7 @@ from sim_devices.server.serve import Served, device_spec
 from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.world import World
 from tests.daq.drivers.reading import reading
-from tests.device_server import serving
+from tests.devices import host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
@@ -35,6 +33,8 @@ if TYPE_CHECKING:
     from daq.transport.byte_stream import ByteStream
     from sim_devices.server.launch import RunningDevice
     from sim_devices.world.scenario import Scenario
+
+pytestmark = pytest.mark.devices
 
 RATE = 2000.0
 COUNTS = 100_000.0
@@ -133,10 +133,10 @@ async def test_who_asks_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sim_devices.server.serve.LEAST_INTERVAL", 1e3)
     described = device_spec(table("A"))
     (line,) = create(described, Source(scenario("A", sampling_rate=RATE), described))
-    clock = WorldClock(time.monotonic_ns())
+    clock = WorldClock(paced_clock().now_ns(), monotonic_ns=paced_clock().now_ns)
     served = Served(line, clock, LineFaults((), "A", begin=0.0), lambda *_: None)
     await served.wire.open()
-    async with asyncio.timeout(10), open_port(served.wire.address, SystemClock()) as stream:
+    async with asyncio.timeout(10), open_port(served.wire.address, host_clock()) as stream:
         for _ in range(3):
             await stream.write(rtu.read_request(1, 2, 1))
             assert (await stream.read())[0]
@@ -172,13 +172,13 @@ async def test_a_lost_reply_is_no_slow_link(monkeypatch: pytest.MonkeyPatch) -> 
 
         async def read(self) -> tuple[bytes, HostTime]:
             await asyncio.sleep(10.0 if self.asked == 1 else 0.015)
-            return self.reply, SystemClock().now()
+            return self.reply, host_clock().now()
 
     settings = FifoSettings(timeout=0.1, poll_interval=1e-3)
     decoder = FifoDecoder("A", RATE, n_channels=3, header="size", unit=1, capacity=None)
     stream = cast("ByteStream", Backlog())
     session = FifoSession(
-        stream, settings, decoder, information=DeviceInformation("A"), clock=SystemClock()
+        stream, settings, decoder, information=DeviceInformation("A"), clock=host_clock()
     )
     items = []
     async with asyncio.timeout(30):
@@ -225,5 +225,5 @@ async def test_what_does_not_fit_is_named(
 async def test_two_sensors_do_not_share_a_line(running: tuple[RunningDevice, ...]) -> None:
     some = [sensor(running, 0, name=name) for name in ("P", "Q")]
     with pytest.raises(BenchFileError, match="'P', 'Q'; reading one FIFO takes all of a line"):
-        async with DRIVER.open(some, SystemClock()):
+        async with DRIVER.open(some, host_clock()):
             pass

@@ -12,16 +12,14 @@ import pytest
 
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.guralp import scream
 from daq.protocols.guralp.gcf import SampleBlock, SystemId
 from sim_devices.devices import guralp
 from sim_devices.devices.interface import DeviceSpec
 from sim_devices.errors import ScenarioError
-from sim_devices.server.launch import RunningDevice
 from tests.daq.drivers import reading
-from tests.device_server import serving
+from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 if TYPE_CHECKING:
@@ -29,6 +27,9 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from sim_devices.devices.interface import Source
+    from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 RATE = 200.0
@@ -101,7 +102,7 @@ async def test_the_streams_feel_one_motion_at_the_utc_they_state(
 
 async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
     one = sensor(running, 0, settings={"system_id": "GURA"}, serial_number="DEMO")
-    async with DRIVER.open([one], SystemClock(SPEED)) as session:
+    async with DRIVER.open([one], host_clock(SPEED)) as session:
         (information,) = session.information
     assert information.serial_number == "DEMO"
     assert information.sampling_rate == RATE
@@ -141,7 +142,7 @@ def test_a_rate_that_gcf_has_no_code_for_is_named() -> None:
 
 
 async def test_nothing_listens() -> None:
-    gone = RunningDevice(("D",), "guralp", "udp://127.0.0.1:9", {}, None)  # type: ignore[arg-type]  # no process
+    gone = device_at("udp://127.0.0.1:9", "D", "guralp")
     with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: nothing listens"):
         await record(sensors(gone, TABLES[3])[0], 1)
 
@@ -191,7 +192,7 @@ async def test_nothing_that_comes_while_streams_are_found_is_lost(named: bool) -
     streams = ["0123Z2", "0123N2", "0123E2"]  # a block tells 123Z2
     settings = {"link": "scream", "patience": 5.0} | ({"streams": streams} if named else {})
     async with sending(streams, 2) as port:
-        one = RunningDevice(("C",), "guralp", port, settings, None)  # type: ignore[arg-type]  # no process
+        one = device_at(port, "C", "guralp", **settings)
         changes = {"settings": settings, "serial_number": "0123"}
         async with reading.reading(DRIVER, sensors(one, TABLES[2], **changes)) as items:
             blocks: list[Block] = []

@@ -17,12 +17,11 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
-from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.labjack.registers import actual_scan_rate
 from sim_devices.world.world import World
 from tests.daq.drivers.reading import reading
-from tests.device_server import serving
+from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import scenario, spec
 
 if TYPE_CHECKING:
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 4.0
 RATE = 200.0
@@ -168,7 +169,7 @@ async def test_inputs_may_be_any(running: tuple[RunningDevice, ...]) -> None:
 
 async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
     some = bench(running[0], sampling_rate=333.0, serial_number="470001234")
-    async with DRIVER.open(some, SystemClock(SPEED)) as session:
+    async with DRIVER.open(some, host_clock(SPEED)) as session:
         information = session.information
     assert [i.sensor for i in information] == list(NAMES)
     assert information[0].model == "LabJack T7"

@@ -15,7 +15,7 @@ from daq.protocols.block import BlockFlag, Event
 from daq.transport.address import host_and_port
 from sim_devices.world.world import World
 from tests.daq.drivers import reading
-from tests.device_server import serving
+from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Sensor
     from daq.protocols.block import Block
     from sim_devices.server.launch import RunningDevice
+
+pytestmark = pytest.mark.devices
 
 SPEED = 4.0
 RATE = 100.0

@@ -19,7 +19,7 @@ from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
 from sim_devices.errors import ServeError
 from tests.acceptance.run_bench import command
-from tests.device_server import serving
+from tests.devices import paced_clock, serving
 from tui.simulation.devices import connected, specification
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def wait_until(path: Path, recorder: subprocess.Popen[str], **wanted: Any) -> di
 
 def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
     bench = parse(bench_text())
-    told = specification(bench, speed=SPEED)
+    told = specification(bench, speed=SPEED) | {"epoch_ns": paced_clock().now_ns()}
     ports = {d["sensors"][0]: d["number"] for d in told["devices"]}
     alone = {**told, "devices": told["devices"][:2]}
     out = tmp_path / "r.h5"

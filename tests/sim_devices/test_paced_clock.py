@@ -1,0 +1,171 @@
+"""The clock of a simulated bench: when it runs, and for whom it waits."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sim_devices.server.paced_clock import LONGEST, NS, PacedClock, PacedLoop
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks of files")
+
+MS = 1_000_000
+
+
+class System:
+    """The system's clock, moved by the test."""
+
+    def __init__(self) -> None:
+        self.ns = time.monotonic_ns()
+
+    def __call__(self) -> int:
+        """Return the time."""
+        return self.ns
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Return the file of a clock that runs as fast as the system's."""
+    PacedClock.create(tmp_path / "clock").close()
+    return tmp_path / "clock"
+
+
+@pytest.fixture
+def system() -> System:
+    return System()
+
+
+@pytest.fixture
+def clock(file: Path, system: System) -> Iterator[PacedClock]:
+    clock = PacedClock(file, system_ns=system)
+    yield clock
+    clock.close()
+
+
+def test_without_participants_it_is_the_systems_clock(clock: PacedClock, system: System) -> None:
+    assert clock.now_ns() == system.ns
+    system.ns += NS
+    assert clock.now_ns() == system.ns
+    assert clock.left_out == 0
+
+
+def test_it_stands_still_while_a_participant_is_behind(clock: PacedClock, system: System) -> None:
+    began = clock.now_ns()
+    with clock.participate() as first, clock.participate() as second:
+        first.let_run_until(began + 50 * MS)
+        second.let_run_until(began + 70 * MS)
+        system.ns += 5 * MS
+        assert clock.now_ns() == began + 5 * MS
+        system.ns += NS
+        assert clock.now_ns() == began + 50 * MS
+        first.let_run_until(began + 80 * MS)
+        assert clock.now_ns() == began + 50 * MS, "what was left out does not come back"
+        system.ns += 15 * MS
+        assert clock.now_ns() == began + 65 * MS
+        system.ns += NS
+        assert clock.now_ns() == began + 70 * MS
+    system.ns += NS
+    assert clock.now_ns() == began + 70 * MS + NS
+    assert clock.left_out == pytest.approx(2.0 - 0.05)
+
+
+def test_it_never_goes_back(clock: PacedClock, system: System) -> None:
+    began = clock.now_ns()
+    with clock.participate() as participant:
+        participant.let_run_until(began + 60 * MS)
+        system.ns += 50 * MS
+        assert clock.now_ns() == began + 50 * MS
+        participant.let_run_until(began + 20 * MS)
+        assert clock.now_ns() == began + 50 * MS
+
+
+def test_all_who_map_the_file_see_one_time(clock: PacedClock, file: Path, system: System) -> None:
+    other = PacedClock(file, system_ns=system)
+    with other.participate() as participant:
+        began = clock.now_ns()
+        participant.let_run_until(began + 50 * MS)
+        system.ns += NS
+        assert clock.now_ns() == other.now_ns() == began + 50 * MS
+    assert clock.utc_ns() == other.utc_ns()
+    other.close()
+
+
+def test_it_may_run_at_another_rate(tmp_path: Path, system: System) -> None:
+    PacedClock.create(tmp_path / "clock", rate=2.5).close()
+    clock = PacedClock(tmp_path / "clock", system_ns=system)
+    began = clock.now_ns()
+    system.ns += NS
+    assert clock.now_ns() - began == 2.5 * NS
+    clock.close()
+
+
+def test_who_leaves_is_waited_for_no_longer_and_the_slot_is_free(
+    clock: PacedClock, system: System
+) -> None:
+    for _ in range(3):
+        with clock.participate():
+            system.ns += NS
+    began = clock.now_ns()
+    system.ns += NS
+    assert clock.now_ns() == began + NS
+    assert len(list(clock.path.parent.glob("clock.*[0-9]"))) == 1
+
+
+def test_who_is_killed_is_waited_for_no_longer(clock: PacedClock, system: System) -> None:
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        with PacedClock(clock.path).participate():
+            os.write(writing, b"!")
+            time.sleep(600)  # until it is killed
+        os._exit(1)
+    os.read(reading, 1)
+    system.ns += NS
+    behind = clock.now_ns()
+    assert behind < system.ns - NS + 2 * LONGEST
+    system.ns += NS
+    assert clock.now_ns() == behind
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    os.close(reading)
+    os.close(writing)
+    for _ in range(3):  # the one look finds that nobody is there, the next counts on
+        system.ns += NS
+        now = clock.now_ns()
+    assert now >= behind + NS
+
+
+def test_an_event_loop_runs_by_it_and_holds_it(file: Path) -> None:
+    clock = PacedClock(file)
+
+    async def main() -> float:
+        loop = asyncio.get_running_loop()
+        began = clock.now_ns()
+        with clock.participate() as other:
+            other.let_run_until(began + 50 * MS)
+            sleeping = asyncio.create_task(asyncio.sleep(0.1))
+            while time.monotonic_ns() < began + 2 * LONGEST + 50 * MS:  # by the system's clock
+                await loop.run_in_executor(None, os.getpid)  # I/O goes on
+            assert not sleeping.done()
+            assert clock.now_ns() == began + 50 * MS
+        await sleeping
+        assert loop.time() >= began / NS + 0.1
+        before, system = clock.now_ns(), time.monotonic_ns()
+        while time.monotonic_ns() < system + 2 * LONGEST:
+            pass  # looks at nothing that comes
+        return (clock.now_ns() - before) / NS
+
+    with asyncio.Runner(loop_factory=lambda: PacedLoop(clock)) as runner:
+        ran_on = runner.run(main())
+    assert ran_on <= LONGEST / NS
+    clock.close()
