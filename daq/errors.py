@@ -1,14 +1,89 @@
-"""Errors of acquisition. Each is a HuddleError and of the standard kind it is."""
+"""Errors of acquisition and of everything that reads recordings.
+
+Each is a `HuddleError`, and also of the standard kind that it is.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ABSENT: object = object()
+"""In place of a value that a file does not give."""
+_SHOWN_LENGTH = 60
+
 
 class HuddleError(Exception):
-    """Root of every error huddle raises on purpose; its message says what to do."""
+    """Root of every error that huddle raises on purpose; its message says what to do."""
+
+    is_usage_error = False
+    """Whether a command line, a setting or a file that a person wrote is wrong; otherwise a device
+    or a recording is in trouble."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileFault:
+    """One thing wrong with a bench file or a fault script.
+
+    Attributes
+    ----------
+    key : str
+        Such as ``estimate.segment``; within a sensor's table where `sensor` is given; empty for
+        the file, or the sensor, as a whole.
+    expected : str
+        What was expected, and what is wrong where the value does not show it.
+    value : object
+        What the file gives; `ABSENT` if nothing.
+    sensor : str
+        Name of the sensor that the key belongs to, if to one.
+    """
+
+    key: str
+    expected: str
+    value: object = ABSENT
+    sensor: str = ""
+
+    def __str__(self) -> str:
+        table = f'sensors["{self.sensor}"]' if self.sensor else ""
+        place = ".".join(part for part in (table, self.key) if part)
+        if self.value is not ABSENT:
+            place += f" = {toml_value(self.value)}"
+        return f"{place}: {self.expected}" if place else self.expected
+
+
+def toml_value(value: object) -> str:
+    """Return a value on one line, as a TOML file has it, cut where it is long."""
+    if isinstance(value, bool):
+        text = str(value).lower()
+    elif isinstance(value, str):
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in f'"{value}"')
+    elif isinstance(value, (list, tuple)):
+        text = f"[{', '.join(map(toml_value, value))}]"
+    else:
+        text = str(value)
+    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}…"
 
 
 class BenchFileError(HuddleError, ValueError):
-    """The bench file is wrong; the message lists every fault with file, key, value, expectation."""
+    """A bench file or a fault script is wrong; the message has a line for each fault.
+
+    Parameters
+    ----------
+    faults : FileFault
+    source : path or str
+        Name of the file, for the message; drivers do not know it.
+    """
+
+    is_usage_error = True
+
+    def __init__(self, *faults: FileFault, source: str | Path = "") -> None:
+        self.faults = tuple(fault for n, fault in enumerate(faults) if fault not in faults[:n])
+        self.source = str(source)
+        head = f"{source}: " if self.source else ""
+        super().__init__("\n".join(f"{head}{fault}" for fault in self.faults))
 
 
 class DriverError(HuddleError, ImportError):
@@ -49,7 +124,9 @@ class CannotAlignError(HuddleError, ValueError):
 
 
 class WrongSettingError(CannotAlignError):
-    """What an estimate was asked for does not fit the recording's sensors or units."""
+    """An option of an estimate does not fit the recording's sensors or units."""
+
+    is_usage_error = True
 
 
 class ImportFormatError(HuddleError, ValueError):

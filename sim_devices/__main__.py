@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from sim_devices.errors import ScenarioError, ServeError
+from sim_devices.errors import SimulationError
 from sim_devices.server.launch import start
 
 
@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
             sys.stdin.read()
     except KeyboardInterrupt:
         return 130
-    except (OSError, ScenarioError, ServeError) as error:
+    except (OSError, SimulationError) as error:
         print(error, file=sys.stderr)
         return 3
     return 0

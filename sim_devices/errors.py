@@ -3,9 +3,28 @@
 from __future__ import annotations
 
 
-class ScenarioError(ValueError):
-    """A scenario that cannot be simulated: every fault with its key, value and expectation."""
+class SimulationError(Exception):
+    """Root of the errors of this package."""
+
+    is_usage_error = False
+    """Whether a scenario or a fault script is wrong; otherwise a device cannot be served."""
 
 
-class ServeError(RuntimeError):
-    """A simulated device cannot be served; the message says what its process said."""
+class ScenarioError(SimulationError, ValueError):
+    """A scenario or fault script that cannot be simulated.
+
+    Parameters
+    ----------
+    problems : str
+        One for each thing that is wrong: key, value and what was expected.
+    """
+
+    is_usage_error = True
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class ServeError(SimulationError, RuntimeError):
+    """A simulated device cannot be served; the message is that of its process."""

@@ -141,13 +141,13 @@ def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...
     try:
         faults = _SCRIPT.validate_python(script)
     except ValidationError as error:
-        raise ScenarioError("\n".join(map(_told, error.errors(include_url=False)))) from error
+        raise ScenarioError(*map(_problem, error.errors(include_url=False))) from error
     if sensors is None:
         return tuple(faults)
     return tuple(f for f in faults if f.sensors is None or set(f.sensors) & set(sensors))
 
 
-def _told(fault: ErrorDetails) -> str:
+def _problem(fault: ErrorDetails) -> str:
     place = "".join(f"[{key + 1}]" if isinstance(key, int) else f".{key}" for key in fault["loc"])
     expected = fault["msg"]
     if fault["type"] == "list_type":
@@ -178,7 +178,7 @@ def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
         if fault.channel is not None and fault.channel >= least:
             wrong.append(f"{place}.channel = {fault.channel}: expected 0 to {least - 1}")
     if wrong:
-        raise ScenarioError("\n".join(wrong))
+        raise ScenarioError(*wrong)
 
 
 class SampleFaults:

@@ -233,13 +233,19 @@ class _Recorder:
             await asyncio.wait((waiting, stopped), return_when=asyncio.FIRST_COMPLETED)
             if self._stop.is_set():
                 return False
-            failures = [e for e in waiting.result() if isinstance(e, Exception)]
+            failures = [
+                DeviceError(f"port {connection.port}: {result}")
+                if isinstance(result, RemoteProtocolError)
+                else result
+                for connection, result in zip(connections, waiting.result(), strict=True)
+                if isinstance(result, Exception)
+            ]
         finally:
             waiting.cancel()
             stopped.cancel()
             await asyncio.wait([stopped])
         for failure in failures:
-            if not isinstance(failure, (DeviceError, RemoteProtocolError)):
+            if not isinstance(failure, DeviceError):
                 raise failure  # an error in the bench file or in the program, not of a device
         if failures:
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)

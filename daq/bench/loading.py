@@ -1,7 +1,7 @@
-"""The bench file: what stands on the floor, how it is sampled, what is wanted of it.
+"""Reads bench files.
 
-``load`` and ``parse`` report every fault of a file at once, each as file, key, value and what was
-expected. The tables are in :mod:`daq.bench.model`; what needs more than one key to judge is in
+``load`` and ``parse`` report every fault of a file at once, each with its key, its value and what
+was expected. The tables are in :mod:`daq.bench.model`; checks of several keys together are in
 :mod:`daq.bench.validation`.
 """
 
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
+from daq.bench.field_faults import field_faults
 from daq.bench.model import Bench
-from daq.bench.validation import Fault, cross_faults, field_faults
-from daq.errors import BenchFileError
+from daq.bench.validation import cross_faults
+from daq.errors import BenchFileError, FileFault
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,14 +36,15 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
     try:
         text = source.read_text(encoding="utf-8")
     except OSError as error:
-        reason = error.strerror or error
-        raise BenchFileError(f"{source}: cannot be read: {reason}; expected a bench file") from None
+        problem = f"cannot be read: {error.strerror or error}; expected a bench file"
+        raise BenchFileError(FileFault("", problem), source=source) from None
     except UnicodeDecodeError as error:
         if source.suffix.lower() in {".h5", ".hdf5"}:
             found = "is a recording"
         else:
             found = f"byte {error.start} is not UTF-8 text"
-        raise BenchFileError(f"{source}: {found}; expected a bench file (.toml)") from None
+        fault = FileFault("", f"{found}; expected a bench file (.toml)")
+        raise BenchFileError(fault, source=source) from None
     return parse(text, source, drivers)
 
 
@@ -71,9 +73,9 @@ def parse(
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BenchFileError(f"{source}: not TOML: {error}") from None
+        raise BenchFileError(FileFault("", f"not TOML: {error}"), source=source) from None
     bench: Bench | None = None
-    faults: list[Fault] = []
+    faults: list[FileFault] = []
     context = {"text": text, "source": source if isinstance(source, Path) else None}
     try:
         bench = Bench.model_validate(table, context=context)
@@ -82,8 +84,7 @@ def parse(
     if drivers is not None:
         faults += cross_faults(table, drivers)
     if faults or bench is None:
-        unique = dict.fromkeys(str(fault) for fault in faults)
-        raise BenchFileError("\n".join(f"{source}: {fault}" for fault in unique))
+        raise BenchFileError(*faults, source=source)
     return bench
 
 

@@ -1,10 +1,10 @@
-"""What a port must be, and its sensors must agree on, told from the bench file alone."""
+"""Checks of a bench file: what a port must be, and what all its sensors must agree on."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daq.errors import BenchFileError
+from daq.errors import BenchFileError, FileFault, toml_value
 from daq.transport.address import host_and_port
 
 if TYPE_CHECKING:
@@ -18,17 +18,18 @@ NETWORK = ("socket://", "tcp://", "udp://", "modbus-tcp://")
 
 
 def only(sensors: Sequence[Sensor], why: str) -> Sensor:
-    """Return the one sensor of a port that takes no more.
+    """Return the only sensor of a port.
 
     Raises
     ------
     BenchFileError
-        There are several; or the port is no address.
+        If there are several sensors, or the port is no address.
     """
     sensor = sensors[0]
     if len(sensors) > 1:
         names = ", ".join(repr(other.name) for other in sensors)
-        raise BenchFileError(f"port {sensor.port} is given to {names}; {why}")
+        expected = f"is the port of {names}; {why}"
+        raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name))
     require_address(sensor)
     return sensor
 
@@ -36,12 +37,12 @@ def only(sensors: Sequence[Sensor], why: str) -> Sensor:
 def require_alike(
     sensors: Sequence[Sensor], settings: Mapping[str, BaseModel], keys: Collection[str]
 ) -> None:
-    """Refuse what a later sensor of a port says otherwise than the first, of which it is taken.
+    """Check that all sensors of a port have the same common settings.
 
     Raises
     ------
     BenchFileError
-        Naming the sensor, its key, the value and what was expected.
+        If a later sensor gives another value than the first, whose value is used.
     """
     first = sensors[0]
     for sensor in sensors[1:]:
@@ -49,22 +50,24 @@ def require_alike(
         for key in (k for k in type(own).model_fields if k in keys and k in own.model_fields_set):
             value, expected = getattr(own, key), getattr(settings[first.name], key)
             if value != expected:
-                raise BenchFileError(
-                    f"sensor {sensor.name!r}: settings.{key} = {value!r}; expected {expected!r}, as"
-                    f" of {first.name!r}, the first on port {sensor.port}"
+                wanted = "no value" if expected is None else toml_value(expected)
+                problem = (
+                    f"expected {wanted}, as of {first.name!r}, the first on port {sensor.port}"
                 )
+                raise BenchFileError(FileFault(f"settings.{key}", problem, value, sensor.name))
 
 
 def require_address(sensor: Sensor) -> None:
-    """Refuse a network port that is no address.
+    """Check that a network port is an address.
 
     Raises
     ------
     BenchFileError
-        Naming the sensor, the port as it was written and what was expected.
+        If it is none.
     """
     if sensor.port.startswith(NETWORK):
         try:
             host_and_port(sensor.port)
         except ValueError as error:
-            raise BenchFileError(f"sensor {sensor.name!r}: port {error}") from error
+            expected = f"expected {sensor.port.partition('://')[0]}://host:port"
+            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error

@@ -28,7 +28,7 @@ from pydantic import (
 
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import only
-from daq.errors import BenchFileError, DeviceError, NoAnswerError
+from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, toml_value
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.text.decoder import TextDecoder
 from daq.protocols.text.format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
@@ -103,7 +103,6 @@ class TextSettings(BaseModel):
         BenchFileError
             There is not one column, or one name, for each channel; or messages could not be read.
         """
-        who = f"sensor {sensor.name!r}"
         given = {
             field.name: value
             for field in fields(TextFormat)
@@ -119,19 +118,19 @@ class TextSettings(BaseModel):
         places = format_.channel_names if format_.layout == "channel" else format_.columns
         if len(places) != n_channels:
             what = "channel_names" if format_.layout == "channel" else "columns"
-            raise BenchFileError(
-                f"{who}: settings.{what} = {list(places)};"
-                f" expected one for each of its {n_channels} channels"
-            )
+            expected = f"expected one for each of the sensor's {n_channels} channels"
+            raise BenchFileError(FileFault(f"settings.{what}", expected, list(places), sensor.name))
         if format_.terminator in format_.delimiter:
+            expected = (
+                f"is in settings.delimiter = {toml_value(format_.delimiter)}; expected one that"
+                " ends a message and not a field"
+            )
             raise BenchFileError(
-                f"{who}: settings.terminator = {format_.terminator!r} is in settings.delimiter ="
-                f" {format_.delimiter!r}; expected one that ends a message and not a field"
+                FileFault("settings.terminator", expected, format_.terminator, sensor.name)
             )
         if format_.device_time and format_.layout == "row" and format_.time_column is None:
-            raise BenchFileError(
-                f"{who}: settings.device_time = true; expected settings.time_column with it"
-            )
+            expected = "expected settings.time_column with it"
+            raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
         return format_
 
 
@@ -278,10 +277,8 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextForma
     settings = TextSettings.model_validate(sensor.settings)
     for key in ("start", "stop"):
         if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
-            raise BenchFileError(
-                f"sensor {sensor.name!r}: settings.{key} = {value!r}; at {sensor.port} it is only"
-                " listened, and nothing sent: leave it out"
-            )
+            expected = f"nothing can be sent to {sensor.port}: leave it out"
+            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
     return sensor, settings, settings.format_for(sensor)
 
 

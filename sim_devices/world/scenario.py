@@ -103,7 +103,7 @@ class Scenario(Table):
         try:
             return cls.model_validate(own)
         except ValidationError as error:
-            raise ScenarioError(_told(error, own)) from error
+            raise ScenarioError(*_problems(error, own)) from error
 
     def to_dict(self) -> dict[str, Any]:
         """Write the scenario as a table: plain TOML and JSON values, `None` left out."""
@@ -203,8 +203,8 @@ def _rotation(angles: float | tuple[float, float, float]) -> FloatArray:
     return np.asarray(about_z @ about_y @ about_x)
 
 
-def _told(error: ValidationError, table: Mapping[str, Any]) -> str:
-    """Every fault on its line: key = value, and what was expected."""
+def _problems(error: ValidationError, table: Mapping[str, Any]) -> list[str]:
+    """Return everything that is wrong: key = value, and what was expected."""
     expected: dict[str, list[str]] = {}
     for fault in error.errors(include_url=False):
         key = "simulation"
@@ -219,4 +219,4 @@ def _told(error: ValidationError, table: Mapping[str, Any]) -> str:
         elif not isinstance(given, dict):
             key = f"{key} = {given!r}"
         expected.setdefault(key, []).append(fault["msg"])
-    return "\n".join(f"{key}: {', or '.join(said)}" for key, said in expected.items())
+    return [f"{key}: {', or '.join(messages)}" for key, messages in expected.items()]

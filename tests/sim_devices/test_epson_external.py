@@ -125,18 +125,18 @@ async def test_without_a_trigger_there_is_no_sample(running: Running) -> None:
 
 async def test_a_model_without_pps_is_named(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "pps-rising"})
-    with pytest.raises(WrongDeviceError, match=r'"pps-rising"; only an M-A370 follows 1PPS'):
+    with pytest.raises(WrongDeviceError, match=r'"pps-rising": only an M-A370 follows 1PPS'):
         await record(DRIVER, sensor, 1, speed=SPEED)
 
 
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"filter": "K128_FC350"}, r'settings.filter = "K128_FC350"; an M-A370 has K64_FC83, K128'),
-        ({"reduced_noise": True}, "settings.reduced_noise = true; only an M-A352 has it"),
+        ({"filter": "K128_FC350"}, r'settings.filter = "K128_FC350": an M-A370 has K64_FC83, K128'),
+        ({"reduced_noise": True}, "settings.reduced_noise = true: only an M-A352 has it"),
         (
             {"temperature_stabilisation": True},
-            "settings.temperature_stabilisation = true; only an M-A352 has it",
+            "settings.temperature_stabilisation = true: only an M-A352 has it",
         ),
     ],
 )
@@ -145,11 +145,11 @@ async def test_what_an_a370_lacks_is_named(
 ) -> None:
     """As soon as the model is known: in the bench file, or from the device."""
     named = connecting(running, "none", settings=settings, model="M-A370")
-    with pytest.raises(BenchFileError, match=f"sensor 'none': {said}"):
+    with pytest.raises(BenchFileError, match=rf'sensors\["none"\]\.{said}'):
         checked([named])
     unnamed = connecting(running, "none", settings=settings)
     checked([unnamed])
-    with pytest.raises(WrongDeviceError, match=f"{unnamed.port}: sensor 'none': {said}"):
+    with pytest.raises(WrongDeviceError, match=rf'{unnamed.port}: sensors\["none"\]\.{said}'):
         await record(DRIVER, unnamed, 1, speed=SPEED)
 
 

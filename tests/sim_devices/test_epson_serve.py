@@ -154,9 +154,18 @@ async def test_a_serial_number_changed_on_the_way_is_not_believed(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sampling_rate": 128.0}, "sampling_rate = 128; the device has 1000, 500, 200, 100, 50"),
-        ({"sampling_rate": 1000.0, "settings": {"baud_rate": 115200}}, "need 240000 baud"),
-        ({"settings": {"fields": ["x"]}}, r"4 channels, but settings.fields = \['x'\]"),
+        (
+            {"sampling_rate": 128.0},
+            "sampling_rate = 128.0: expected .* rates: 1000, 500, 200, 100, 50",
+        ),
+        (
+            {"sampling_rate": 1000.0, "settings": {"baud_rate": 115200}},
+            "at least 240000 for 1000 Hz",
+        ),
+        (
+            {"settings": {"fields": ["x"]}},
+            r'settings.fields = \["x"\]: .* each of the sensor.s 4 channels',
+        ),
     ],
 )
 async def test_what_the_device_cannot_do(

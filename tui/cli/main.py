@@ -3,15 +3,8 @@
 What a subcommand needs is imported when it runs; so ``huddle --help`` loads neither numpy nor
 HDF5, and ``huddle record`` never loads Textual.
 
-====  ==========================================================
-exit  meaning
-====  ==========================================================
-0     done
-1     a limit was not met
-2     the command line or the bench file is wrong
-3     a device or a file is in trouble
-130   interrupted
-====  ==========================================================
+The codes are in :mod:`tui.output.exit_codes`; every error of ours says which one it means by its
+type.
 """
 
 from __future__ import annotations
@@ -28,18 +21,10 @@ from typer.core import TyperGroup
 
 from tui.cli import acquisition, recordings, setup, studies
 from tui.cli.examples import EXAMPLES
+from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-
-USAGE, TROUBLE, INTERRUPTED = 2, 3, 130
-
-
-_OTHERS = (("estimator.errors", "EstimatorError"), ("sim_devices.errors", "ServeError"))
-"""Roots of errors that are trouble as well, where their module has been loaded at all."""
-
-
-_WRONG_USE = {"ScenarioError", "BandError"}
 
 
 class HuddleGroup(TyperGroup):
@@ -52,18 +37,16 @@ class HuddleGroup(TyperGroup):
         try:
             code = super().main(*args, **options | {"standalone_mode": False})
         except typer.Abort:  # the end of standard input where an answer is expected
-            code = TROUBLE
-        except Exception as error:
-            if not hasattr(error, "format_message"):
-                raise
+            code = ExitCode.TROUBLE
+        except typer.TyperException as error:  # a usage error
             from tui.output.logs import report_failure  # noqa: PLC0415 - seldom needed
 
             context = getattr(error, "ctx", None)
             lines = [error.format_message()]
             if context is not None:
                 lines.append(f"see {context.command_path} --help")
-            report_failure(lines, exit_code=USAGE)
-            code = USAGE
+            report_failure(lines, exit_code=ExitCode.USAGE)
+            code = ExitCode.USAGE
         sys.exit(code)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - the context is the library's own
@@ -71,44 +54,38 @@ class HuddleGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(ExitCode.INTERRUPTED) from None
         except BrokenPipeError:  # | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(0) from None
-        except Exception as error:
-            if isinstance(error, (typer.Exit, typer.Abort)) or hasattr(error, "show"):
-                raise  # the library's own: usage errors show themselves
+            raise typer.Exit(ExitCode.DONE) from None
+        except (typer.Exit, typer.Abort, typer.TyperException):
+            raise  # of the library, which shows usage errors itself
+        except Exception as error:  # noqa: BLE001 -- the one place where errors become exit codes
             from tui.output.logs import COMMAND, report_failure  # noqa: PLC0415 - seldom needed
 
             code = exit_code(error)
             lines = list(messages(error))
             if code is None:
                 COMMAND.critical("unexpected error", exc_info=True)
-                code, lines = TROUBLE, ["this is an error in huddle itself; please report it"]
+                code = ExitCode.TROUBLE
+                lines = ["this is an error in huddle itself; please report it"]
             with suppress(OSError):  # standard error may be a file on a full disk
                 report_failure(lines, exit_code=code)
             raise typer.Exit(code) from None
 
 
-def exit_code(error: BaseException) -> int | None:
-    """Return the exit code of an error; None for one that we did not foresee."""
-    from daq.errors import BenchFileError, HuddleError, WrongSettingError  # noqa: PLC0415 - seldom needed
+def exit_code(error: BaseException) -> ExitCode | None:
+    """Return the exit code of an error; None for an error of the program itself."""
+    from daq.errors import HuddleError  # noqa: PLC0415 - seldom needed
+    from estimator.errors import EstimatorError  # noqa: PLC0415
+    from sim_devices.errors import SimulationError  # noqa: PLC0415
 
     if isinstance(error, BaseExceptionGroup):
         codes = [exit_code(inner) for inner in error.exceptions]
         return None if None in codes else max(code for code in codes if code is not None)
-    if type(error).__name__ == "RecorderFailedError":
-        return int(getattr(error, "code", TROUBLE))
-    wrong_use = isinstance(error, (BenchFileError, WrongSettingError))
-    if wrong_use or type(error).__name__ in _WRONG_USE:
-        return USAGE
-    if isinstance(error, (HuddleError, OSError)):
-        return TROUBLE
-    for module, name in _OTHERS:
-        loaded = sys.modules.get(module)
-        if loaded is not None and isinstance(error, getattr(loaded, name)):
-            return TROUBLE
-    return None
+    if isinstance(error, (HuddleError, EstimatorError, SimulationError)):
+        return ExitCode.USAGE if error.is_usage_error else ExitCode.TROUBLE
+    return ExitCode.TROUBLE if isinstance(error, OSError) else None
 
 
 def messages(error: BaseException) -> Iterator[str]:
@@ -116,7 +93,7 @@ def messages(error: BaseException) -> Iterator[str]:
     if isinstance(error, BaseExceptionGroup):
         for inner in error.exceptions:
             yield from messages(inner)
-    elif isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
+    elif isinstance(error, OSError) and error.strerror:
         yield ": ".join(str(part) for part in (error.filename, error.strerror) if part)
     else:
         yield from (str(error) or type(error).__name__).splitlines()
@@ -203,11 +180,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         app(arguments)
     except SystemExit as ended:
-        if ended.code == TROUBLE and "h5py" in sys.modules:
+        if ended.code == ExitCode.TROUBLE and "h5py" in sys.modules:
             # HDF5 can crash on exit after a full disk; all files of ours are closed by now.
             with suppress(OSError):
                 sys.stdout.flush()
                 sys.stderr.flush()
-            os._exit(TROUBLE)
+            os._exit(ExitCode.TROUBLE)
         raise
-    raise SystemExit(0)
+    raise SystemExit(ExitCode.DONE)

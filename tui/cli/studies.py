@@ -10,8 +10,7 @@ import typer
 from tui.cli.examples import examples
 from tui.cli.logging_options import with_logging
 from tui.cli.options import JsonOption
-
-DISAGREES = 1
+from tui.output.exit_codes import ExitCode
 
 
 @examples("huddle reproduce fig4 fig9", "huddle reproduce all --out figures --json points.json")
@@ -43,4 +42,4 @@ def reproduce(
     from tui.studies.reproduce import run
 
     if not run(studies or (), out=out, json=json):
-        raise typer.Exit(DISAGREES)
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)

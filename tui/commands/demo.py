@@ -23,8 +23,9 @@ from daq.estimation.settings import Settings
 from daq.results.band_summary import band_of, correlation_of
 from daq.results.clock_effect import effect
 from estimator.self_noise.band_means import band_edges, band_means
-from tui.commands.run import INTERRUPTED, result_of
+from tui.commands.run import result_of
 from tui.output.console import check_places, for_people, notices, write_json
+from tui.output.exit_codes import ExitCode
 from tui.output.formatting import level, level_with_error
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
@@ -117,7 +118,7 @@ def run_demo(
         screen.print(line)
     write_json(json, _document(compared, snapshot))
     if interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(ExitCode.INTERRUPTED)
 
 
 def _show(path: Path, settings: Settings) -> Path | None:

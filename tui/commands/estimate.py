@@ -11,6 +11,7 @@ from daq.estimation.estimation import estimate
 from daq.results.limits import exceeded
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
+from tui.output.exit_codes import ExitCode
 from tui.output.results import curves_csv, document, limit_line, remarks, result_table, result_title
 from tui.runs.estimate_settings import settings_for
 
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-
-LIMIT_NOT_MET = 1
 
 
 def estimate_recordings(
@@ -45,7 +44,7 @@ def estimate_recordings(
     met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
     hint(f"for a report of it: huddle report {files[0]}")
     if not met:
-        raise typer.Exit(LIMIT_NOT_MET)
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
 
 
 def estimated(

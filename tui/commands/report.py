@@ -8,8 +8,9 @@ import typer
 from rich.markup import escape
 
 from daq.results.limits import exceeded
-from tui.commands.estimate import LIMIT_NOT_MET, estimated
+from tui.commands.estimate import estimated
 from tui.output.console import check_places, console, notices
+from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,7 +44,7 @@ def report_recordings(
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
     write_report(snapshot, out, recordings=files, settings=settings, screen=console())
     if exceeded(bench, snapshot, settings):
-        raise typer.Exit(LIMIT_NOT_MET)
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
 
 
 def checked(out: Path) -> Path:

@@ -24,9 +24,10 @@ from daq.recording.repair import heal
 from daq.results.band_summary import reached_cov
 from daq.results.store import store_results
 from estimator.errors import EstimatorError
-from tui.commands.estimate import LIMIT_NOT_MET, show_result
+from tui.commands.estimate import show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
+from tui.output.exit_codes import ExitCode
 from tui.output.formatting import clock_time, time_left
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.runs.interrupt import defer_interrupt
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus
 
 _LOGGER = logging.getLogger(__name__)
-INTERRUPTED = 130
 
 
 def run_test(
@@ -109,9 +109,9 @@ def run_test(
     if report is None:
         hint(f"for a report of it: huddle report {out}")
     if interruption.pressed:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(ExitCode.INTERRUPTED)
     if not met:
-        raise typer.Exit(LIMIT_NOT_MET)
+        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
 
 
 def result_of(

@@ -14,12 +14,13 @@ from daq.acquisition.recorder import recording_path
 from daq.acquisition.schedule import due_times, remove_old, serve, utc_now
 from daq.bench.estimate_settings import to_arguments
 from daq.drivers.bench_file import load
-from daq.errors import BenchFileError, HuddleError, RecordingError
+from daq.errors import BenchFileError, FileFault, HuddleError, RecordingError
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.python_process import python_command
 from tui.output import logs
 from tui.output.console import for_people, write_json
+from tui.output.exit_codes import ExitCode
 from tui.runs.child_log import ChildLog
 from tui.runs.estimate_settings import check_fit, chosen
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 _LEVELS = {"failed": logging.ERROR, "missed": logging.WARNING, "refused": logging.WARNING}
 SHOWN = 5
+ENDED_WELL = {ExitCode.DONE, ExitCode.LIMIT_NOT_MET, ExitCode.INTERRUPTED}
+"""Exit codes of a run that is no failure."""
 
 
 class RunFailedError(HuddleError):
@@ -58,14 +61,11 @@ def serve_bench(
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
     if not bench.schedule.cron:
-        raise BenchFileError(
-            f'{path}: schedule.cron: is missing; expected cron lines such as ["0 22 * * *"]'
-        )
+        expected = 'is missing; expected cron lines such as ["0 22 * * *"]'
+        raise BenchFileError(FileFault("schedule.cron", expected), source=path)
     if bench.recording.duration is None:
-        raise BenchFileError(
-            f"{path}: recording.duration: is missing; expected how long each run lasts, "
-            'such as "3h"'
-        )
+        expected = 'is missing; expected how long each run lasts, such as "3h"'
+        raise BenchFileError(FileFault("recording.duration", expected), source=path)
     if show:
         times = list(islice(due_times(bench.schedule, utc_now()), SHOWN))
         for due in times:
@@ -135,7 +135,7 @@ async def run_once(
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGINT)
     await done
-    if process.returncode not in {0, 1, 130}:
+    if process.returncode not in ENDED_WELL:
         said = "; ".join(log.errors) or f"huddle run ended with exit code {process.returncode}"
         raise RunFailedError(said)
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from daq.acquisition.recorder import recording_path
 from daq.drivers.bench_file import load
-from daq.errors import BenchFileError, HuddleError
+from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.control import ask
@@ -166,15 +166,17 @@ def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fie
     if source.suffix.lower() in {".h5", ".hdf5"}:
         open_recording(source, **wanted)
     elif source.suffix.lower() in FOREIGN:
-        raise BenchFileError(
-            f"{source}: neither a bench file (.toml) nor a recording (.h5); make a recording of it"
-            f" first: huddle import {source} --out {source.with_suffix('.h5')}"
+        problem = (
+            "neither a bench file (.toml) nor a recording (.h5); make a recording of it first:"
+            f" huddle import {source} --out {source.with_suffix('.h5')}"
         )
+        raise BenchFileError(FileFault("", problem), source=source)
     elif not source.exists():
-        raise BenchFileError(
-            f"{source}: there is no such file; write a bench file with huddle init -o {source}, or"
-            " see one at work with huddle demo"
+        problem = (
+            f"there is no such file; write a bench file with huddle init -o {source}, or see one at"
+            " work with huddle demo"
         )
+        raise BenchFileError(FileFault("", problem), source=source)
     else:
         open_bench(source, **wanted)
 

@@ -22,6 +22,7 @@ from daq.errors import HuddleError, RecordingError
 from daq.python_process import python_command
 from daq.recording.control import ask
 from tui.output import logs
+from tui.output.exit_codes import ExitCode
 from tui.runs.child_log import ChildLog
 
 POLL = 0.05
@@ -31,11 +32,11 @@ STOP_TIMEOUT = 30.0
 
 
 class RecorderFailedError(HuddleError):
-    """The recorder ended in trouble; ``code`` is its exit code and the message what it said."""
+    """The recorder failed; the message has the errors that it reported."""
 
-    def __init__(self, said: str, code: int) -> None:
-        super().__init__(said)
-        self.code = code
+    def __init__(self, message: str, *, is_usage_error: bool = False) -> None:
+        super().__init__(message)
+        self.is_usage_error = is_usage_error
 
 
 class RecorderProcess:
@@ -104,7 +105,7 @@ class RecorderProcess:
         while not self.out.exists():
             if self.ended and not self.out.exists():
                 self.check()
-                raise RecorderFailedError(f"{self.out}: the recorder ended without a recording", 3)
+                raise RecorderFailedError(f"{self.out}: the recorder ended without a recording")
             time.sleep(POLL)
 
     def check(self) -> None:
@@ -119,7 +120,7 @@ class RecorderProcess:
         if code in {None, 0}:
             return
         said = "\n".join(self._log.errors()) or self._how_it_ended(code)
-        raise RecorderFailedError(said, code if code in {2, 3} else 3)
+        raise RecorderFailedError(said, is_usage_error=code == ExitCode.USAGE)
 
     def _how_it_ended(self, code: int) -> str:
         if code > 0:

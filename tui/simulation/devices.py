@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from daq.bench.loading import dump
 from daq.drivers.bench_file import load, parse
-from daq.errors import BenchFileError
+from daq.errors import BenchFileError, FileFault
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import check
 from sim_devices.faults import parse as parse_faults
@@ -41,23 +41,21 @@ def scenario_of(bench: Bench) -> Scenario:
     """
     source = bench.source or "bench"
     if not bench.simulation:
-        raise BenchFileError(
-            f"{source}: simulation: is missing; expected a table with motion and sensors "
-            "(huddle init writes one)"
-        )
+        expected = "is missing; expected a table with motion and sensors (huddle init writes one)"
+        raise BenchFileError(FileFault("simulation", expected), source=source)
     scenario = Scenario.from_dict(bench.simulation, sampling_rate=bench.sampling_rate)
     for sensor in bench.sensors:
         if sensor.name not in scenario.names:
-            raise BenchFileError(
-                f"{source}: simulation.sensors.{sensor.name}: is missing; "
-                "expected a table for every sensor"
-            )
+            expected = "is missing; expected a table for every sensor"
+            fault = FileFault(f"simulation.sensors.{sensor.name}", expected)
+            raise BenchFileError(fault, source=source)
         if scenario.n_channels(sensor.name) != sensor.n_main_channels:
-            raise BenchFileError(
-                f"{source}: simulation.sensors.{sensor.name}: has "
-                f"{scenario.n_channels(sensor.name)} channels; expected {sensor.n_main_channels}, "
-                "one for each channel that is not auxiliary"
+            expected = (
+                f"has {scenario.n_channels(sensor.name)} channels; expected"
+                f" {sensor.n_main_channels}, one for each channel that is not auxiliary"
             )
+            fault = FileFault(f"simulation.sensors.{sensor.name}", expected)
+            raise BenchFileError(fault, source=source)
     return scenario
 
 
@@ -160,15 +158,15 @@ def with_faults(bench: Bench, path: Path) -> Bench:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        reason = error.strerror or error
-        raise BenchFileError(f"{path}: cannot be read: {reason}; expected a fault script") from None
+        problem = f"cannot be read: {error.strerror or error}; expected a fault script"
+        raise BenchFileError(FileFault("", problem), source=path) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BenchFileError(
-            f"{path}: {error}; expected a fault script, a TOML file of [[faults]]"
-        ) from None
-    unknown = ", ".join(sorted(table.keys() - {"faults"}))
+        problem = f"{error}; expected a fault script, a TOML file of [[faults]]"
+        raise BenchFileError(FileFault("", problem), source=path) from None
+    unknown = sorted(table.keys() - {"faults"})
     if unknown:
-        raise BenchFileError(f"{path}: {unknown}: there is no such key; expected [[faults]]")
+        found = (FileFault(key, "there is no such key; expected [[faults]]") for key in unknown)
+        raise BenchFileError(*found, source=path)
     script = table.get("faults", [])
     _check_faults(bench, script, str(path))
     return bench.model_copy(update={"simulation": bench.simulation | {"faults": script}})
@@ -181,8 +179,8 @@ def _check_faults(bench: Bench, script: object, source: str) -> None:
             parse_faults(script), {sensor.name: sensor.n_main_channels for sensor in bench.sensors}
         )
     except ScenarioError as error:
-        lines = str(error).splitlines()
-        raise BenchFileError("\n".join(f"{source}: {line}" for line in lines)) from error
+        found = (FileFault("", problem) for problem in error.problems)
+        raise BenchFileError(*found, source=source) from error
 
 
 @contextmanager

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, PositiveFloat, Strict, field_validator
 
 from daq.drivers.interface import DeviceInformation
-from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.epson import commands
 from daq.protocols.epson.burst import BurstDecoder
 from daq.protocols.epson.commands import BurstFormat, Register
@@ -95,12 +95,12 @@ class Configuration:
         """
         settings = EpsonSettings.model_validate(sensor.settings)
         model = (model or sensor.model).upper()
-        who = f"sensor {sensor.name!r}"
         rate = round(sensor.sampling_rate)
         if rate not in commands.RATES or rate != sensor.sampling_rate:
             rates = ", ".join(map(str, commands.RATES))
+            expected = f"expected one of the device's rates: {rates} Hz"
             raise BenchFileError(
-                f"{who}: sampling_rate = {sensor.sampling_rate:g}; the device has {rates} Hz"
+                FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
             )
         axes: Iterator[Field] = iter(("x", "y", "z"))
         fields = settings.fields or tuple(
@@ -108,19 +108,23 @@ class Configuration:
             for channel in sensor.channels
         )
         if len(fields) != len(sensor.channels) or len(set(fields)) < len(fields):
-            raise BenchFileError(
-                f"{who}: {len(sensor.channels)} channels, but settings.fields = {list(fields)};"
-                " expected a different one of x, y, z, temperature for each channel"
+            expected = (
+                "expected a different one of x, y, z, temperature for each of the sensor's"
+                f" {len(sensor.channels)} channels"
             )
+            raise BenchFileError(FileFault("settings.fields", expected, list(fields), sensor.name))
         flags = ("flag",) if settings.flags else ()
         burst = BurstFormat.of(*flags, *fields, "count", "checksum")
         if (needed := rate * burst.size * 10) > settings.baud_rate:
+            expected = (
+                f"expected at least {needed} for {rate} Hz of {burst.size} bytes (or fewer fields,"
+                " or a lower rate)"
+            )
             raise BenchFileError(
-                f"{who}: {rate} Hz of {burst.size} bytes need {needed} baud;"
-                f" settings.baud_rate = {settings.baud_rate} (fewer fields, or a lower rate)"
+                FileFault("settings.baud_rate", expected, settings.baud_rate, sensor.name)
             )
         if lacking := _lacking(settings, model):
-            raise BenchFileError(f"{who}: {lacking}")
+            raise BenchFileError(replace(lacking, sensor=sensor.name))
         is_a370 = "A370" in model
         usual = commands.USUAL_FILTER[min(rate, 500) if is_a370 else rate]
         return cls(rate, settings.filter or usual, fields, burst, settings, is_a370)
@@ -163,18 +167,18 @@ class Configuration:
         ]
 
 
-def _lacking(settings: EpsonSettings, model: str) -> str:
-    """Say what of the settings a model does not have; nothing if it has all, or is not known."""
+def _lacking(settings: EpsonSettings, model: str) -> FileFault | None:
+    """Return a setting that a model does not have; None if it has all, or is not known."""
     if "A370" in model:
         if settings.filter in commands.NOT_ON_A370:
             known = ", ".join(name for name in commands.FILTERS if name not in commands.NOT_ON_A370)
-            return f'settings.filter = "{settings.filter}"; an M-A370 has {known}'
+            return FileFault("settings.filter", f"an M-A370 has {known}", settings.filter)
         for key in ("reduced_noise", "temperature_stabilisation"):
             if getattr(settings, key):
-                return f"settings.{key} = true; only an M-A352 has it: leave it out"
+                return FileFault(f"settings.{key}", "only an M-A352 has it: leave it out", True)
     if "A352" in model and settings.external.startswith("pps"):
-        return f'settings.external = "{settings.external}"; only an M-A370 follows 1PPS'
-    return ""
+        return FileFault("settings.external", "only an M-A370 follows 1PPS", settings.external)
+    return None
 
 
 class Device:

@@ -28,7 +28,7 @@ from daq.drivers.guralp.links import open_link
 from daq.drivers.guralp.settings import GuralpSettings
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import require_address, require_alike
-from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp.gcf import component, serial_number
 
@@ -152,15 +152,16 @@ def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
         if settings.streams is None and len(sensors) == 1:
             return {sensor.name: ()}
         if settings.streams is None or len(settings.streams) != len(sensor.channels):
-            raise BenchFileError(
-                f"sensor {sensor.name!r}: settings.streams = {settings.streams};"
-                f" expected a stream ID for each of its {len(sensor.channels)} channels"
+            expected = (
+                f"expected a stream ID for each of the sensor's {len(sensor.channels)} channels"
             )
+            given = ABSENT if settings.streams is None else list(settings.streams)
+            raise BenchFileError(FileFault("settings.streams", expected, given, sensor.name))
         for stream in settings.streams:
             if stream in taken:
+                expected = f"{stream} is already a stream of sensor {taken[stream]!r}"
                 raise BenchFileError(
-                    f"sensor {sensor.name!r}: settings.streams: {stream} is already of a channel of"
-                    f" {taken[stream]!r}"
+                    FileFault("settings.streams", expected, list(settings.streams), sensor.name)
                 )
             taken[stream] = sensor.name
         ids[sensor.name] = settings.streams

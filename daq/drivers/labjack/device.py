@@ -21,7 +21,7 @@ from pydantic import (
 
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import require_alike
-from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers as reg
 from daq.protocols.labjack import stream as labjack
@@ -175,10 +175,8 @@ def address_of(sensor: Sensor) -> tuple[str, int]:
             url = f"{url}:{MODBUS_PORT}"
         host, number = host_and_port(url)
     except ValueError as error:
-        raise BenchFileError(
-            f"sensor {sensor.name!r}: port = {sensor.port!r}; expected modbus-tcp://host, or"
-            " modbus-tcp://host:port"
-        ) from error
+        expected = "expected modbus-tcp://host, or modbus-tcp://host:port"
+        raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error
     return f"[{host}]" if ":" in host else host, number
 
 
@@ -203,28 +201,32 @@ def inputs_of(
             numbers = tuple(range(len(taken), len(taken) + n_channels))
         for what, given in (("inputs", numbers), ("negative_inputs", own.negative_inputs)):
             if given is not None and len(given) != n_channels:
+                expected = f"expected one for each of the sensor's {n_channels} channels"
                 raise BenchFileError(
-                    f"sensor {sensor.name!r}: settings.{what} = {list(given)};"
-                    f" expected one for each of its {n_channels} channels"
+                    FileFault(f"settings.{what}", expected, list(given), sensor.name)
                 )
         for number in numbers:
             if number in taken:
+                expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
                 raise BenchFileError(
-                    f"sensor {sensor.name!r}: AIN{number} is already an input of {taken[number]!r}"
+                    FileFault("settings.inputs", expected, list(numbers), sensor.name)
                 )
             taken[number] = sensor.name
         if sensor.sampling_rate != sensors[0].sampling_rate:
+            expected = (
+                f"expected {sensors[0].sampling_rate:g}, as of all sensors on port {sensor.port}"
+            )
             raise BenchFileError(
-                f"sensor {sensor.name!r}: sampling_rate = {sensor.sampling_rate:g}; expected"
-                f" {sensors[0].sampling_rate:g}, as of all sensors on port {sensor.port}"
+                FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
             )
         inputs[sensor.name] = numbers
     for sensor in sensors:
-        for number in settings[sensor.name].negative_inputs or ():
+        negative = settings[sensor.name].negative_inputs or ()
+        for number in negative:
             if number in taken:
+                expected = f"AIN{number} is already an input of sensor {taken[number]!r}"
                 raise BenchFileError(
-                    f"sensor {sensor.name!r}: AIN{number} is a negative input, and already an input"
-                    f" of {taken[number]!r}"
+                    FileFault("settings.negative_inputs", expected, list(negative), sensor.name)
                 )
     return inputs
 
@@ -315,7 +317,8 @@ def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: fl
     timer = labjack.TIMER_ADDRESSES if settings.core_timer else ()
     scan_list = (*timer, *(reg.ain(n) for numbers in inputs.values() for n in numbers))
     if len(scan_list) > 128:
-        raise BenchFileError(f"{len(scan_list)} addresses to scan; a LabJack scans at most 128")
+        expected = f"{len(scan_list)} addresses to scan; a LabJack scans at most 128"
+        raise BenchFileError(FileFault("sensors", expected))
     n_columns = len(scan_list)
     scans = max(1, min(labjack.MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
     return StreamPlan(scan_list, rate, settings.samples_per_packet or scans * n_columns)

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.port_rules import only
-from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import MAX_WORDS, RATE_REGISTER, READ_OVERHEAD, FifoDecoder
 from daq.protocols.modbus.rtu import ReplyFinder
@@ -178,24 +178,26 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
     """Return the sensor and its settings; raise BenchFileError for what cannot be."""
     sensor = only(sensors, "reading one FIFO takes all of a line")
     settings = FifoSettings.model_validate(sensor.settings)
-    who, rate = f"sensor {sensor.name!r}", sensor.sampling_rate
+    rate = sensor.sampling_rate
     if settings.set_rate and not 1 <= rate == round(rate) <= HIGHEST_RATE:
-        raise BenchFileError(
-            f"{who}: sampling_rate = {rate:g}; expected whole Hz up to {HIGHEST_RATE}, as the"
-            " device's register holds (or settings.set_rate = false)"
+        expected = (
+            f"expected whole Hz up to {HIGHEST_RATE}, as the device's register holds (or"
+            " settings.set_rate = false)"
         )
+        raise BenchFileError(FileFault("sampling_rate", expected, rate, sensor.name))
     n_channels = len(sensor.channels)
     samples_a_read = MAX_WORDS // n_channels
     if not samples_a_read:
-        raise BenchFileError(
-            f"{who}: {n_channels} channels; a read takes {MAX_WORDS} words at most"
-        )
+        expected = f"expected at most {MAX_WORDS}, the words of one read"
+        raise BenchFileError(FileFault("channels", expected, f"{n_channels} channels", sensor.name))
     bytes_a_sample = 2 * n_channels + READ_OVERHEAD / samples_a_read
     needed = math.ceil(rate * bytes_a_sample * (10 if settings.parity == "N" else 11))
     if needed > settings.baud_rate:
+        expected = (
+            f"expected at least {needed} for {rate:g} Hz of {n_channels} channels (or a lower rate)"
+        )
         raise BenchFileError(
-            f"{who}: {rate:g} Hz of {n_channels} channels need {needed} baud;"
-            f" settings.baud_rate = {settings.baud_rate} (or a lower rate)"
+            FileFault("settings.baud_rate", expected, settings.baud_rate, sensor.name)
         )
     return sensor, settings
 

@@ -20,9 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.modbus.bus import ModbusBus, RefusedError, Reply, open_bus
 from daq.drivers.port_rules import require_address, require_alike
-from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
+from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
-from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
 from daq.protocols.modbus import registers as protocol
 from daq.protocols.modbus.registers import (
     DataType,
@@ -101,8 +101,11 @@ class _Polled:
         given = settings.model_dump(exclude_none=True)
         try:
             registers = RegisterMap.of(given, len(sensor.channels))
-        except ValueError as error:
-            raise BenchFileError(f"sensor {sensor.name!r}: {error}") from error
+        except DeviceSettingError as error:
+            value = sensor.settings.get(error.key, ABSENT)
+            key = f"settings.{error.key}" if error.key else "settings"
+            fault = FileFault(key, error.expected, value, sensor.name)
+            raise BenchFileError(fault) from error
         preset = protocol.PRESETS.get(settings.preset or "", {})
         return cls(sensor, settings, registers, given.get("device_id", preset.get("device_id", 1)))
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, CountsArray, Event, EventKind
-from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
 from daq.protocols.plural import several
 
 if TYPE_CHECKING:
@@ -115,15 +115,13 @@ class RegisterMap:
         elif "address" in chosen:
             addresses = tuple(chosen["address"] + words * k for k in range(n_channels))
         else:
-            raise ValueError("settings: address is missing; expected that of the first channel")
+            raise DeviceSettingError("address", "is missing; expected that of the first channel")
         if len(addresses) != n_channels:
-            raise ValueError(
-                f"settings.addresses: {len(addresses)} given; expected {n_channels}, one a channel"
+            raise DeviceSettingError(
+                "addresses", f"{len(addresses)} given; expected {n_channels}, one a channel"
             )
         if "time_format" in chosen and "time_address" not in chosen:
-            raise ValueError(
-                f"settings.time_format = {chosen['time_format']!r}: expected with time_address only"
-            )
+            raise DeviceSettingError("time_format", "expected with time_address only")
         found = cls(
             function=chosen.get("function", 3),
             addresses=addresses,
@@ -135,9 +133,8 @@ class RegisterMap:
         )
         end = max(address + words for address, words in found._extents)
         if end > N_ADDRESSES:
-            raise ValueError(
-                f"settings: registers up to {end - 1}; expected at most {N_ADDRESSES - 1}, which is"
-                " the last there is"
+            raise DeviceSettingError(
+                "", f"registers up to {end - 1}; expected at most {N_ADDRESSES - 1}, the last one"
             )
         return found
 

@@ -14,8 +14,15 @@ import pytest
 
 from daq.acquisition.block_writer import MAX_EVENTS_PER_SECOND
 from daq.acquisition.recorder import RecorderStatus, record, recording_path
-from daq.errors import NoAnswerError, NotConnectedError, RecordingError, WrongDeviceError
+from daq.errors import (
+    DeviceError,
+    NoAnswerError,
+    NotConnectedError,
+    RecordingError,
+    WrongDeviceError,
+)
 from daq.protocols.block import Event, EventKind
+from daq.protocols.errors import RemoteProtocolError
 from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import verify
@@ -129,6 +136,15 @@ async def test_all_failures_at_the_start_come_at_once(tmp_path: Path) -> None:
         await run.record()
     assert not run.path.exists()
     assert run.device("b").left_quiet
+
+
+async def test_a_device_that_breaks_its_protocol_at_the_start_is_a_device_in_trouble(
+    tmp_path: Path,
+) -> None:
+    run = Run(tmp_path / "r.h5", "a")
+    run.device("a").failure = RemoteProtocolError("a reply of 3 bytes; expected 5")
+    with pytest.RaisesGroup(pytest.RaisesExc(DeviceError, match="port a: a reply of 3 bytes")):
+        await run.record()
 
 
 async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> None:

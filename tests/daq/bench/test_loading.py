@@ -137,8 +137,8 @@ psd = [[1, 2], [3, 4]]
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("name = 3\n", "bench.toml: name = 3: expected a valid string"),
-        ('sampling_rate = "200"\n', 'sampling_rate = "200": expected a valid number'),
+        ("name = 3\n", "bench.toml: name = 3: expected a text"),
+        ('sampling_rate = "200"\n', 'sampling_rate = "200": expected a number'),
         (
             '[estimate]\nsegment = "fast"\n',
             'estimate.segment = "fast": expected a positive duration',
@@ -299,19 +299,19 @@ sensitivity = 1
     found = "\n".join(faults(text))
     for expected in (
         "name: is missing; expected the bench's name",
-        "sampling_rate = -1: expected greater than 0",
+        "sampling_rate = -1: expected a number above 0",
         'colour = "red": unknown key',
         'estimate.detrend = "quadratic": expected',
-        'sensors["a"].channels["x"].sensitivity = "big": expected a valid number',
+        'sensors["a"].channels["x"].sensitivity = "big": expected a number',
         'sensors["a"].driver = "serila"',
-        'sensors["b"].settings.baud_rate = "fast": expected a valid integer',
+        'sensors["b"].settings.baud_rate = "fast": expected a whole number',
     ):
         assert expected in found
 
 
 def test_what_a_device_cannot_do_is_said_without_it() -> None:
     text = HEAD.replace("200", "201") + sensor_text("A", driver="epson")
-    with pytest.raises(BenchFileError, match=r'sensors\["A"\]: .*sampling_rate = 201'):
+    with pytest.raises(BenchFileError, match=r'sensors\["A"\]\.sampling_rate = 201'):
         bench_file.parse(text)
 
 

@@ -115,7 +115,11 @@ async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice
         ({"serial_number": "OTHR"}, WrongDeviceError, "expected serial number 'OTHR', got 'DEMO'"),
         ({"settings": {"system_id": "X"}}, WrongDeviceError, "expected system ID 'X', got 'GURA'"),
         ({"sampling_rate": 100.0}, WrongDeviceError, "expected 100 Hz, got 200 Hz"),
-        ({"settings": {"streams": ["DEMOZ2"]}}, BenchFileError, "for each of its 3 channels"),
+        (
+            {"settings": {"streams": ["DEMOZ2"]}},
+            BenchFileError,
+            "for each of the sensor's 3 channels",
+        ),
         (
             {"settings": {"streams": ["DEMOZ2", "DEMON2", "OTHER"], "patience": 1.0}},
             NoAnswerError,

@@ -141,8 +141,8 @@ async def test_a_quiet_device_is_started_and_stopped(running: tuple[RunningDevic
 @pytest.mark.parametrize(
     ("index", "settings", "said"),
     [
-        (1, {"columns": [1, 2]}, r"settings.columns = \[1, 2\]; expected one for each of its 3"),
-        (0, {"channel_names": ["EHZ"]}, r"channel_names = \['EHZ'\]; expected one for each"),
+        (1, {"columns": [1, 2]}, r"settings.columns = \[1, 2\]: expected one for each of the"),
+        (0, {"channel_names": ["EHZ"]}, r'channel_names = \["EHZ"\]: expected one for each'),
     ],
 )
 async def test_formats_that_do_not_fit(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
 from daq.protocols.modbus.registers import DataType, RegisterDecoder, RegisterMap
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def test_what_a_device_holds_is_what_is_read(
 @pytest.mark.parametrize(
     ("given_settings", "message"),
     [
-        ({}, "address is missing"),
+        ({}, "address: is missing"),
         ({"addresses": (1, 2)}, "2 given; expected 3"),
         ({"address": 65531, "data_type": "int32"}, "up to 65536; expected at most 65535"),
         ({"address": 0, "counter_address": 65536}, "up to 65536; expected at most 65535"),
@@ -140,7 +140,7 @@ def test_what_a_device_holds_is_what_is_read(
     ],
 )
 def test_maps_that_cannot_be(given_settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(DeviceSettingError, match=message):
         RegisterMap.of(given_settings, 3)
 
 

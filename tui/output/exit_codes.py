@@ -1,0 +1,18 @@
+"""Exit codes of the ``huddle`` command."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """How a command ended."""
+
+    DONE = 0
+    LIMIT_NOT_MET = 1
+    """Also: a reproduced figure does not agree with the theory."""
+    USAGE = 2
+    """The command line, a bench file or another file that a person wrote is wrong."""
+    TROUBLE = 3
+    """A device or a recording is in trouble."""
+    INTERRUPTED = 130
