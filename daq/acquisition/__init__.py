@@ -1,4 +1,4 @@
-"""The recorder: connections kept alive, blocks checked, indexed and written.
+"""The recorder: keeps devices connected; validates, indexes and writes their blocks.
 
 Knows drivers and recordings. Knows no alignment and no estimate.
 """

@@ -1,7 +1,7 @@
-"""What a driver yields, checked before it goes on: a fault of one must not harm the others.
+"""Validates what a driver yields, so that an error in one driver does not harm other devices.
 
-The recorder takes any driver of any package. A block that the file cannot hold would end the whole
-recording; here it ends its own sensor's session, with an error that says what was wrong.
+Drivers may come from any package. A block that the file cannot hold would end the whole recording;
+validated here, it ends the session of its own port, with an error that says what was wrong.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ if TYPE_CHECKING:
     from daq.drivers.interface import DriverType
     from daq.protocols.block import HostTime
 
-_LEAST, _MOST = -(1 << 63), (1 << 63) - 1
-_MOST_FLAGS = (1 << 31) - 1
+_MIN_INT64, _MAX_INT64 = -(1 << 63), (1 << 63) - 1
+_MAX_FLAGS = (1 << 31) - 1
+_MAX_FIRST_SAMPLE = _MAX_INT64 // 4
+_TIMES = "expected a HostTime with two integers of 64 bits"
 
 
 class FaultyDriverError(DeviceError, TypeError):
-    """A driver yielded what is no block or event of its sensors."""
+    """A driver yielded something other than a valid block or event of its sensors."""
 
 
 class BlockValidator:
-    """Checks what one session yields.
+    """Validates the items of one session.
 
     Parameters
     ----------
     driver : DriverType
     sensors : sequence of Sensor
-        On its port.
+        All sensors on the port.
     """
 
     def __init__(self, driver: DriverType, sensors: Sequence[Sensor]) -> None:
@@ -46,24 +48,24 @@ class BlockValidator:
         self._polled: dict[str, bool] = {}
 
     def validated(self, item: object) -> Block | Event:
-        """Return it, if it is as it should be.
+        """Return the item if it is valid.
 
         Raises
         ------
         FaultyDriverError
-            Naming what came and what was expected.
+            If it is not; the message names what was yielded and what was expected.
         """
         if isinstance(item, Block):
-            wrong = self._wrong_block(item)
+            problem = self._block_problem(item)
         elif isinstance(item, Event):
-            wrong = self._wrong_event(item)
+            problem = self._event_problem(item)
         else:
-            wrong = f"{type(item).__name__}; expected a Block or an Event"
-        if not wrong and isinstance(item, (Block, Event)):
+            problem = f"{type(item).__name__}; expected a Block or an Event"
+        if not problem and isinstance(item, (Block, Event)):
             return item
-        raise FaultyDriverError(f"{self._port}: driver {self._driver!r} yielded {wrong}")
+        raise FaultyDriverError(f"{self._port}: driver {self._driver!r} yielded {problem}")
 
-    def _wrong_block(self, block: Block) -> str:
+    def _block_problem(self, block: Block) -> str:
         if block.sensor not in self._n_channels:
             return f"a block of {block.sensor!r}; expected {self._expected_names()}"
         wanted = self._n_channels[block.sensor]
@@ -72,9 +74,11 @@ class BlockValidator:
             return f"counts of shape {shape}; expected an array (n_samples, {wanted})"
         if not shape[0]:
             return "a block without samples"
-        return self._wrong_counts(block) or _wrong_numbers(block) or self._wrong_instants(block)
+        return (
+            self._counts_problem(block) or _number_problem(block) or self._instants_problem(block)
+        )
 
-    def _wrong_counts(self, block: Block) -> str:
+    def _counts_problem(self, block: Block) -> str:
         counts, expected = block.counts, self._dtypes[block.sensor]
         if np.can_cast(counts.dtype, expected, "safe"):
             return ""
@@ -82,38 +86,44 @@ class BlockValidator:
             fits = counts.dtype.kind in "iuf" and np.array_equal(counts.astype(expected), counts)
         return "" if fits else f"counts of type {counts.dtype} that do not fit {expected}"
 
-    def _wrong_instants(self, block: Block) -> str:
+    def _instants_problem(self, block: Block) -> str:
         instants = block.instants_ns
         polled = self._polled.setdefault(block.sensor, instants is not None)
         if polled != (instants is not None):
-            return "blocks with instants of their samples, and some without"
+            return "blocks with sample times and others without; expected one kind"
         if instants is None:
             return ""
         if _shape(instants) != (block.n_samples,) or instants.dtype != np.int64:
-            return f"instants of shape {_shape(instants)}; expected int64 ({block.n_samples},)"
+            return f"sample times of shape {_shape(instants)}; expected int64 ({block.n_samples},)"
         return ""
 
-    def _wrong_event(self, event: Event) -> str:
+    def _event_problem(self, event: Event) -> str:
         if event.sensor and event.sensor not in self._n_channels:
             return f"an event of {event.sensor!r}; expected {self._expected_names()}"
         if not _are_texts(event.kind, event.text):
             return f"an event {event.kind!r}, {event.text!r}; expected text"
-        return "" if _are_times(event.received) else f"an event received at {event.received!r}"
+        return (
+            ""
+            if _are_times(event.received)
+            else f"an event received at {event.received!r}; {_TIMES}"
+        )
 
     def _expected_names(self) -> str:
         return " or ".join(map(repr, self._n_channels))
 
 
-def _wrong_numbers(block: Block) -> str:
-    if not _is_int64(block.first_sample) or not 0 <= block.first_sample <= _MOST // 4:
-        return f"a block that begins at sample {block.first_sample!r}; expected one from 0 on"
+def _number_problem(block: Block) -> str:
+    if not _is_int64(block.first_sample) or not 0 <= block.first_sample <= _MAX_FIRST_SAMPLE:
+        return f"a block with first_sample {block.first_sample!r}; expected 0 or more"
     if block.device_counter is not None and not _is_int64(block.device_counter):
-        return f"a block with device_counter {block.device_counter!r}; expected 64 bits"
-    if not _is_int64(block.flags) or not 0 <= block.flags <= _MOST_FLAGS:
-        return f"a block with flags {block.flags!r}"
+        return (
+            f"a block with device_counter {block.device_counter!r}; expected an integer of 64 bits"
+        )
+    if not _is_int64(block.flags) or not 0 <= block.flags <= _MAX_FLAGS:
+        return f"a block with flags {block.flags!r}; expected 0 to {_MAX_FLAGS}"
     if not _are_texts(block.reason):
         return f"a block with reason {block.reason!r}; expected text"
-    return "" if _are_times(block.received) else f"a block received at {block.received!r}"
+    return "" if _are_times(block.received) else f"a block received at {block.received!r}; {_TIMES}"
 
 
 def _shape(array: object) -> tuple[int, ...] | None:
@@ -128,5 +138,5 @@ def _are_times(at: HostTime) -> bool:
     return all(_is_int64(getattr(at, name, None)) for name in ("monotonic_ns", "utc_ns"))
 
 
-def _is_int64(value: Any) -> bool:  # noqa: ANN401 -- whatever a driver put there
-    return isinstance(value, (int, np.integer)) and _LEAST <= int(value) <= _MOST
+def _is_int64(value: Any) -> bool:  # noqa: ANN401 -- a driver may yield anything
+    return isinstance(value, (int, np.integer)) and _MIN_INT64 <= int(value) <= _MAX_INT64

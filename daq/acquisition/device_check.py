@@ -1,4 +1,4 @@
-"""What ``huddle check`` asks: who is there, and does a second of its samples make sense."""
+"""Checks devices for ``huddle check``: their identity, and a second of their samples."""
 
 from __future__ import annotations
 
@@ -27,52 +27,52 @@ if TYPE_CHECKING:
     from daq.drivers.interface import DeviceInformation
     from daq.host_clock import HostClock
 
-LEAST_SAMPLES = 4
-FIRST_BLOCK = 30.0
-"""How long a sensor may take to its first samples, s (a Güralp block lasts many seconds)."""
-MIN_BLOCKS, RATE_TOLERANCE = 3, 0.01
-"""For a rate: blocks, and its standard error as a share of it."""
+MIN_SAMPLES = 4
+FIRST_BLOCK_TIMEOUT = 30.0
+"""Seconds to wait for the first samples of a sensor (a Güralp block lasts many seconds)."""
+MIN_BLOCKS, MAX_RATE_ERROR = 3, 0.01
+"""Blocks that a measured rate takes, and its standard error at most, as a fraction of the rate."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelCheck:
-    """A stretch of one channel, in its unit."""
+    """Statistics of one channel, in its unit."""
 
     name: str
     unit: str
     mean: float
     rms: float
     """About the mean."""
-    least: float
-    largest: float
+    minimum: float
+    maximum: float
     is_stuck: bool
-    """All samples are equal: nothing is connected, or the channel is dead."""
+    """Whether all samples are equal: nothing is connected, or the channel is dead."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorCheck:
-    """What a sensor says about itself and what a stretch of it looks like.
+    """What a sensor reports about itself, and statistics of some of its samples.
 
     Attributes
     ----------
     information
-        As the device told it.
+        As reported by the device.
     n_samples, n_missing : int
-        Samples received, and known to be missing between them.
+        Samples received, and samples known to be missing between them.
     measured_rate : float or None
-        Samples a second by the host's clock; None where blocks were too few or came too unevenly.
+        Samples per second by the host's clock; None if blocks were too few or arrived too unevenly.
     clipped : bool
-        Whether any sample was at the end of its range.
+        Whether any sample reached the end of the range.
     channels
         In the order of the bench file.
-    events
-        What the device or its protocol reported meanwhile.
+    events : tuple of Event
+        Reported by the device or its protocol in the meantime.
     jitter : float or None
-        Of polled sensors: standard deviation of the sampling instants about an even grid, s.
+        Of polled sensors: standard deviation of the sample times about an even grid, in s.
     bandwidth : float or None
-        Of polled sensors: half the rate at the longest interval, in Hz.
+        Of polled sensors: half the reciprocal of the longest sampling interval, in Hz.
     """
 
     information: DeviceInformation
@@ -81,16 +81,16 @@ class SensorCheck:
     measured_rate: float | None
     clipped: bool
     channels: tuple[ChannelCheck, ...]
-    events: tuple[str, ...]
+    events: tuple[Event, ...]
     jitter: float | None = None
     bandwidth: float | None = None
 
     @property
     def signal_to_noise_db(self) -> float | None:
-        """What the jitter would leave of a sine at the edge of the bandwidth, taken as even.
+        """SNR of a sine at the edge of the bandwidth if its samples are taken to be evenly spaced.
 
-        Its power over that of the error, in dB: −20 log10(2π f σ). Recorded instants make it
-        better; this is what is lost to whoever disregards them.
+        Power of the sine over power of the error, −20 log10(2π f σ) in dB. Estimates use the
+        recorded sample times and do better.
         """
         if self.jitter is None or self.bandwidth is None or self.jitter <= 0:
             return None
@@ -100,14 +100,14 @@ class SensorCheck:
 async def probe(
     sensors: Sequence[Sensor], clock: HostClock, *, duration: float = 1.0
 ) -> tuple[SensorCheck, ...]:
-    """Open the sensors of one port, read them for a while, and leave them quiet.
+    """Open the sensors of one port, read some samples, and close them again.
 
     Parameters
     ----------
     sensors
         All sensors of one port.
     duration
-        Samples to read of each sensor, in seconds of its nominal rate.
+        Length of the samples to read of each sensor, in seconds of its nominal rate.
 
     Raises
     ------
@@ -123,38 +123,38 @@ async def probe(
 async def _probe(
     sensors: Sequence[Sensor], clock: HostClock, *, duration: float
 ) -> tuple[list[SensorCheck], list[DeviceError]]:
-    """Return what is found of each sensor of a port, and what is wrong with the others."""
+    """Return the checks of the sensors that deliver samples, and the errors of the others."""
     blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in sensors}
-    events: dict[str, list[str]] = {sensor.name: [] for sensor in sensors}
-    wanted = {s.name: max(LEAST_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
+    events: dict[str, list[Event]] = {sensor.name: [] for sensor in sensors}
+    wanted = {s.name: max(MIN_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
     longest = max(wanted[s.name] / s.sampling_rate for s in sensors) / clock.speed
     async with driver_type(sensors[0].driver).open(sensors, clock) as session:
         information = {one.sensor: one for one in session.information}
-        errors = list(_wrong(sensors, information))
+        errors = list(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
         async with contextlib.aclosing(
-            cast("AsyncGenerator[Block | Event]", session.read())  # else there is nothing to close
+            cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
         ) as stream:
             try:
-                async with asyncio.timeout(FIRST_BLOCK + 3 * longest):
+                async with asyncio.timeout(FIRST_BLOCK_TIMEOUT + 3 * longest):
                     async for item in stream:
                         if isinstance(item, Event):
                             name = item.sensor if item.sensor in events else sensors[0].name
-                            events[name].append(f"{item.kind}: {item.text}")
+                            events[name].append(item)
                             continue
                         blocks[item.sensor].append(item)
-                        if all(_n(blocks[name]) >= n for name, n in awaited.items()):
+                        if all(_n_samples(blocks[name]) >= n for name, n in awaited.items()):
                             break
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise
     for sensor in sensors:
         if not blocks[sensor.name] and not information[sensor.name].trouble:
-            said = f"; it said: {'; '.join(events[sensor.name])}" if events[sensor.name] else ""
+            reported = "; ".join(f"{event.kind}: {event.text}" for event in events[sensor.name])
             errors.append(
                 NoAnswerError(
-                    f"sensor {sensor.name!r} on {sensor.port}: no samples in {FIRST_BLOCK:g} s"
-                    f"{said}"
+                    f"sensor {sensor.name!r} on {sensor.port}: no samples in"
+                    f" {FIRST_BLOCK_TIMEOUT:g} s{reported and f'; it reported: {reported}'}"
                 )
             )
     found = [
@@ -165,10 +165,10 @@ async def _probe(
     return found, errors
 
 
-def _wrong(
+def _identity_errors(
     sensors: Sequence[Sensor], information: Mapping[str, DeviceInformation]
 ) -> Iterator[DeviceError]:
-    """Yield what is wrong with who answers."""
+    """Yield an error for each device that does not answer, or is not the expected one."""
     for sensor in sensors:
         found = information[sensor.name]
         if found.trouble:
@@ -183,7 +183,7 @@ def _wrong(
 async def probe_bench(
     bench: Bench, clock: HostClock, *, duration: float = 1.0
 ) -> tuple[list[SensorCheck], list[DeviceError]]:
-    """Probe every port of a bench at once; what is in trouble is returned, not raised."""
+    """Probe all ports of a bench at the same time; return checks and errors."""
     answers = await asyncio.gather(
         *(_probe(sensors, clock, duration=duration) for sensors in bench.ports().values()),
         return_exceptions=True,
@@ -204,8 +204,8 @@ async def probe_bench(
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """A device somebody has on a port: the driver it needs, its settings, what it says."""
+class DiscoveredDevice:
+    """A device on a port: the driver and settings it needs, and what it reports about itself."""
 
     driver: str
     port: str
@@ -220,25 +220,25 @@ async def discover(
     *,
     baud_rates: Sequence[int] = MODBUS_BAUD_RATES,
     device_ids: Sequence[int] = MODBUS_DEVICES,
-) -> list[Found]:
+) -> list[DiscoveredDevice]:
     """Look for Epson accelerometers and Modbus devices on a port.
 
     Parameters
     ----------
     baud_rates, device_ids
-        Where to look for Modbus devices; any answer, a refusal too, tells of one.
+        To try for Modbus devices. Any answer shows a device, also a refusal.
 
     Raises
     ------
     NotConnectedError
-        The port cannot be opened.
+        If the port cannot be opened.
     """
     if not port.startswith(TCP):
         for baud_rate in commands.BAUD_RATES if "://" not in port else (460800,):
             with contextlib.suppress(DeviceError):
                 information = await identify(port, clock, baud_rate=baud_rate)
-                return [Found("epson", port, {"baud_rate": baud_rate}, information)]
-    found: list[Found] = []
+                return [DiscoveredDevice("epson", port, {"baud_rate": baud_rate}, information)]
+    found: list[DiscoveredDevice] = []
     for baud_rate in baud_rates if "://" not in port else baud_rates[:1]:
         found += await _modbus_devices(port, clock, baud_rate, device_ids)
         if found:
@@ -246,8 +246,8 @@ async def discover(
     return found
 
 
-def searched(port: str) -> str:
-    """Return in words where `discover` looks, unless told otherwise."""
+def search_description(port: str) -> str:
+    """Return in words what `discover` looks for by default."""
     devices = "Modbus device " + ", ".join(map(str, MODBUS_DEVICES))
     if port.startswith(TCP):
         return devices
@@ -261,7 +261,7 @@ def searched(port: str) -> str:
 
 async def _modbus_devices(
     port: str, clock: HostClock, baud_rate: int, device_ids: Sequence[int]
-) -> list[Found]:
+) -> list[DiscoveredDevice]:
     found = []
     over_tcp = port.startswith(TCP)
     async with open_bus(
@@ -274,7 +274,7 @@ async def _modbus_devices(
             try:
                 await bus.read(3, device_id, 0, 1)
             except RefusedError as refused:
-                if refused.code in {10, 11}:  # a gateway answers for a device that is not there
+                if refused.code in {10, 11}:  # a gateway answers in place of an absent device
                     continue
                 remark = "answers, and has no register 0"
             except NoAnswerError:
@@ -283,19 +283,19 @@ async def _modbus_devices(
                 break
             else:
                 remark = "answers"
-            found.append(Found("registers", port, settings, remark=remark))
+            found.append(DiscoveredDevice("registers", port, settings, remark=remark))
     return found
 
 
-def _n(blocks: Sequence[Block]) -> int:
+def _n_samples(blocks: Sequence[Block]) -> int:
     return sum(block.n_samples for block in blocks)
 
 
 def _check(
-    sensor: Sensor, information: DeviceInformation, blocks: Sequence[Block], events: Sequence[str]
+    sensor: Sensor, information: DeviceInformation, blocks: Sequence[Block], events: Sequence[Event]
 ) -> SensorCheck:
     counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
-    instants = _together([block.instants_ns for block in blocks])
+    instants = _concatenated([block.instants_ns for block in blocks])
     jitter = bandwidth = None
     if instants is not None and instants.size > 2:
         steps = np.diff(instants) * 1e-9
@@ -314,8 +314,8 @@ def _check(
                 unit=channel.unit,
                 mean=float(values.mean()),
                 rms=float(values.std()),
-                least=float(values.min()),
-                largest=float(values.max()),
+                minimum=float(values.min()),
+                maximum=float(values.max()),
                 is_stuck=bool(np.ptp(values) == 0) and not channel.auxiliary,
             )
             for channel, values in zip(
@@ -330,21 +330,21 @@ def _check(
     )
 
 
-def _together(parts: Sequence[NDArray[np.int64] | None]) -> NDArray[np.int64] | None:
-    there = [part for part in parts if part is not None]
-    return np.concatenate(there) if there else None
+def _concatenated(parts: Sequence[NDArray[np.int64] | None]) -> NDArray[np.int64] | None:
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if known else None
 
 
 def arrival_rate(blocks: Sequence[Block]) -> float | None:
-    """Return samples a second by the arrival of blocks, from the second one on.
+    """Return samples per second by the arrival times of blocks, without the first one.
 
-    The first may have waited for its reader. None where the others were too few, or came too
-    unevenly, as when all had waited.
+    The first block may have waited in a buffer. None if the others are too few, or arrived too
+    unevenly, as when all of them had waited.
     """
     blocks = blocks[1:]
     if len(blocks) < MIN_BLOCKS:
         return None
-    sent = np.array([block.end_sample - blocks[0].end_sample for block in blocks])
-    came = [block.received.monotonic_ns - blocks[0].received.monotonic_ns for block in blocks]
-    (period, _), cov = np.polyfit(sent, np.array(came) * 1e-9, 1, cov=True)
-    return float(1 / period) if 0 < period >= np.sqrt(cov[0, 0]) / RATE_TOLERANCE else None
+    samples = np.array([block.end_sample - blocks[0].end_sample for block in blocks])
+    arrived = [block.received.monotonic_ns - blocks[0].received.monotonic_ns for block in blocks]
+    (period, _), cov = np.polyfit(samples, np.array(arrived) * 1e-9, 1, cov=True)
+    return float(1 / period) if 0 < period >= np.sqrt(cov[0, 0]) / MAX_RATE_ERROR else None

@@ -1,19 +1,22 @@
-"""Session sample index → recording sample index, across reconnections, resets and repetitions.
+"""Converts sample indices of sessions to the sample index of the recording.
 
 Theory of operation
 -------------------
-A driver counts samples from 0 at the start of each session. A recording has one index per sensor,
-which counts the samples the sensor took, or should have taken, since its first. Within a session
-the two differ by a constant, and a jump of the index is a gap of exactly that length (unless the
-protocol itself says it is an estimate). Where a session begins, or a device restarts its sampling
-(``BlockFlag.CLOCK_RESTART``), the length of the gap comes from the device's UTC where both sides of
-the gap have it and the host's clock agrees within an hour (a device may send what it kept, or come
-back with a date of its own), and else from the host's clock, and then says that it is an estimate;
-the block after it carries ``CLOCK_RESTART``, because the phase of the sampling is new. A session
-may also go on in the index of the one before, where the device counted on
-(``daq.drivers.interface``, ``Resuming``): then nothing changes but the reason of the gap.
+A driver counts samples from 0 at the start of each session. A recording has one index per sensor:
+it counts the samples that the sensor took, or should have taken, since its first one. Within a
+session the two indices differ by a constant, and a jump is a gap of exactly that length (unless the
+protocol itself marks the length as an estimate).
 
-Samples that were recorded already (late or repeated blocks) are never recorded twice.
+Where a session begins, or a device restarts its sampling (``BlockFlag.CLOCK_RESTART``), the length
+of the gap comes from the device's UTC, if the blocks on both sides have it and the host's clock
+agrees within an hour: a device may send stored data, or return with a wrong date. Otherwise it
+comes from the host's clock and is marked as an estimate. The block after such a gap carries
+``CLOCK_RESTART``, because the phase of the sampling is new.
+
+A session may also continue the index of the session before, where the device kept counting
+(``daq.drivers.interface``, ``Resuming``). Then only the reason of the gap changes.
+
+Samples that were recorded before (in late or repeated blocks) are not recorded again.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 _NS = 1e9
-_HOUR = 3600.0
+_MAX_DISAGREEMENT = 3600.0
+"""Seconds by which the intervals of the device's and the host's clock may differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,43 +46,45 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A block in the recording's index, the gap before it, and how much of it was known already."""
+    """A block in the index of the recording, and the gap before it."""
 
     block: Block | None
+    """Its samples that are new; None if there are none."""
     gap: Gap | None = None
     repeated: int = 0
+    """Number of samples that were recorded before."""
 
 
 class SampleIndexer:
-    """Places the blocks of one sensor."""
+    """Converts the sample indices of one sensor's blocks."""
 
     def __init__(self, sampling_rate: float) -> None:
         self.next_sample = 0
-        """Recording index of the sample that should come next."""
+        """Recording index after the last sample."""
         self._rate = sampling_rate
         self._offset: int | None = 0
         self._reason = ""
         self._last: Block | None = None
 
     def new_session(self, reason: str) -> None:
-        """Say that the next block comes from a new session, and why the last one ended."""
+        """Begin a new session with the next block; ``reason`` is why the last one ended."""
         self._offset = None
         self._reason = reason
 
     def resume(self, reason: str) -> None:
-        """Say that the next block comes from a new session that goes on in the index of the last.
+        """Begin a session that continues the index of the last one.
 
-        What is missing before it is missing for ``reason``.
+        Samples missing before its first block are missing for ``reason``.
         """
         self._reason = reason
 
     def place(self, block: Block) -> Placed:
-        """Return the block where it belongs in the recording.
+        """Return a block in the index of the recording.
 
         Parameters
         ----------
         block : Block
-            In its session's index.
+            In the index of its session.
         """
         restarted = bool(block.flags & BlockFlag.CLOCK_RESTART)
         going_back = self._offset is not None and block.first_sample + self._offset < (
@@ -100,7 +106,7 @@ class SampleIndexer:
         return self._placed(block, reason, estimated=estimated)
 
     def lost_until(self, now: HostTime, reason: str) -> Gap | None:
-        """Return what is missing at the end of a recording that ends while the device is lost."""
+        """Return the gap at the end of a recording that ends while the device is lost."""
         if self._last is None:
             return None
         elapsed = now.monotonic_ns - self._last.received.monotonic_ns
@@ -127,11 +133,12 @@ class SampleIndexer:
         return Placed(placed, gap, repeated)
 
     def _missing_by_time(self, last: Block, block: Block) -> tuple[int, bool]:
-        """Return how many samples lie between two blocks by their times, and if that is a guess."""
+        """Return the number of samples between two blocks, and whether it is an estimate."""
         waited = (block.received.monotonic_ns - last.received.monotonic_ns) / _NS
         both = last.flags & block.flags & BlockFlag.DEVICE_UTC
         if both and last.device_counter is not None and block.device_counter is not None:
             elapsed = (block.device_counter - last.device_counter) / _NS
-            if abs(elapsed - waited) <= _HOUR:  # negative where it sends again what is known
+            if abs(elapsed - waited) <= _MAX_DISAGREEMENT:
+                # Negative where the device sends samples again.
                 return round(elapsed * self._rate) - last.n_samples, False
         return max(0, round(waited * self._rate) - block.n_samples), True

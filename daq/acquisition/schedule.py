@@ -1,8 +1,8 @@
-"""Cron lines → runs: when the next is due, one at a time, and which recordings are too old.
+"""Scheduled runs: when they are due, one at a time, and which recordings are too old.
 
-A run that became due while another was running, or while the computer was off or asleep, is not
-made up for; it is reported. Times are of the schedule's time zone, and right on the days its clocks
-change.
+A run that became due while another was running, or while the computer was off or asleep, is
+reported and not repeated later. Times are in the schedule's time zone, also on the days when its
+clocks change.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import contextlib
 import heapq
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from enum import StrEnum
 from itertools import groupby, islice, takewhile
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
 from cronsim import CronSim
@@ -29,24 +30,39 @@ if TYPE_CHECKING:
     from daq.bench.model import Schedule
 
 GRACE = timedelta(minutes=1)
-"""A run that starts later than this was missed."""
-MOST_TOLD = 20
-"""Runs that were not done of which each is told: a clock that is set may leave years of them."""
-_LONGEST_SLEEP = 30.0
-"""In s; the system's clock may be set meanwhile."""
+"""A run that would start later than this is missed."""
+MAX_NOTICES = 20
+"""Runs not done that are reported one by one: setting a clock may skip years of them."""
+_MAX_SLEEP = 30.0
+"""Seconds between two readings of the system's clock, which may be set."""
+
+
+class RunState(StrEnum):
+    """What happened to a scheduled run."""
+
+    WAITING = "waiting"
+    """The next run; not due yet."""
+    STARTED = "started"
+    FINISHED = "finished"
+    FAILED = "failed"
+    """Ended by an error."""
+    MISSED = "missed"
+    """Not started, because the computer was off, asleep or busy."""
+    REFUSED = "refused"
+    """Not started, because the run before was still running."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunNotice:
-    """What happened to a scheduled run: ``waiting`` for it, ``started``, ``finished`` and so on."""
+    """A change of a scheduled run's state."""
 
-    kind: Literal["waiting", "started", "finished", "failed", "missed", "refused"]
+    state: RunState
     due: datetime
     text: str = ""
 
 
 def due_times(schedule: Schedule, after: datetime) -> Iterator[datetime]:
-    """Yield when runs are due after an instant: in order, each once, in the schedule's time zone.
+    """Yield the times after an instant at which runs are due, in order and in the time zone.
 
     Parameters
     ----------
@@ -58,13 +74,13 @@ def due_times(schedule: Schedule, after: datetime) -> Iterator[datetime]:
     local = after.astimezone(ZoneInfo(schedule.time_zone))
     lines = [CronSim(line, local) for line in schedule.cron]
     merged = heapq.merge(*lines, key=datetime.timestamp)
-    # by instant: in the hour that comes twice, datetimes of both are equal
+    # By instant: in the hour that is repeated, different instants compare equal as datetimes.
     for _, same in groupby(merged, key=datetime.timestamp):
         yield next(same)
 
 
 def utc_now() -> datetime:
-    """Return the present instant in UTC."""
+    """Return the current time in UTC."""
     return datetime.now(UTC)
 
 
@@ -77,18 +93,18 @@ async def serve(
     now: Callable[[], datetime] = utc_now,
     sleep: Callable[[float], Awaitable[object]] | None = None,
 ) -> None:
-    """Do each run when it is due, until told to stop.
+    """Do each run when it is due, until stopped.
 
     Parameters
     ----------
     schedule : Schedule
-        When.
+        Cron lines and their time zone.
     run : coroutine function of the due time
         Does one run; a HuddleError or OSError, alone or in groups, fails that run only.
     stop : asyncio.Event
-        Ends the loop; a run that is going on must look at it itself.
+        Ends the loop when set; a run in progress must check it itself.
     notice : callable
-        Told what happens.
+        Receives each change of state.
     now, sleep : callables
         The clock; ``sleep`` returns early when ``stop`` is set.
     """
@@ -98,39 +114,43 @@ async def serve(
         due = next(due_times(schedule, after), None)
         if due is None:
             return
-        notice(RunNotice("waiting", due))
+        notice(RunNotice(RunState.WAITING, due))
         while not stop.is_set() and (left := (due - now()).total_seconds()) > 0:
-            await wait(min(left, _LONGEST_SLEEP))
+            await wait(min(left, _MAX_SLEEP))
         if stop.is_set():
             return
         if now() - due > GRACE:
-            why = "the computer was off, asleep or busy"
-            until = now() - GRACE
-            after = _not_done(schedule, after, until, kind="missed", why=why, notice=notice)
+            reason = "the computer was off, asleep or busy"
+            until, state = now() - GRACE, RunState.MISSED
+            after = _report_skipped(
+                schedule, after, until, state=state, reason=reason, notice=notice
+            )
             continue
         await _run_once(run, due, notice)
-        why = "the run before was still going on"
-        after = _not_done(schedule, due, now(), kind="refused", why=why, notice=notice)
+        reason = "the run before was still running"
+        state = RunState.REFUSED
+        after = _report_skipped(schedule, due, now(), state=state, reason=reason, notice=notice)
 
 
-def _not_done(
+def _report_skipped(
     schedule: Schedule,
     after: datetime,
     until: datetime,
     *,
-    kind: Literal["missed", "refused"],
-    why: str,
+    state: RunState,
+    reason: str,
     notice: Callable[[RunNotice], None],
 ) -> datetime:
-    """Tell of the runs that were due and not done; return after when the next is looked for."""
+    """Report the runs that were due and not done; return the time after which to continue."""
     passed = takewhile(lambda due: due <= until, due_times(schedule, after))
-    for due in islice(passed, MOST_TOLD):
-        notice(RunNotice(kind, due, why))
+    for due in islice(passed, MAX_NOTICES):
+        notice(RunNotice(state, due, reason))
         after = due
     further = next(passed, None)
     if further is None:
         return after
-    notice(RunNotice(kind, further, f"{why}; and so were all others until {until:%Y-%m-%d %H:%M}"))
+    text = f"{reason}; the same for all others until {until:%Y-%m-%d %H:%M}"
+    notice(RunNotice(state, further, text))
     return until
 
 
@@ -139,14 +159,14 @@ async def _run_once(
     due: datetime,
     notice: Callable[[RunNotice], None],
 ) -> None:
-    notice(RunNotice("started", due))
+    notice(RunNotice(RunState.STARTED, due))
     try:
         await run(due)
     except* (HuddleError, OSError) as group:
         text = "; ".join(str(error) for error in _leaves(group))
-        notice(RunNotice("failed", due, text))
+        notice(RunNotice(RunState.FAILED, due, text))
     else:
-        notice(RunNotice("finished", due))
+        notice(RunNotice(RunState.FINISHED, due))
 
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:
@@ -169,15 +189,15 @@ def _sleep_until(stop: asyncio.Event) -> Callable[[float], Awaitable[object]]:
 def remove_old(
     directory: Path, retention: float, *, bench: str, now: datetime | None = None
 ) -> list[Path]:
-    """Remove recordings of a bench that are older than ``retention`` seconds, and return which.
+    """Remove recordings of a bench that are older than ``retention`` seconds; return their paths.
 
-    Only closed huddle recordings of the bench of that name are removed: what is something else, is
-    of another bench or imported, still grows, or was left by a crash stays.
+    Only closed recordings of the bench with that name are removed: never other files, recordings of
+    other benches, imported or growing ones, or those left open by a crash.
 
     Raises
     ------
     RecordingError
-        If some cannot be removed; the others are.
+        If some recordings cannot be removed; the others are removed all the same.
     """
     limit = (now or utc_now()) - timedelta(seconds=retention)
     removed, kept = [], []
@@ -200,5 +220,5 @@ def _is_old(path: Path, limit: datetime, bench: str) -> bool:
             old = recording.closed and recording.created < limit
             own = old and recording.bench is not None and recording.bench.name == bench
         return own and not is_being_written(path)
-    except (HuddleError, OSError):  # no recording of ours, or gone meanwhile
+    except (HuddleError, OSError):  # no recording of ours, or removed meanwhile
         return False

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.table import Table
 
-from daq.acquisition.device_check import discover, probe_bench, searched
+from daq.acquisition.device_check import discover, probe_bench, search_description
 from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from daq.errors import NoAnswerError
@@ -96,8 +96,8 @@ def check_port(port: str, *, json: str | None) -> None:
     write_json(json, {"port": port, "devices": plain(found)})
     if not found:
         raise NoAnswerError(
-            f"port {port}: nothing answers as {searched(port)}; check power and cable; other"
-            " devices, rates and addresses must be named in a bench file"
+            f"port {port}: nothing answers as {search_description(port)}; check power and"
+            " cable; other devices, rates and addresses must be named in a bench file"
         )
     table = _table(["driver", "settings", "device"])
     for device in found:
@@ -164,7 +164,7 @@ def _remarks(entry: SensorCheck) -> Iterator[str]:
             " of jitter"
             + ("" if noise is None else f" (SNR {signed(noise, '.0f')} dB at its edge)")
         )
-    for text, times in Counter(entry.events).items():
+    for text, times in Counter(f"{e.kind}: {e.text}" for e in entry.events).items():
         yield text if times == 1 else f"{text} ({times} times)"
 
 
@@ -176,7 +176,7 @@ def _channel_table(found: Sequence[SensorCheck]) -> Table:
                 f"{entry.information.sensor}.{channel.name}",
                 signed(channel.mean, ".4g"),
                 signed(channel.rms, ".3g"),
-                f"{signed(channel.least, '.4g')} … {signed(channel.largest, '.4g')}",
+                f"{signed(channel.minimum, '.4g')} … {signed(channel.maximum, '.4g')}",
                 channel.unit,
                 "stuck: nothing connected?" if channel.is_stuck else "",
             )

@@ -11,7 +11,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from daq.acquisition.recorder import recording_path
-from daq.acquisition.schedule import due_times, remove_old, serve, utc_now
+from daq.acquisition.schedule import RunState, due_times, remove_old, serve, utc_now
 from daq.bench.estimate_settings import to_arguments
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError, RecordingError
@@ -34,7 +34,11 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
 
 _LOGGER = logging.getLogger(__name__)
-_LEVELS = {"failed": logging.ERROR, "missed": logging.WARNING, "refused": logging.WARNING}
+_LEVELS = {
+    RunState.FAILED: logging.ERROR,
+    RunState.MISSED: logging.WARNING,
+    RunState.REFUSED: logging.WARNING,
+}
 SHOWN = 5
 ENDED_WELL = {ExitCode.DONE, ExitCode.LIMIT_NOT_MET, ExitCode.INTERRUPTED}
 """Exit codes of a run that is no failure."""
@@ -149,8 +153,8 @@ async def _follow(process: Process, log: ChildLog) -> None:
 
 def _tell(notice: RunNotice) -> None:
     _LOGGER.log(
-        _LEVELS.get(notice.kind, logging.INFO),
+        _LEVELS.get(notice.state, logging.INFO),
         "run due %s %s%s",
-        *(f"{notice.due:%Y-%m-%d %H:%M %Z}", notice.kind, notice.text and f": {notice.text}"),
-        extra={"due": notice.due.isoformat(), "run": notice.kind},
+        *(f"{notice.due:%Y-%m-%d %H:%M %Z}", notice.state, notice.text and f": {notice.text}"),
+        extra={"due": notice.due.isoformat(), "run": notice.state},
     )

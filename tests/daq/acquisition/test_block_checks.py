@@ -26,9 +26,9 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
     "too large": ({"counts": np.full((10, 2), 2**40)}, "type int64 that do not fit int32"),
     "empty": ({"counts": np.zeros((0, 2), np.int32)}, "a block without samples"),
     "sensor": ({"sensor": "c"}, "a block of 'c'; expected 'a' or 'b'"),
-    "index": ({"first_sample": -5}, "begins at sample -5; expected one from 0 on"),
-    "no index": ({"first_sample": None}, "begins at sample None"),
-    "counter": ({"device_counter": 2**70}, "device_counter .*; expected 64 bits"),
+    "index": ({"first_sample": -5}, "first_sample -5; expected 0 or more"),
+    "no index": ({"first_sample": None}, "first_sample None; expected 0 or more"),
+    "counter": ({"device_counter": 2**70}, "device_counter .*; expected an integer of 64 bits"),
     "flags": ({"flags": 2**40}, "flags 1099511627776"),
     "reason": ({"reason": None}, "reason None; expected text"),
     "time": ({"received": 12.0}, r"received at 12\.0"),
@@ -69,7 +69,7 @@ def test_instants_come_always_or_never() -> None:
     one = checked()
     one.validated(block("a", 0, 10, NOW))
     one.validated(block("b", 0, 10, NOW, instants_ns=np.arange(10)))
-    with pytest.raises(FaultyDriverError, match="some without"):
+    with pytest.raises(FaultyDriverError, match="with sample times and others without"):
         one.validated(block("a", 10, 10, NOW, instants_ns=np.arange(10)))
 
 

@@ -16,7 +16,7 @@ from daq.acquisition.device_check import (
     discover,
     probe,
     probe_bench,
-    searched,
+    search_description,
 )
 from daq.bench.loading import parse
 from daq.drivers.registry import driver_names
@@ -70,7 +70,7 @@ async def test_a_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
     assert not x.is_stuck
     assert y.is_stuck
     assert (y.mean, y.rms) == (0, 0)
-    assert z.largest == pytest.approx(100 / TABLES[0]["channels"]["A"][2]["sensitivity"])
+    assert z.maximum == pytest.approx(100 / TABLES[0]["channels"]["A"][2]["sensitivity"])
     assert temperature.mean == pytest.approx(2634, abs=140)
     assert not temperature.is_stuck
     assert check.jitter is None
@@ -180,9 +180,9 @@ async def test_who_is_silent_or_another_does_not_hide_the_others_on_its_port(
 
 
 def test_where_is_looked_is_said() -> None:
-    said = searched("/dev/ttyUSB0")
+    said = search_description("/dev/ttyUSB0")
     assert all(str(each) in said for each in (*MODBUS_DEVICES, *MODBUS_BAUD_RATES, 460800))
-    assert "Epson" not in searched("modbus-tcp://10.0.0.9:502")
+    assert "Epson" not in search_description("modbus-tcp://10.0.0.9:502")
     text = " ".join(CliRunner().invoke(app, ["check", "--help"]).output.replace("│", " ").split())
     assert MODBUS_DEVICES == (1, 2, 3, 4, 5, 80)
     assert "Modbus devices 1 to 5 and 80" in text

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.acquisition.schedule import GRACE, MOST_TOLD, RunNotice, due_times, remove_old, serve
+from daq.acquisition.schedule import (
+    GRACE,
+    MAX_NOTICES,
+    RunNotice,
+    RunState,
+    due_times,
+    remove_old,
+    serve,
+)
 from daq.bench.loading import parse
 from daq.bench.model import Channel, Schedule
 from daq.errors import NoAnswerError, NotConnectedError, RecordingError
@@ -81,8 +89,8 @@ class Night:
 
     def notice(self, notice: RunNotice) -> None:
         """Take note."""
-        if notice.kind != "waiting":
-            self.said.append((notice.kind, f"{notice.due:%H:%M}"))
+        if notice.state is not RunState.WAITING:
+            self.said.append((notice.state, f"{notice.due:%H:%M}"))
             self.texts.append(notice.text)
 
     async def serve(self, *cron: str) -> None:
@@ -201,12 +209,12 @@ async def test_years_that_were_missed_are_told_in_a_few_words() -> None:
         now=lambda: night.time,
         sleep=set_clock,
     )
-    assert [kind for kind, _ in night.said] == ["missed"] * (MOST_TOLD + 1) + [
+    assert [kind for kind, _ in night.said] == ["missed"] * (MAX_NOTICES + 1) + [
         "started",
         "finished",
     ]
     assert night.said[-1] == ("finished", "12:10")
-    assert "all others until 2026-11-21 12:00" in night.texts[MOST_TOLD]
+    assert "all others until 2026-11-21 12:00" in night.texts[MAX_NOTICES]
 
 
 async def test_trouble_of_the_system_fails_one_run() -> None:
