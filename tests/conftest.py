@@ -16,6 +16,8 @@ import pytest
 
 from tests import devices
 from tests.devices import device_loop
+from tests.virtual_time import VirtualTimeLoop
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -56,7 +58,7 @@ def nothing_left_behind() -> Iterator[None]:
     descriptors = _open_descriptors()
     yield
     for thread in set(threading.enumerate()) - threads:
-        thread.join(timeout=2.0)  # one that is ending may end
+        thread.join(timeout=limit(2.0))  # one that is ending may end
     left = [
         t.name for t in set(threading.enumerate()) - threads if not t.name.startswith("asyncio_")
     ]
@@ -94,6 +96,8 @@ def pytest_asyncio_loop_factories(
     item: pytest.Item,
 ) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
     """Run a test by the clock that its marker names."""
+    if item.get_closest_marker("virtual_time"):
+        return {"virtual_time": VirtualTimeLoop}
     if item.get_closest_marker("devices"):
         return {"devices": device_loop}
     return {"system": asyncio.new_event_loop}
@@ -104,9 +108,13 @@ def pytest_sessionfinish() -> None:
     devices.stop()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Watch the tasks of every asynchronous test."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Watch the tasks of every asynchronous test, and multiply the time limits."""
+    usual = float(config.getini("timeout"))
     for item in items:
+        marker = item.get_closest_marker("timeout")
+        seconds = float(marker.args[0]) if marker else usual
+        item.add_marker(pytest.mark.timeout(limit(seconds)), append=False)
         if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
             item.obj = _leaving_no_task(item.obj)
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import asyncio
 import functools
 import tempfile
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from daq.host_clock import SystemClock
 from sim_devices.server.launch import DeviceServer, RunningDevice
 from sim_devices.server.paced_clock import PacedClock, PacedLoop
+from tests.virtual_time import VirtualTimeLoop
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator, Mapping
@@ -43,7 +44,11 @@ def device_loop() -> PacedLoop:
 
 
 def host_clock(speed: float = 1.0) -> SystemClock:
-    """Return the host clock of who reads simulated devices."""
+    """Return the host clock of who reads devices in a test: it goes with the test's event loop."""
+    with suppress(RuntimeError):  # no loop runs
+        loop = asyncio.get_running_loop()
+        if isinstance(loop, VirtualTimeLoop):
+            return SystemClock(speed, monotonic_ns=loop.time_ns, always_ns=loop.time_ns)
     clock = paced_clock()
     return SystemClock(
         speed, monotonic_ns=clock.now_ns, always_ns=clock.now_ns, utc_ns=clock.utc_ns

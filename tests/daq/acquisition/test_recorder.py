@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from daq.acquisition.block_writer import MAX_EVENTS_PER_SECOND
+from daq.acquisition.connection import CLOSE_TIMEOUT
 from daq.acquisition.recorder import RecorderStatus, record, recording_path
 from daq.errors import (
     DeviceError,
@@ -28,10 +29,13 @@ from daq.recording.reader import Recording, control_address
 from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+pytestmark = pytest.mark.virtual_time
 
 
 LOST = (SensorState.DISCONNECTED, SensorState.WAITING)
@@ -189,14 +193,9 @@ async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -
         assert kinds == ["connected", "late", "stalled", "connected"]
 
 
-async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "daq.acquisition.stall_detector.STALL_MARGIN", 5.0
-    )  # however busy the machine is
+async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
-    async with asyncio.timeout(60), run.going():
+    async with run.going():
         run.send("a", 0, 50)
         run.send("a", 50, 50)
         await run.until("a", 100, SensorState.LATE)
@@ -263,30 +262,25 @@ async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> 
 
 
 async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr("daq.acquisition.connection.CLOSE_TIMEOUT", 0.2)
     run = Run(tmp_path / "r.h5", "a", "b")
     run.device("a").hangs = True
-    async with asyncio.timeout(60), run.going():
+    async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
     assert run.statuses[-1].closed
     assert run.device("b").left_quiet
     with Recording.open(run.path) as recording:
-        assert "the driver did not close its session within 0.2 s" in [
+        assert f"the driver did not close its session within {CLOSE_TIMEOUT:g} s" in [
             e.text for e in recording.events if e.sensor == "a"
         ]
 
 
-async def test_a_driver_that_cannot_be_ended_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("daq.acquisition.connection.CLOSE_TIMEOUT", 0.2)
-    monkeypatch.setattr("daq.acquisition.recorder.CANCEL_TIMEOUT", 0.5)
+async def test_a_driver_that_cannot_be_ended_is_left_alone(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").may_end = may_end = asyncio.Event()
-    async with asyncio.timeout(60), run.going():
+    async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
     assert run.statuses[-1].closed
@@ -303,7 +297,7 @@ async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
     tmp_path: Path,
 ) -> None:
     run = Run(tmp_path / "r.h5", "a")
-    async with asyncio.timeout(60), run.going():
+    async with run.going():
         run.send("a", 0, 100)
         await run.until("a", 100)
         address = control_address(run.path)
@@ -538,7 +532,7 @@ def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
         check=False,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=limit(),
     )
     assert said.stdout == f"{path}: cannot be written: File too large\n", said.stderr
     report = verify(path)
@@ -578,7 +572,7 @@ def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
         check=False,
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=limit(),
     )
     assert (said.returncode, said.stdout) == (0, "True\n"), said.stderr
     assert verify(path).closed

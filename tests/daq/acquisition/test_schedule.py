@@ -170,6 +170,7 @@ async def test_runs_that_were_slept_through_are_missed() -> None:
     ]
 
 
+@pytest.mark.virtual_time
 async def test_stop_ends_the_wait() -> None:
     stop = asyncio.Event()
 

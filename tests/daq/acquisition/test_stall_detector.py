@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import time
 
 import numpy as np
 import pytest
 
 from daq.acquisition.stall_detector import (
     MIN_LATE_AFTER,
+    MIN_STALLED_AFTER,
     STALL_MARGIN,
     BlockInterval,
     StallDetector,
 )
 from daq.protocols.block import Block, HostTime
+from tests.virtual_time import VirtualTimeLoop
+
+pytestmark = pytest.mark.virtual_time
 
 RATE = 100.0
 NOW = HostTime(0, 0)
@@ -54,7 +57,7 @@ def said() -> Said:
 
 
 async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -> None:
-    """Not at the next look of a clock that ticks: within what the event loop's timer takes."""
+    """Not at the next look of a clock that ticks: at that very instant."""
 
     async def wait() -> None:
         async with StallDetector({"a": RATE}, said) as watch:
@@ -64,9 +67,10 @@ async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -
 
     with pytest.raises(TimeoutError):
         await wait()
-    (one,) = [item for item in said.items if item[1] == "late"]
-    assert one[2] == pytest.approx(0.4, abs=0.1)
-    assert [item[1] for item in said.items] == ["late"]
+    ((sensor, stage, after),) = said.items
+    assert (sensor, stage) == ("a", "late")
+    assert after == pytest.approx(0.4)
+    assert asyncio.get_running_loop().time() == pytest.approx(0.4 + STALL_MARGIN)
 
 
 async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
@@ -76,7 +80,8 @@ async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
             await said.wait(1)
             watch.block_received(block("a", 20))
             await said.wait(2)
-    assert [item[1] for item in said.items] == ["late", "late"]
+    assert [item[:2] for item in said.items] == [("a", "late")] * 2
+    assert [after for _, _, after in said.items] == pytest.approx([0.4, 0.4])
 
 
 async def test_of_several_on_a_port_one_can_be_lost(said: Said) -> None:
@@ -85,13 +90,8 @@ async def test_of_several_on_a_port_one_can_be_lost(said: Said) -> None:
         with watch.waiting():
             while len(said.items) < 2:
                 watch.block_received(block("b", 10))
-                said.news.clear()
-                try:
-                    async with asyncio.timeout(0.1):
-                        await said.news.wait()
-                except TimeoutError:
-                    continue
-    assert [item[:2] for item in said.items if item[0] == "a"] == [("a", "late"), ("a", "stalled")]
+                await asyncio.sleep(0.1)
+    assert [item[:2] for item in said.items] == [("a", "late"), ("a", "stalled")]
 
 
 async def test_what_could_not_be_said_is_said_later(said: Said) -> None:
@@ -107,7 +107,9 @@ async def test_a_busy_host_is_no_devices_fault(said: Said) -> None:
     async with StallDetector({"a": RATE}, said) as watch:
         watch.block_received(block("a", 10))
         with watch.waiting():
-            time.sleep(1.0)  # noqa: ASYNC251 -- the event loop is to be held up
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, VirtualTimeLoop)
+            loop.hold_up(1.0)
             await asyncio.sleep(0.05)
             watch.block_received(block("a", 10))
     assert not said.items
@@ -137,12 +139,12 @@ async def test_a_device_that_recovers_is_late_and_not_lost(
     recovering = StallDetector(rates, said, is_recovering=lambda: True)
     with pytest.raises(TimeoutError):
         await wait(recovering)
-    assert recovering.seconds >= 1.0  # not for ever
+    assert recovering.seconds == pytest.approx(1.0)  # not for ever
     assert sorted(item[:2] for item in said.items) == [("a", "late"), ("b", "late")]
     stalled = StallDetector(rates, said, is_recovering=lambda: False)
     with pytest.raises(TimeoutError):
         await wait(stalled)
-    assert stalled.seconds < 1.0
+    assert stalled.seconds == pytest.approx(MIN_STALLED_AFTER)
 
 
 def test_one_lost_block_is_no_stall() -> None:
