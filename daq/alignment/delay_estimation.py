@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cache
-from typing import TYPE_CHECKING
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -48,6 +48,7 @@ _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples either way
 _CLEAR = 1.5  # times as high as the peak nearest zero: those of one line are about as high
 _OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
+_FREQUENCIES_AT_ONCE = 1024
 _RIDGE = 1e-10  # of the mean power: keeps a dead channel from stopping everything
 
 
@@ -58,14 +59,21 @@ class _Frame:
     reference: ComplexArray
     crossed: ComplexArray
     own: ComplexArray
-    n_segments: int = 0
+    n_segments: int
 
-    def add(self, x0: ComplexArray, xj: ComplexArray) -> None:
-        """Add spectra, shape (n_freqs, n_segments, n_channels)."""
-        self.reference += _products(x0, x0)
-        self.crossed += _products(xj, x0)
-        self.own += _products(xj, xj)
-        self.n_segments += x0.shape[1]
+    @classmethod
+    def of(cls, x0: ComplexArray, xj: ComplexArray, reference: ComplexArray | None = None) -> Self:
+        """Sum spectra, shape (n_freqs, n_segments, n_channels); `reference` if it is known."""
+        if reference is None:
+            reference = _products(x0, x0)
+        return cls(reference, _products(xj, x0), _products(xj, xj), x0.shape[1])
+
+    def add(self, other: _Frame) -> None:
+        """Add the sums of further segments."""
+        self.reference += other.reference
+        self.crossed += other.crossed
+        self.own += other.own
+        self.n_segments += other.n_segments
 
 
 @dataclass(slots=True, eq=False)
@@ -134,14 +142,18 @@ class DelayEstimator:
         else:
             self._reference, found = self._begun(sensors)
             x0 = sensors[self._reference]
-            self._frames = {number: _empty(x0, sensors[number]) for number in found}
         delays[:, self._reference] = std[:, self._reference] = 0.0
         for number, (tau, spread) in found.items():
-            frame, xj = self._frames[number], sensors[number]
+            frame, xj = self._frames.get(number), sensors[number]
             known = np.isfinite(spread)
-            if frame.n_segments == 0 or known.any():
+            if frame is None or known.any():
                 used = known if known.any() else np.ones(len(starts), dtype=bool)
-                frame.add(x0[:, used], self._advanced(xj[:, used], np.where(known, tau, 0.0)[used]))
+                advanced = self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
+                new = _Frame.of(x0[:, used], advanced)
+                if frame is None:
+                    self._frames[number] = new
+                else:
+                    frame.add(new)
             delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
         return delays, std
 
@@ -152,8 +164,9 @@ class DelayEstimator:
         best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
         most = -1
         for reference, x0 in enumerate(sensors[:_REFERENCES]):
+            power = _products(x0, x0)
             found = {
-                number: self._first_delays(x0, xj)
+                number: self._first_delays(x0, xj, power)
                 for number, xj in enumerate(sensors)
                 if number != reference
             }
@@ -165,12 +178,16 @@ class DelayEstimator:
                 break
         return best
 
-    def _first_delays(self, x0: ComplexArray, xj: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Measure delays in the frame of these segments, which the delays define in turn."""
+    def _first_delays(
+        self, x0: ComplexArray, xj: ComplexArray, power: ComplexArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Measure delays in the frame of these segments, which the delays define in turn.
+
+        `power` is the sum of x0's own products.
+        """
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
         for _ in range(_FIRST_ITERATIONS):
-            frame = _empty(x0, xj)
-            frame.add(x0, self._advanced(xj, tau))
+            frame = _Frame.of(x0, self._advanced(xj, tau), power)
             tau, spread = self._delays(frame, x0, xj)
             tau = np.where(np.isfinite(spread), tau, 0.0)
             tau -= tau.mean()
@@ -246,11 +263,26 @@ class DelayEstimator:
 
     def _peak(self, crossed: ComplexArray) -> FloatArray:
         """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column."""
-        height, step = self._heights(crossed)
-        middle = height.shape[1] // 2
-        reach = min(middle - 1, int(_LONGEST / self.sampling_rate / step))
-        near = height[:, middle - reach : middle + reach + 1]
-        return self._polished(crossed, (np.argmax(near, axis=1) - reach) * step)
+        reach = min(self._n_grid // 2 - 1, int(_LONGEST / self.sampling_rate / self._step))
+        even, odd = (np.zeros((crossed.shape[1], reach + 1)) for _ in range(2))
+        # Of so few τ a product with the transform's matrix costs less than the transform.
+        for first in range(0, len(crossed), _FREQUENCIES_AT_ONCE):
+            some = crossed[first : first + _FREQUENCIES_AT_ONCE]
+            cosine, sine = _fourier(self._n_grid, first + 1, reach + 1)
+            even += some.real.T @ cosine[: len(some)]
+            odd += some.imag.T @ sine[: len(some)]
+        near = np.concatenate([(even + odd)[:, :0:-1], even - odd], axis=1)
+        return self._polished(crossed, (np.argmax(near, axis=1) - reach) * self._step)
+
+    @property
+    def _n_grid(self) -> int:
+        """Grid points of τ in a segment: a fraction of a period of the highest frequency."""
+        return _fast_length(4 * len(self.window))
+
+    @property
+    def _step(self) -> float:
+        """Seconds between grid points of τ."""
+        return float(2 * np.pi / self.omega[0] / self._n_grid)
 
     def _constant(self, crossed: ComplexArray) -> float:
         """Return the τ at which Re Σ crossed exp(iωτ) has the peak that it is likely to have.
@@ -259,8 +291,8 @@ class DelayEstimator:
         others, as high. So another one within `_LONGEST` must be clearly higher, and one farther
         off must be so high that noise cannot be the reason.
         """
-        heights, step = self._heights(crossed[:, None])
-        height, middle = heights[0], heights.shape[1] // 2
+        step, middle = self._step, self._n_grid // 2
+        height = np.fft.fftshift(np.fft.irfft(np.append(0, crossed), n=self._n_grid))
         peaks = np.flatnonzero((height[1:-1] > height[:-2]) & (height[1:-1] >= height[2:])) + 1
         away = np.abs(peaks - middle) * step * self.sampling_rate
         if not (away < _LONGEST).any():
@@ -285,17 +317,6 @@ class DelayEstimator:
             tau = tau - np.clip(step, -1 / self.sampling_rate, 1 / self.sampling_rate)
         return tau
 
-    def _heights(self, crossed: ComplexArray) -> tuple[FloatArray, float]:
-        """Return Re Σ crossed exp(iωτ) of every column on a grid of τ, and its step in seconds.
-
-        A fraction of a period of the highest frequency; τ = 0 is in the middle of the row.
-        """
-        n = _fast_length(4 * len(self.window))
-        padded = np.zeros((crossed.shape[1], n // 2 + 1), dtype=np.complex128)
-        padded[:, 1 : len(crossed) + 1] = crossed.T
-        height = np.fft.fftshift(np.fft.irfft(padded, n=n, axis=-1), axes=-1)
-        return height, float(2 * np.pi / self.omega[0] / n)
-
 
 @cache
 def _fast_length(n: int) -> int:
@@ -303,6 +324,14 @@ def _fast_length(n: int) -> int:
     while n != math.gcd(n, 2**64 * 3**40 * 5**28):
         n += 1
     return n
+
+
+@lru_cache(maxsize=4)
+def _fourier(n: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return cosine and sine of 2π f t / n for `_FREQUENCIES_AT_ONCE` f, and t from 0."""
+    turns = np.outer(np.arange(first, first + _FREQUENCIES_AT_ONCE), np.arange(count)) % n
+    angle = 2 * np.pi / n * np.arange(n)
+    return np.cos(angle)[turns], np.sin(angle)[turns]
 
 
 def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:
@@ -318,15 +347,6 @@ def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:
 
 def _products(a: ComplexArray, b: ComplexArray) -> ComplexArray:
     return np.asarray(np.matmul(a.transpose(0, 2, 1), b.conj()))
-
-
-def _empty(x0: ComplexArray, xj: ComplexArray) -> _Frame:
-    n_freqs, d0, dj = x0.shape[0], x0.shape[2], xj.shape[2]
-
-    def zeros(*shape: int) -> ComplexArray:
-        return np.zeros((n_freqs, *shape), dtype=np.complex128)
-
-    return _Frame(zeros(d0, d0), zeros(dj, d0), zeros(dj, dj))
 
 
 def _prediction(frame: _Frame) -> tuple[ComplexArray, ComplexArray]:
