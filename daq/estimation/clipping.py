@@ -57,6 +57,8 @@ def _rows(record: ReadableSensor) -> NDArray[np.int64]:
 
 
 def _share(counts: NDArray[np.generic]) -> float:
+    if max((counts == end).sum() for end in (counts.min(), counts.max())) < _MIN_SAMPLES:
+        return 0.0
     values, times = np.unique(counts, return_counts=True)
     if len(values) < _DISTINCT:
         return 0.0

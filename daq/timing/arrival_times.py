@@ -119,6 +119,8 @@ class ArrivalTimes:
     _lowest: tuple[float, float] = (np.inf, np.inf)
     _leapt: float = 0.0
     _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
+    _line: tuple[float, list[float]] | None = None  # what `_lines` found, until more arrives
+    _unmeasured: Clock | None = None  # what `solve` found, until more arrives
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -131,6 +133,7 @@ class ArrivalTimes:
         blocks = blocks[blocks["n_samples"] > 0]
         if len(blocks) == 0:
             return
+        self._line = self._unmeasured = None
         flags = blocks["flags"]
         first = blocks["first_sample"].astype(np.int64)
         length = blocks["n_samples"].astype(np.int64)
@@ -236,8 +239,11 @@ class ArrivalTimes:
         """
         if self._device_utc:
             return self._stated(sensor)
-        slope, anchors = self._lines()
-        return self._filtered(sensor, slope, anchors, measured)
+        if measured is not None:
+            return self._filtered(sensor, *self._lines(), measured)
+        if self._unmeasured is None or self._unmeasured.state.sensor != sensor:
+            self._unmeasured = self._filtered(sensor, *self._lines(), None)
+        return self._unmeasured
 
     def _bounds(self) -> list[tuple[int, int]]:
         """First sample of each epoch, and the one after its last."""
@@ -266,6 +272,8 @@ class ArrivalTimes:
 
     def _lines(self) -> tuple[float, list[float]]:
         """One slope (lateness per sample) for all epochs, and the lateness at index 0 of each."""
+        if self._line is not None:
+            return self._line
         slopes, weights = [0.0], [0.0]
         for number in range(len(self._epoch_starts)):
             mine = self._epoch == number
@@ -276,9 +284,11 @@ class ArrivalTimes:
         total = sum(weights)
         slope = float(np.dot(slopes, weights) / total) if total else 0.0
         late = self._late - slope * self._index
-        return slope, [
-            float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))
-        ]
+        self._line = (
+            slope,
+            [float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))],
+        )
+        return self._line
 
     def _too_early(self, index: IntArray, late: FloatArray) -> BoolArray:
         """Whether blocks come far below the lateness before: then the host's clock stood still.

@@ -78,8 +78,9 @@ def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     else:
         chosen = np.arange(len(x))
     hull: list[int] = []
+    across, up = x.tolist(), y.tolist()  # plain numbers: arrays are slow one by one
     for point in chosen.tolist():
-        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], point):
+        while len(hull) > 1 and _turns_down(across, up, hull[-2], hull[-1], point):
             hull.pop()
         hull.append(point)
     right = min(max(int(np.searchsorted(x[hull], x.mean())), 1), len(hull) - 1)
@@ -88,5 +89,5 @@ def supporting_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     return y0 + float(y[a]) - slope * (x0 + float(x[a])), slope
 
 
-def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
-    return bool((x[b] - x[a]) * (y[c] - y[a]) <= (y[b] - y[a]) * (x[c] - x[a]))
+def _turns_down(x: list[float], y: list[float], a: int, b: int, c: int) -> bool:
+    return (x[b] - x[a]) * (y[c] - y[a]) <= (y[b] - y[a]) * (x[c] - x[a])
