@@ -33,6 +33,7 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.recording import control
+from daq.recording.control import Command
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
 
@@ -348,12 +349,12 @@ class _Recorder:
     def _is_complete(self, writer: BlockWriter, duration: float) -> bool:
         return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
 
-    async def _answer(self, command: str, text: str) -> dict[str, Any]:
+    async def _answer(self, command: Command, text: str) -> dict[str, Any]:
         """Carry out a command of the control channel."""
-        if command == "stop":
+        if command is Command.STOP:
             self._end_reason = "stopped by command"
             self._stop.set()
-        elif command == "mark":
+        elif command is Command.MARK:
             await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
         return self._status.to_dict()
 

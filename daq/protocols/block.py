@@ -1,14 +1,14 @@
-"""What every protocol yields: blocks of samples, and events.
+"""Blocks of samples and events, which every protocol yields.
 
 Theory of operation
 -------------------
-A protocol is fed received bytes together with the host time at which they came, and returns
-finished :class:`Block` and :class:`Event` objects in order. It owns no clock and no wire.
+A protocol takes received bytes and the host time at which they arrived, and returns complete
+:class:`Block` and :class:`Event` objects in order. It reads no clock and opens no port.
 
-``first_sample`` counts on the device's own sampling grid, from 0 at the start of a *session* (one
-connection). A block that does not start where the one before ended is a **gap**: the samples
-between were taken by the device, or should have been, and were not received. Where the protocol
-carries a counter the length of a gap is exact; where it does not, the block says
+``first_sample`` counts the device's own samples, from 0 at the start of a *session* (one
+connection). Where a block does not begin at the end of the block before, there is a **gap**: the
+device took the samples between them, or should have, and they were not received. If the protocol
+has a counter, the length of a gap is exact; otherwise the block has the flag
 ``BlockFlag.MISSING_ESTIMATED``. Gaps are never filled.
 """
 
@@ -25,25 +25,25 @@ CountsArray: TypeAlias = NDArray[np.integer[Any]] | NDArray[np.floating[Any]]
 
 
 class BlockFlag(IntFlag):
-    """What is known about a block beyond its samples (stored in the recording as int32)."""
+    """Properties of a block (stored in the recording as int32)."""
 
     NONE = 0
     CLIPPED = 1
-    """At least one sample is at the end of its range."""
+    """At least one sample reached the end of the range."""
     CLOCK_RESTART = 2
-    """The device's sampling clock starts anew here: first block, reset, reconnection."""
+    """The device's sampling clock restarts here: first block, reset or reconnection."""
     MISSING_ESTIMATED = 4
-    """How many samples are missing before this block was estimated from host time."""
+    """The number of samples missing before this block is an estimate from host time."""
     DEVICE_UTC = 8
-    """``device_counter`` is the UTC of the first sample in ns, from the device (GPS or NTP)."""
+    """``device_counter`` is the device's UTC (GPS or NTP) of the first sample, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class HostTime:
-    """One instant as the host saw it.
+    """One instant on the clocks of the host.
 
-    ``monotonic_ns`` is never stepped and is what clock models use; ``utc_ns`` (since 1970) names
-    the instant for people.
+    Clock models use ``monotonic_ns``, which is never stepped. ``utc_ns``, since 1970, is for people
+    to read.
     """
 
     monotonic_ns: int
@@ -59,19 +59,18 @@ class Block:
     sensor : str
         Name of the sensor in the bench file.
     first_sample : int
-        Index of the first sample on the device's sampling grid, from the start of the session.
+        Index of the first sample, from 0 at the start of the session.
     counts : ndarray, shape (n_samples, n_channels)
-        Raw values as the device sent them (integers, or floats where registers hold floats).
+        Raw values as sent by the device (integers, or floats where registers hold floats).
     received : HostTime
-        When the last byte of the block had been received.
+        When the last byte of the block was received.
     device_counter : int or None
-        The device's own counter (unwrapped) or time of the first sample, where there is one.
+        The device's counter (unwrapped) or time of the first sample; None where it sends none.
     flags : BlockFlag
-        See there.
     reason : str
-        Why samples are missing before this block; empty where none are.
+        Why samples are missing before this block; empty if none are. For people.
     instants_ns : int64 ndarray, shape (n_samples,), or None
-        For polled devices: host monotonic instant of each sample, in ns.
+        Of polled devices: host monotonic time of each sample, in ns.
     """
 
     sensor: str

@@ -1,4 +1,4 @@
-"""The HDF5 recording: written, read while it grows, locked, repaired, monitored.
+"""The HDF5 recording: writes it, reads it while it grows, locks, repairs and monitors it.
 
 Knows no driver and no estimate; the format is in docs/recording-format.md.
 """

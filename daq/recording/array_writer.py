@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Times: TypeAlias = Sequence[int] | NDArray[np.int64]
 
 BLOCK_ROWS = 4096
-"""Samples of a block, where the caller does not say: quickly read, and little is read twice."""
+"""Default number of samples in a block."""
 CHUNK_SECONDS = 10.0
 _NS_PER_S = 1_000_000_000
 
@@ -40,7 +40,7 @@ class ArrayWriter:
     path : path
         Must not exist; its directory is made.
     bench : Bench, optional
-        What the recording says of the bench.
+        Stored in the recording.
     sensors : sequence of SensorLayout
     created : HostTime
         Start of the recording.
@@ -112,18 +112,18 @@ class ArrayWriter:
             Of the dtype of the sensor's layout. Sliced block by block, so a lazily read array is
             never in memory as a whole.
         first_sample : int
-            Index of the first one, counted from the sensor's first sample of the recording.
+            Sample index of the first one, counted from the sensor's first sample.
         block_rows : int
-            Samples of a block; the last block has what remains.
+            Samples in a block; the last block has the remaining ones.
         received_ns : int, shape (n_blocks,), optional
             When each block was received. By default, one sampling interval after its last sample at
             the nominal rate.
         utc_ns : int, shape (n_blocks,), optional
-            Time of the first sample of each block, where the device itself states UTC.
+            Time of the first sample of each block, where the device sends UTC.
         instants_ns : int64, shape (n_samples,), optional
             Time of each sample, where it is known.
         restart : bool, optional
-            Whether the sampling clock starts anew here; by default, at sample 0 only.
+            Whether the sampling clock restarts here; by default, only at sample 0.
         """
         rate, n_samples = self._rates[sensor], len(counts)
         flags = BlockFlag.NONE if utc_ns is None else BlockFlag.DEVICE_UTC

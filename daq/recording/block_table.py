@@ -1,7 +1,7 @@
-"""The committed blocks of a sensor, of which a long recording has millions.
+"""The committed blocks of a sensor; a long recording has millions.
 
-They stay in the file, and are read where they are asked for: who follows a recording wants each of
-them once. What is asked for again and again, which of them are clipped, is kept.
+Rows stay in the file and are read on demand: a reader that follows a recording needs each row once.
+Only the clipped stretches are kept in memory, since they are needed again and again.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.int64]
 
-_ROWS_AT_ONCE = 1 << 14  # 900 kB
+_ROWS_PER_READ = 1 << 14  # 900 kB
 
 
 class BlockTable:
     """Committed blocks, dtype :data:`daq.recording.file_format.BLOCK_DTYPE`, indexed like an array.
 
-    A slice reads no more than its rows, the name of a field no other fields.
+    A slice reads only its rows; the name of a field reads only that field.
     """
 
     def __init__(self, dataset: h5py.Dataset) -> None:
@@ -35,12 +35,12 @@ class BlockTable:
         self._n_rows = 0
         self._clipped: list[IntArray] = []
         self.n_samples = 0
-        """Rows of samples at which they end."""
+        """Number of rows of samples in these blocks."""
 
     def __len__(self) -> int:
         return self._n_rows
 
-    def __getitem__(self, which: Any) -> NDArray[Any]:  # noqa: ANN401 - as arrays take it
+    def __getitem__(self, which: Any) -> NDArray[Any]:  # noqa: ANN401 - any index of an array
         if isinstance(which, str):
             return self._read(0, self._n_rows, which)
         if isinstance(which, slice) and which.step is None:
@@ -49,25 +49,26 @@ class BlockTable:
         return np.asarray(self._read(0, self._n_rows)[which])
 
     def __iter__(self) -> Iterator[NDArray[np.void]]:
-        for first in range(0, self._n_rows, _ROWS_AT_ONCE):
-            yield from self[first : first + _ROWS_AT_ONCE]
+        for first in range(0, self._n_rows, _ROWS_PER_READ):
+            yield from self[first : first + _ROWS_PER_READ]
 
     @property
     def clipped(self) -> IntArray:
-        """First sample and the one after the last of what is clipped, shape (n, 2); rising."""
+        """First sample, and the one after the last, of each clipped stretch; shape (n, 2)."""
         if len(self._clipped) > 1:
             self._clipped = [np.concatenate(self._clipped)]
         return self._clipped[0] if self._clipped else np.empty((0, 2), np.int64)
 
-    def take(self, n_rows: int, n_samples: int) -> None:
-        """Take further blocks: up to ``n_rows``, of those that end within ``n_samples``.
+    def extend(self, n_rows: int, n_samples: int) -> None:
+        """Add blocks up to row ``n_rows``, without those that end beyond ``n_samples``.
 
-        Samples and blocks end together, even if a crash left one of the two numbers behind.
+        A crash may leave one of the two numbers older than the other. Blocks and samples are cut to
+        end together.
         """
         if n_rows > self._n_rows:
             self._dataset.refresh()
-        for first in range(self._n_rows, n_rows, _ROWS_AT_ONCE):
-            blocks = self._read(first, min(first + _ROWS_AT_ONCE, n_rows))
+        for first in range(self._n_rows, n_rows, _ROWS_PER_READ):
+            blocks = self._read(first, min(first + _ROWS_PER_READ, n_rows))
             ends = blocks["first_row"] + blocks["n_samples"]
             n_whole = int(np.searchsorted(ends, n_samples, side="right"))
             if n_whole:

@@ -1,11 +1,11 @@
-"""Reads many small chunks of a dataset at once, by several threads if there are several.
+"""Reads many small chunks of a dataset at once, also from several threads.
 
-HDF5 takes one lock for the whole process while it reads, decompression included. Here it only
-fetches the chunks as they are in the file; ISA-L decompresses them without a lock, in little more
-than half of zlib's time, and numpy puts the bytes of all of them back in their places at once.
+HDF5 holds one lock for the whole process while it reads and decompresses. Here HDF5 only fetches
+the stored chunks. ISA-L decompresses them without a lock, in little more than half of zlib's time,
+and numpy unshuffles the bytes of all chunks together.
 
-That a chunk is whole is told by the Adler-32 in its zlib stream, over the bytes that come out. The
-Fletcher-32 that HDF5 puts behind the stream, over the bytes that went in, says no more.
+The Adler-32 in the zlib stream, over the decompressed bytes, shows whether a chunk is intact. The
+Fletcher-32 that HDF5 appends, over the compressed bytes, adds nothing and is not checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_F
 
 
 class ChunkedRows:
-    """The rows of a dataset.
+    """Reads rows of a chunked dataset.
 
     Parameters
     ----------
@@ -49,21 +49,21 @@ class ChunkedRows:
         OSError, RuntimeError
             If the file is damaged there.
         """
-        if self._direct and last_row - first_row >= self._length:  # of parts HDF5 keeps the rest
+        # HDF5 caches the chunk of which only a part is read.
+        if self._direct and last_row - first_row >= self._length:
             rows = self._decompressed(first_row, last_row)
             if rows is not None:
                 return rows
         return np.asarray(self._dataset[first_row:last_row])
 
     def _decompressed(self, first_row: int, last_row: int) -> NDArray[Any] | None:
-        """Return rows, or None where HDF5 had better look itself."""
+        """Return rows, or None where HDF5 must read them itself."""
         start = first_row // self._length * self._length
         fetch, corner, n_bytes = self._dataset.id.read_direct_chunk, self._corner, self._n_bytes
         try:
             stored = [fetch((row, *corner)) for row in range(start, last_row, self._length)]
-            if any(skipped for skipped, _ in stored):  # compressed, it would have been longer
+            if any(skipped for skipped, _ in stored):  # stored without compression
                 return None
-            # What follows the stream is not looked at.
             inflate, bits = isal_zlib.decompress, isal_zlib.MAX_WBITS
             chunks = [inflate(content, bits, n_bytes) for _, content in stored]
         except (OSError, RuntimeError, isal_zlib.error):  # type: ignore[misc]  # a class: its stub says instance

@@ -1,4 +1,4 @@
-"""The rows of one sensor on their way to disk: in whole chunks, in joined blocks."""
+"""Buffers the rows of one sensor: samples become whole chunks, small blocks are merged."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from daq.recording.file_format import SensorLayout
 
 _MERGED_SECONDS = 0.1
+"""Length of merged blocks in seconds."""
 
 
-class Table:
-    """A dataset of rows that are added in small numbers; unfiltered, so written in place."""
+class TableBuffer:
+    """Appends rows to a table; the dataset is unfiltered, so that rows are written in place."""
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._dataset = dataset
@@ -30,11 +31,11 @@ class Table:
         self.n_rows = 0
 
     def add(self, row: NDArray[np.void]) -> None:
-        """Take a row; it waits for the next write."""
+        """Buffer a row until the next `write`."""
         self._waiting.append(row)
 
     def write(self) -> None:
-        """Write what waits."""
+        """Write the buffered rows."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
@@ -44,8 +45,8 @@ class Table:
         self._waiting.clear()
 
 
-class Chunked:
-    """A dataset that is written in whole chunks; what does not fill one waits."""
+class ChunkBuffer:
+    """Appends rows to a dataset in whole chunks; the rows of an incomplete chunk are buffered."""
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._dataset = dataset
@@ -54,7 +55,7 @@ class Chunked:
         self.n_written = 0
 
     def add(self, rows: NDArray[Any]) -> None:
-        """Take rows, and write the chunks they fill."""
+        """Add rows, and write the chunks that are complete."""
         length = len(self._buffer)
         taken = min(len(rows), length - self._filled) if self._filled else 0
         if taken:
@@ -72,7 +73,7 @@ class Chunked:
             self._filled = len(rest)
 
     def finish(self) -> None:
-        """Write what waits, as a last, partial chunk."""
+        """Write the buffered rows as a last, partial chunk."""
         rest, self._filled = self._filled, 0
         if rest:
             self._write(self._buffer[:rest])
@@ -84,8 +85,8 @@ class Chunked:
 
 
 @dataclass(slots=True)
-class _Row:
-    """A block that may still grow."""
+class _OpenBlock:
+    """A block to which further samples may be added."""
 
     first_sample: int
     first_row: int
@@ -95,7 +96,7 @@ class _Row:
     flags: int
 
     def array(self) -> NDArray[np.void]:
-        """Return its row, without checksum."""
+        """Return the block's row without its checksum."""
         at = self.received.monotonic_ns, self.received.utc_ns
         begin = self.first_sample, self.first_row, self.n_samples
         return np.array(
@@ -104,40 +105,39 @@ class _Row:
 
 
 class SensorRows:
-    """The rows of one sensor.
+    """Buffers samples, blocks and gaps of one sensor.
 
-    Small blocks that follow each other without a gap become one row of ``blocks`` until that is a
-    tenth of a second long: at 200 Hz a serial port hands over three or four samples at a time, and
-    their rows would be larger than they.
+    Small contiguous blocks are merged into one row of ``blocks`` of up to a tenth of a second: at
+    200 Hz a serial port delivers three or four samples at a time, which take less space than a row.
     """
 
     def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
-        self.samples = Chunked(group["samples"])
-        self.instants = Chunked(group["instants"])
+        self.samples = ChunkBuffer(group["samples"])
+        self.instants = ChunkBuffer(group["instants"])
         self._polled: bool | None = None
-        self.blocks = Table(group["blocks"])
-        self.gaps = Table(group["gaps"])
+        self.blocks = TableBuffer(group["blocks"])
+        self.gaps = TableBuffer(group["gaps"])
         self._layout = sensor
         self._merged_length = max(1, round(sensor.sampling_rate * _MERGED_SECONDS))
-        self._current: _Row | None = None
+        self._current: _OpenBlock | None = None
         self._crc32 = 0
-        self._whole: list[NDArray[np.void]] = []
+        self._finished: list[NDArray[np.void]] = []
         self._n_rows = 0
 
     def append(self, block: Block) -> None:
-        """Take a block.
+        """Add a block.
 
         Raises
         ------
         RecordingError
-            If it is not of this sensor's shape or type.
+            If its shape or type is not that of the sensor.
         """
         counts = self._converted(block)
         if self._polled is None:
             self._polled = block.instants_ns is not None
         elif self._polled != (block.instants_ns is not None):
             raise RecordingError(
-                f"sensor {block.sensor!r}: some blocks with instants of their samples, some without"
+                f"sensor {block.sensor!r}: some blocks have sample times, others do not"
             )
         merged = self._merge(block)
         self._crc32 = zlib.crc32(counts.data, self._crc32 if merged else 0)
@@ -147,35 +147,35 @@ class SensorRows:
             self.instants.add(block.instants_ns)
 
     def collect(self) -> None:
-        """Hand the rows of blocks whose samples are all written to their table."""
+        """Add the blocks whose samples are all written to the table of blocks."""
         written = self.samples.n_written
         if self._polled:
             written = min(written, self.instants.n_written)
         if self._n_rows == written:
             self._end_current()
         done = 0
-        for row in self._whole:
+        for row in self._finished:
             if row["first_row"][0] + row["n_samples"][0] > written:
                 break
             self.blocks.add(row)
             done += 1
-        del self._whole[:done]
+        del self._finished[:done]
 
     def finish(self) -> None:
-        """Write everything that waits."""
+        """End the current block and write all buffered samples."""
         self._end_current()
         self.samples.finish()
         self.instants.finish()
 
     @property
     def committable_rows(self) -> int:
-        """Number of rows up to the end of the last block that was collected."""
-        if self._whole:
-            return int(self._whole[0]["first_row"][0])
+        """Number of rows of samples in the blocks that are in their table."""
+        if self._finished:
+            return int(self._finished[0]["first_row"][0])
         return self._n_rows if self._current is None else self._current.first_row
 
     def _merge(self, block: Block) -> bool:
-        """Continue the current block with this one, or end it and begin another."""
+        """Add a block to the current one and return True, or begin another one."""
         current = self._current
         if (
             current is not None
@@ -189,7 +189,7 @@ class SensorRows:
             return True
         self._end_current()
         counter = file_format.NO_COUNTER if block.device_counter is None else block.device_counter
-        self._current = _Row(
+        self._current = _OpenBlock(
             block.first_sample,
             self._n_rows,
             block.n_samples,
@@ -203,7 +203,7 @@ class SensorRows:
         if self._current is not None:
             row = self._current.array()
             row["crc32"] = file_format.block_crc32(row, self._crc32)
-            self._whole.append(row)
+            self._finished.append(row)
             self._current = None
 
     def _converted(self, block: Block) -> NDArray[Any]:

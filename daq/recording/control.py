@@ -1,10 +1,11 @@
-"""A small channel to a running recorder: ``stop``, ``mark``, ``status``.
+"""Control channel of a running recorder: ``stop``, ``mark``, ``status``.
 
 Theory of operation
 -------------------
-The recorder listens on an ephemeral port of the local host and writes the port and a random token
-into the file's attributes: who can read the recording can stop it. A request is one line,
-``token command text``; the answer is one line of JSON, with ``"error"`` if it was refused.
+The recorder listens on an ephemeral port of the local host, and writes port and a random token into
+the attributes of the file: whoever can read the recording can stop it. A request is one line,
+``token command text``. The answer is one line of JSON, with the key ``"error"`` if the recorder
+refuses.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import hmac
 import json
 import secrets
 import socket
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,29 +27,39 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
 HOST = "127.0.0.1"
-COMMANDS = ("stop", "mark", "status")
 _MAX_LINE = 4096
 _IDLE_TIMEOUT = 10.0
-_LAST_WORDS = 1.0
-"""For answers to be read when the recorder ends, s."""
+_FINAL_REPLY_TIMEOUT = 1.0
+"""Seconds in which the last answers may be read when the recorder ends."""
 
 Answer = dict[str, Any]
 
 
+class Command(StrEnum):
+    """What a recorder can be asked."""
+
+    STOP = "stop"
+    """Close the recording and end."""
+    MARK = "mark"
+    """Record a remark."""
+    STATUS = "status"
+    """Answer with the status; every other command is answered so, too."""
+
+
 class ControlRefusedError(HuddleError):
-    """The recorder refused a command; the message says why."""
+    """The recorder refused a command; the message has its reason."""
 
 
 @contextlib.asynccontextmanager
 async def serve(
-    answer: Callable[[str, str], Awaitable[Answer]],
+    answer: Callable[[Command, str], Awaitable[Answer]],
 ) -> AsyncIterator[tuple[int, str]]:
     """Listen for commands while the context lasts.
 
     Parameters
     ----------
     answer : coroutine function of command and text
-        Does what is asked and returns what to say.
+        Carries out a command and returns the answer.
 
     Yields
     ------
@@ -56,7 +68,7 @@ async def serve(
     """
     token = secrets.token_hex(16)
     conversations: set[asyncio.Task[None]] = set()
-    silent: set[asyncio.Task[None]] = set()  # of them, who have not said anything yet
+    silent: set[asyncio.Task[None]] = set()  # those that have sent nothing yet
 
     async def converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -74,7 +86,7 @@ async def serve(
                 writer.write(json.dumps(reply, ensure_ascii=False).encode() + b"\n")
                 await writer.drain()
         except (TimeoutError, ConnectionError, ValueError):
-            pass  # Whoever it was has gone, or talks nonsense of any length.
+            pass  # the client has gone, or its line is too long
         except asyncio.CancelledError:
             writer.transport.abort()
         finally:
@@ -87,25 +99,27 @@ async def serve(
         yield int(server.sockets[0].getsockname()[1]), token
     finally:
         server.close()
-        # Who asked is answered, "stop" above all; who is silent is not waited for.
+        # Requests are still answered, above all "stop"; clients that are silent are dropped.
         for task in silent:
             task.cancel()
         if conversations:
-            _, unread = await asyncio.wait(conversations, timeout=_LAST_WORDS)
+            _, unread = await asyncio.wait(conversations, timeout=_FINAL_REPLY_TIMEOUT)
             for task in unread:
                 task.cancel()
         await server.wait_closed()
 
 
 async def _reply(
-    line: bytes, token: str, answer: Callable[[str, str], Awaitable[Answer]]
+    line: bytes, token: str, answer: Callable[[Command, str], Awaitable[Answer]]
 ) -> Answer:
     given, _, rest = line.decode(errors="replace").strip().partition(" ")
-    command, _, text = rest.partition(" ")
+    word, _, text = rest.partition(" ")
     if not hmac.compare_digest(given.encode(), token.encode()):
         return {"error": "wrong token"}
-    if command not in COMMANDS:
-        return {"error": f"unknown command {command!r}; expected one of {', '.join(COMMANDS)}"}
+    try:
+        command = Command(word)
+    except ValueError:
+        return {"error": f"unknown command {word!r}; expected one of {', '.join(Command)}"}
     return await answer(command, text)
 
 
@@ -115,10 +129,10 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     Parameters
     ----------
     recording : path, or (port, token)
-        The file it writes.
+        The file that the recorder writes, or the address in its attributes.
     command : {"stop", "mark", "status"}
     text : str
-        For ``mark``: what to write into the recording.
+        The remark of a ``mark``.
 
     Raises
     ------
@@ -127,7 +141,7 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     NoAnswerError
         If the recorder does not answer.
     ControlRefusedError
-        If it refuses.
+        If the recorder refuses.
     """
     control = recording if isinstance(recording, tuple) else _control_of(Path(recording))
     port, token = control
@@ -142,7 +156,7 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     except OSError as error:
         raise NotConnectedError(f"no recorder is writing {recording}: {error}") from error
     if not received:
-        raise NotConnectedError(f"the recorder on port {port} went away")
+        raise NotConnectedError(f"the recorder on port {port} closed the connection")
     answer: Answer = json.loads(received)
     if "error" in answer:
         raise ControlRefusedError(f"the recorder refused {command!r}: {answer['error']}")

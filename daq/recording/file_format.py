@@ -22,7 +22,7 @@ FORMAT = "huddle-recording"
 FORMAT_VERSION = 1
 
 NO_COUNTER = -1
-"""``device_counter`` of a block whose device has none."""
+"""``device_counter`` of a block without one."""
 
 BLOCK_DTYPE = np.dtype(
     [
@@ -49,7 +49,7 @@ EVENT_DTYPE = np.dtype(
     ]
 )
 
-# Columns of ``/committed``. Its last row counts events, and says whether the file was closed.
+# Columns of ``/committed``. The last row has the number of events, and whether the file is closed.
 ROWS, BLOCKS, GAPS = range(3)
 EVENTS, CLOSED = range(2)
 
@@ -60,20 +60,20 @@ EVENTS_PER_CHUNK = 64
 
 @dataclass(frozen=True, slots=True)
 class SensorLayout:
-    """How one sensor stands in a recording.
+    """One sensor of a recording.
 
     Attributes
     ----------
     name, model, serial_number, driver, port : str
-        As in the bench file, or as the device says.
+        As in the bench file, or as reported by the device.
     channels : tuple of Channel
         Columns of ``samples``.
     sampling_rate : float
-        In Hz; as read back from the device where it says, else nominal.
+        In Hz; as reported by the device, otherwise nominal.
     dtype : numpy dtype
         Of the raw counts.
     clock : str
-        Sensors of one clock name are sampled by one clock.
+        Sensors with the same name here are sampled by one clock.
     """
 
     name: str
@@ -103,7 +103,7 @@ class SensorLayout:
 
 
 def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
-    """Return channels as attributes of the samples."""
+    """Return channels as attributes of the dataset ``samples``."""
     return {
         "channels": [channel.name for channel in channels],
         "sensitivity": np.array([channel.sensitivity for channel in channels]),
@@ -115,7 +115,7 @@ def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
 
 
 def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py is untyped)
-    """Return the channels that :func:`channel_attributes` described."""
+    """Return the channels from the attributes that :func:`channel_attributes` made."""
     columns = zip(
         *(attributes[key] for key in ("channels", "sensitivity", "unit", "direction")),
         *(attributes[key] for key in ("auxiliary", "response")),
@@ -148,7 +148,7 @@ def _response_text(response: PolesZeros | None) -> str:
 
 
 def block_crc32(row: NDArray[np.void], counts_crc32: int) -> int:
-    """Return a block's checksum: over its counts, continued over its row up to ``crc32``.
+    """Return the checksum of a block: of its counts, continued over its row up to ``crc32``.
 
     Parameters
     ----------

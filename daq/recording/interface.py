@@ -1,4 +1,4 @@
-"""What an estimate reads: a recording in a file, or one made of arrays in memory."""
+"""Interface of recordings that can be estimated: files, and arrays in memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ReadableBlocks(Protocol):
 
     @property
     def clipped(self) -> NDArray[np.int64]:
-        """First sample and the one after the last of what is clipped, shape (n, 2); rising."""
+        """First sample, and the one after the last, of each clipped stretch; shape (n, 2)."""
 
 
 class ReadableSensor(Protocol):
@@ -35,19 +35,19 @@ class ReadableSensor(Protocol):
 
     @property
     def clock(self) -> str:
-        """Sensors of one clock name are sampled by one clock."""
+        """Sensors with the same name here are sampled by one clock."""
 
     @property
     def sampling_rate(self) -> float:
-        """In Hz, as the device says; nominal where it does not."""
+        """In Hz, as reported by the device; otherwise nominal."""
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """What each column of the counts is."""
+        """Channels, in the order of the columns of the counts."""
 
     @property
     def polled(self) -> bool:
-        """Whether the instant of every sample is known."""
+        """Whether the time of every sample is recorded."""
 
     @property
     def n_samples(self) -> int:
@@ -65,7 +65,7 @@ class ReadableSensor(Protocol):
         """Return raw counts, shape (last_row - first_row, n_channels)."""
 
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
-        """Return the host monotonic instants of samples, in ns, of a polled sensor."""
+        """Return the host monotonic time of each sample of a polled sensor, in ns."""
 
 
 class ReadableRecording(Protocol):
@@ -73,30 +73,30 @@ class ReadableRecording(Protocol):
 
     @property
     def path(self) -> Path:
-        """Its name in messages."""
+        """Name of the recording in messages."""
 
     @property
     def run_id(self) -> str:
-        """What tells this recording from every other."""
+        """Unique identifier of the recording."""
 
     @property
     def created_at(self) -> HostTime:
-        """When the recording was begun."""
+        """Start of the recording."""
 
     @property
     def bench(self) -> Bench | None:
-        """The bench it was recorded with, if there is one."""
+        """The bench that was recorded, if there is one."""
 
     @property
     def closed(self) -> bool:
-        """Whether nothing more will come."""
+        """Whether the recording is complete."""
 
     @property
     def sensors(self) -> tuple[ReadableSensor, ...]:
         """In the order of the bench."""
 
     def refresh(self) -> bool:
-        """Take over what was committed since; return whether there was anything."""
+        """Read what has been committed since the last call; return whether there was anything."""
 
     def close(self) -> None:
         """Close the file, if there is one."""

@@ -1,8 +1,8 @@
-"""Says to others that a recording is being written.
+"""Marks a recording as being written.
 
-HDF5's own lock goes when a writer turns to SWMR, so the writer holds a shared ``flock`` of its own:
-our readers take none, and other readers a shared one; but whoever opens the file for writing,
-plain h5py included, is refused. The lock goes with the process, however that ends.
+HDF5 releases its own lock when a writer switches to SWMR. So the writer holds a shared ``flock``:
+our readers take no lock, other readers a shared one, and programs that open the file for writing,
+plain h5py included, are refused. The lock ends with the process, however the process ends.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class WriterLock:
             fcntl.flock(self._handle, fcntl.LOCK_SH)
 
     def release(self) -> None:
-        """Let go; more than once is fine."""
+        """Release the lock; may be called again."""
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
@@ -35,7 +35,7 @@ class WriterLock:
 
 def is_being_written(path: Path) -> bool:
     """Return whether a living process is writing this recording."""
-    if sys.platform == "win32":  # No protection beyond HDF5's own.
+    if sys.platform == "win32":  # no protection beyond HDF5's own
         return False
     handle = os.open(path, os.O_RDONLY)
     try:

@@ -1,7 +1,7 @@
-"""Reads a recording: growing, killed or closed, by the same code.
+"""Reads recordings: growing ones, those of a killed recorder, and closed ones, by the same code.
 
-A file is opened as a SWMR reader, which works in all three states. What ``/committed`` counts is
-what there is; longer datasets are a tail that was never acknowledged.
+A file is opened as a SWMR reader, which works in all three cases. A recording has the rows that
+``/committed`` counts; rows beyond these were never acknowledged.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Channel
 
 
-class _Rows:
-    """The committed rows of a table, read once each."""
+class _CommittedRows:
+    """The committed rows of a table; each is read once."""
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._dataset = dataset
         self._parts: list[NDArray[np.void]] = []
         self.n_rows = 0
 
-    def take(self, n_rows: int) -> None:
-        """Read up to ``n_rows``."""
+    def extend(self, n_rows: int) -> None:
+        """Read further rows, up to ``n_rows`` in all."""
         if n_rows > self.n_rows:
             self._dataset.refresh()
             part = self._dataset[self.n_rows : n_rows]
@@ -62,7 +62,7 @@ class _Rows:
 
 
 class SensorRecord:
-    """What has been committed of one sensor; grows when its recording is refreshed."""
+    """The committed data of one sensor; grows when its recording is refreshed."""
 
     def __init__(self, group: h5py.Group) -> None:
         attributes = group.attrs
@@ -72,9 +72,9 @@ class SensorRecord:
         self.driver: str = attributes["driver"]
         self.port: str = attributes["port"]
         self.clock: str = attributes["clock"]
-        """Sensors of one clock name are sampled by one clock."""
+        """Sensors with the same name here are sampled by one clock."""
         self.sampling_rate = float(attributes["sampling_rate"])
-        """In Hz, as the device says; nominal where it does not."""
+        """In Hz, as reported by the device; otherwise nominal."""
         self._samples: h5py.Dataset = group["samples"]
         self._instants: h5py.Dataset = group["instants"]
         self.channels: tuple[Channel, ...] = file_format.channels_of(self._samples.attrs)
@@ -82,18 +82,18 @@ class SensorRecord:
         self._sample_rows = ChunkedRows(self._samples)
         self._instant_rows = ChunkedRows(self._instants)
         self.blocks = BlockTable(group["blocks"])
-        self._gaps = _Rows(group["gaps"])
+        self._gaps = _CommittedRows(group["gaps"])
         self.n_samples = 0
         """Number of committed rows of samples."""
 
     @property
     def polled(self) -> bool:
-        """Whether the instant of every sample is known; False as long as there are no samples."""
+        """Whether the time of every sample is recorded; False as long as there are no samples."""
         return bool(self.n_samples > 0 and self._instants.shape[0] >= self.n_samples)
 
     @property
     def n_written(self) -> int:
-        """Number of rows in the file, those never committed included."""
+        """Number of rows of samples in the file, including those never committed."""
         return int(self._samples.shape[0])
 
     @property
@@ -107,7 +107,7 @@ class SensorRecord:
         Parameters
         ----------
         first_row, last_row : int
-            Rows, ``last_row`` not included; up to ``n_samples`` if not given.
+            Rows, without ``last_row``; up to ``n_samples`` if not given.
 
         Returns
         -------
@@ -116,24 +116,24 @@ class SensorRecord:
         Raises
         ------
         IndexError
-            If these rows were not committed.
+            If these rows are not committed.
         RecordingError
             If the file is damaged there.
         """
         return self._read(self._sample_rows, first_row, last_row)
 
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
-        """Return the host monotonic instants of samples, in ns, of a polled sensor.
+        """Return the host monotonic time of each sample of a polled sensor, in ns.
 
         Raises
         ------
         IndexError
-            If these rows were not committed.
+            If these rows are not committed.
         RecordingError
             If the sensor is not polled, or the file damaged.
         """
         if not self.polled:
-            raise RecordingError(f"sensor {self.name!r} has no instants of single samples")
+            raise RecordingError(f"sensor {self.name!r} has no sample times")
         return self._read(self._instant_rows, first_row, last_row)
 
     def _read(self, rows: ChunkedRows, first_row: int, last_row: int | None) -> NDArray[Any]:
@@ -151,11 +151,11 @@ class SensorRecord:
                 f" {first_row} and {last_row}: {error}"
             ) from error
 
-    def take(self, counts: NDArray[np.int64]) -> bool:
-        """Take over what was committed (a row of ``/committed``); return whether that is news."""
+    def extend(self, counts: NDArray[np.int64]) -> bool:
+        """Add what a row of ``/committed`` counts; return whether anything is new."""
         before = self.n_samples, self._gaps.n_rows
-        self.blocks.take(int(counts[file_format.BLOCKS]), int(counts[file_format.ROWS]))
-        self._gaps.take(int(counts[file_format.GAPS]))
+        self.blocks.extend(int(counts[file_format.BLOCKS]), int(counts[file_format.ROWS]))
+        self._gaps.extend(int(counts[file_format.GAPS]))
         if self.blocks.n_samples > self.n_samples:
             self._samples.refresh()
             self._instants.refresh()
@@ -182,37 +182,37 @@ class Recording:
         self.bench_text: str = attributes["bench"]
         duration = attributes.get("duration")
         self.duration = None if duration is None else float(duration)
-        """Seconds for which it was to be; None: until it was stopped."""
+        """Planned length in seconds; None where it was to last until stopped."""
         self._committed: h5py.Dataset = file["committed"]
         self.sensors = tuple(
             SensorRecord(file["sensors"][name]) for name in self._committed.attrs["sensors"]
         )
         """In the order of the bench."""
-        self._events = _Rows(file["events"])
+        self._events = _CommittedRows(file["events"])
         self.closed = False
-        """Whether it was closed properly: nothing more will come."""
+        """Whether the recording was closed properly, and so is complete."""
         self.refresh()
 
     @classmethod
-    def open(cls, path: str | Path, *, alone: bool = False) -> Recording:
-        """Open a recording, whether it grows, was killed, or is closed.
+    def open(cls, path: str | Path, *, isolated: bool = False) -> Recording:
+        """Open a recording: growing, closed, or left open by a killed recorder.
 
         Parameters
         ----------
-        alone : bool
-            Read a file that nobody is writing by itself. HDF5 lets all readers of a file in one
-            process share what it remembers of it; beside a reader that has not been refreshed, a
-            second one may see zeros where there are samples.
+        isolated : bool
+            Share no cached metadata with other readers in this process, if no process is writing
+            the file. HDF5 shares it among all readers of a file: beside a reader that has not been
+            refreshed, a second one may read zeros in place of samples.
 
         Raises
         ------
         NotARecordingError
-            If it is something else, truncated, or of a newer format.
+            If the file is something else, truncated, or of a newer format.
         RecordingError
-            If it cannot be read.
+            If the file cannot be read.
         """
         path = Path(path)
-        file = _open_file(path, alone=alone)
+        file = _open_file(path, isolated=isolated)
         try:
             check_format(path, file)
             return cls(path, file)
@@ -220,11 +220,11 @@ class Recording:
             file.close()
             if isinstance(error, RecordingError):
                 raise
-            raise NotARecordingError(f"{path}: a damaged recording: {error}") from error
+            raise NotARecordingError(f"{path}: the recording is damaged: {error}") from error
 
     @property
     def bench(self) -> Bench | None:
-        """The bench it was recorded with; None for recordings from elsewhere."""
+        """The bench that was recorded; None for recordings from elsewhere."""
         if not self.bench_text:
             return None
         with contextlib.suppress(BenchFileError):
@@ -233,11 +233,11 @@ class Recording:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """What has happened so far."""
+        """All events so far."""
         return self.events_from(0)
 
     def events_from(self, first: int) -> tuple[Event, ...]:
-        """Return what has happened since there were ``first`` events."""
+        """Return all events but the first ``first`` ones."""
         return tuple(
             Event(
                 sensor=row["sensor"].decode(),
@@ -256,7 +256,7 @@ class Recording:
         raise KeyError(name)
 
     def results(self) -> dict[str, tuple[dict[str, NDArray[Any]], dict[str, Any]]]:
-        """Return what was written when the run was closed: arrays and attributes by method."""
+        """Return the stored results: arrays and attributes by method."""
         group = self._file.get("results", {})
         return {
             method: ({key: entry[key][...] for key in entry}, dict(entry.attrs))
@@ -264,7 +264,7 @@ class Recording:
         }
 
     def refresh(self) -> bool:
-        """Take over what was committed since; return whether there was anything.
+        """Read what has been committed since the last call; return whether there was anything.
 
         Raises
         ------
@@ -276,15 +276,15 @@ class Recording:
         try:
             self._committed.refresh()
             counts: NDArray[np.int64] = self._committed[...]
-            news = [s.take(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
+            is_new = [s.extend(row) for s, row in zip(self.sensors, counts[:-1], strict=True)]
             n_events = self._events.n_rows
-            self._events.take(int(counts[-1, file_format.EVENTS]))
+            self._events.extend(int(counts[-1, file_format.EVENTS]))
         except RecordingError:
             raise
         except (OSError, RuntimeError) as error:
-            raise RecordingError(f"{self.path}: a damaged recording: {error}") from error
+            raise RecordingError(f"{self.path}: the recording is damaged: {error}") from error
         self.closed = bool(counts[-1, file_format.CLOSED])
-        return any(news) or self._events.n_rows > n_events or self.closed
+        return any(is_new) or self._events.n_rows > n_events or self.closed
 
     def close(self) -> None:
         """Close the file."""
@@ -302,19 +302,19 @@ class Recording:
         self.close()
 
 
-def _open_file(path: Path, *, alone: bool) -> h5py.File:
+def _open_file(path: Path, *, isolated: bool) -> h5py.File:
     superblock = Superblock.of(path)
     at_rest = not is_being_written(path)
-    cut_short = superblock.end > superblock.n_bytes and at_rest
-    if cut_short and not superblock.is_open:
+    is_truncated = superblock.end > superblock.n_bytes and at_rest
+    if is_truncated and not superblock.is_open:
         raise NotARecordingError(
-            f"{path}: truncated: {superblock.n_bytes} of {superblock.end} bytes are there;"
-            " fetch it again"
+            f"{path}: truncated: {superblock.n_bytes} of {superblock.end} bytes; copy the file"
+            " again"
         )
     try:
-        if cut_short or (alone and at_rest and superblock.version == 3):
-            # Of a killed file that lost its end, a SWMR reader would try to read that again and
-            # again, in case the writer is about to complete it.
+        if is_truncated or (isolated and at_rest and superblock.version == 3):
+            # Where a killed recorder's file lost its end, a SWMR reader would retry for long, in
+            # case a writer is about to complete it.
             return h5py.File(ClearedFile(path, superblock), "r")
         return h5py.File(path, "r", libver="latest", swmr=True, locking=False)
     except (OSError, RuntimeError) as error:
@@ -322,31 +322,30 @@ def _open_file(path: Path, *, alone: bool) -> h5py.File:
 
 
 def check_format(path: Path, file: h5py.File) -> None:
-    """Refuse HDF5 files that are no recordings, and formats newer than this program."""
+    """Raise NotARecordingError for other HDF5 files, and for formats newer than this program."""
     found = file.attrs.get("format")
     if found != file_format.FORMAT:
-        what = "it does not say what it is" if found is None else f"it says format={found!r}"
+        what = "it has no attribute format" if found is None else f"its format is {found!r}"
         raise NotARecordingError(
             f"{path}: an HDF5 file but not a huddle recording: {what};"
-            f" expected format={file_format.FORMAT!r}"
+            f" expected {file_format.FORMAT!r}"
         )
     number = file.attrs.get("format_version")
     if not isinstance(number, (int, np.integer)) or number < 1:
         raise NotARecordingError(f"{path}: format_version {number!r}; expected 1")
     if number > file_format.FORMAT_VERSION:
         raise NotARecordingError(
-            f"{path}: written by a newer huddle (format {number}); this one reads up to"
-            f" format {file_format.FORMAT_VERSION}: update it"
+            f"{path}: written by a newer version of huddle (format {number}); this version reads"
+            f" formats up to {file_format.FORMAT_VERSION}: update huddle"
         )
 
 
 def control_address(path: str | Path) -> tuple[int, str] | None:
-    """Return port and token of the recorder that writes a recording; None if it was closed.
+    """Return port and token of the recorder that writes a recording; None if it is closed.
 
-    Safe beside a reader that follows the file in the same process, as a second ``Recording`` is
-    not: HDF5 would let the two share what it remembers of a file that grows, and the first then
-    fails or sees zeros. So the file is read here as it is at this instant, and only what never
-    moves in it.
+    Safe beside a reader that follows the file in the same process, unlike a second ``Recording``:
+    HDF5 would share the metadata of the growing file, and the first reader would fail or read
+    zeros. This function reads the file without that cache, and only parts that never move.
 
     Raises
     ------
@@ -365,4 +364,4 @@ def control_address(path: str | Path) -> tuple[int, str] | None:
     except (KeyError, OSError, RuntimeError, ValueError) as error:
         if isinstance(error, RecordingError):
             raise
-        raise NotARecordingError(f"{path}: a damaged recording: {error}") from error
+        raise NotARecordingError(f"{path}: the recording is damaged: {error}") from error

@@ -1,9 +1,9 @@
-"""Checks recordings, closes those whose recorder was killed, and adds results to closed ones.
+"""Verifies recordings, closes those that a killed recorder left open, and stores results.
 
 Theory of operation
 -------------------
-Nothing here changes a recording in place. A copy beside it is changed, fsynced and renamed over the
-original, so that at any instant there is one good file under its name.
+A recording is never changed in place. A copy beside it is changed, fsynced and renamed over the
+original, so that there is always one intact file under the name.
 """
 
 from __future__ import annotations
@@ -35,15 +35,22 @@ if TYPE_CHECKING:
 
     from daq.protocols.block import HostTime
 
-_ROWS_AT_ONCE = 1 << 18
+_ROWS_PER_READ = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
-class SensorReport:
-    """What a recording holds of one sensor.
+class SensorVerification:
+    """The data of one sensor in a recording.
 
-    ``bad_blocks`` are indices of committed blocks whose checksum is wrong or that cannot be read;
-    ``n_uncommitted`` rows were written but never acknowledged, and are not returned as samples.
+    Attributes
+    ----------
+    name : str
+    n_samples, n_blocks, n_gaps : int
+        Committed.
+    bad_blocks : tuple of int
+        Indices of committed blocks that have a wrong checksum or cannot be read.
+    n_uncommitted : int
+        Rows that were written and never acknowledged; they are not part of the recording.
     """
 
     name: str
@@ -55,47 +62,47 @@ class SensorReport:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
-    """What a recording holds."""
+class Verification:
+    """The data in a recording, and whether they are intact."""
 
     path: Path
     closed: bool
     being_written: bool
-    sensors: tuple[SensorReport, ...]
+    sensors: tuple[SensorVerification, ...]
     n_events: int
 
     @property
     def intact(self) -> bool:
-        """Whether every committed block is what was written."""
+        """Whether all committed blocks have their checksums."""
         return not any(sensor.bad_blocks for sensor in self.sensors)
 
 
-def verify(path: str | Path) -> Report:
-    """Check every committed block against its checksum.
+def verify(path: str | Path) -> Verification:
+    """Check the checksums of all committed blocks.
 
     Raises
     ------
     NotARecordingError, RecordingError
-        If it is no recording, or cannot be read at all.
+        If the file is no recording, or cannot be read at all.
     """
     path = Path(path)
     being_written = is_being_written(path) if path.is_file() else False
-    with Recording.open(path, alone=True) as recording:
+    with Recording.open(path, isolated=True) as recording:
         sensors = tuple(_verify_sensor(sensor) for sensor in recording.sensors)
-        return Report(path, recording.closed, being_written, sensors, len(recording.events))
+        return Verification(path, recording.closed, being_written, sensors, len(recording.events))
 
 
-def heal(path: str | Path, *, now: HostTime | None = None) -> Report:
-    """Close a recording whose recorder was killed: its uncommitted tail goes, the rest stays.
+def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
+    """Close a recording that a killed recorder left open; uncommitted rows are removed.
 
-    A recording that was closed is left as it is.
+    A closed recording is not changed.
 
     Raises
     ------
     NotARecordingError
-        If it is no recording.
+        If the file is no recording.
     RecordingError
-        If a recorder is writing it, or the copy cannot be written.
+        If a recorder is writing the file, or the copy cannot be written.
     """
     path = Path(path)
     report = verify(path)
@@ -103,7 +110,7 @@ def heal(path: str | Path, *, now: HostTime | None = None) -> Report:
         return report
     if report.being_written:
         raise RecordingError(
-            f"{path}: is being written, or open in another program; stop that first"
+            f"{path}: another program is writing it or has it open; stop that program first"
         )
     now = SystemClock().now() if now is None else now
     with _replaced(path) as copy:
@@ -136,10 +143,10 @@ def write_results(
         If a recorder is writing the file, or it cannot be written.
     """
     path = Path(path)
-    with Recording.open(path, alone=True) as recording:
+    with Recording.open(path, isolated=True) as recording:
         closed = recording.closed
     if not closed:
-        heal(path)
+        repair(path)
     with _replaced(path) as copy, h5py.File(copy, "r+", libver=LIBVER) as file:
         if "results" in file:
             del file["results"]
@@ -150,10 +157,10 @@ def write_results(
             group.attrs.update(attributes)
 
 
-def _verify_sensor(sensor: SensorRecord) -> SensorReport:
+def _verify_sensor(sensor: SensorRecord) -> SensorVerification:
     blocks = sensor.blocks
     bad = [number for number, row in enumerate(blocks) if not _is_intact(sensor, row)]
-    return SensorReport(
+    return SensorVerification(
         name=sensor.name,
         n_samples=sensor.n_samples,
         n_blocks=len(blocks),
@@ -167,15 +174,15 @@ def _is_intact(sensor: SensorRecord, row: NDArray[np.void]) -> bool:
     crc32 = 0
     first, end = int(row["first_row"]), int(row["first_row"] + row["n_samples"])
     try:
-        for start in range(first, end, _ROWS_AT_ONCE):
-            counts = sensor.counts(start, min(start + _ROWS_AT_ONCE, end))
+        for start in range(first, end, _ROWS_PER_READ):
+            counts = sensor.counts(start, min(start + _ROWS_PER_READ, end))
             crc32 = zlib.crc32(np.ascontiguousarray(counts).data, crc32)
     except (RecordingError, IndexError):
         return False
     return bool(file_format.block_crc32(row, crc32) == row["crc32"])
 
 
-def _cut_to_committed(file: h5py.File, report: Report) -> None:
+def _cut_to_committed(file: h5py.File, report: Verification) -> None:
     for sensor in report.sensors:
         group = file["sensors"][sensor.name]
         group["samples"].resize(sensor.n_samples, axis=0)
@@ -185,9 +192,9 @@ def _cut_to_committed(file: h5py.File, report: Report) -> None:
         group["gaps"].resize(sensor.n_gaps, axis=0)
 
 
-def _add_last_events(file: h5py.File, report: Report, now: HostTime) -> None:
-    """Say in the file what happened to it, and that it is closed."""
-    lines = [("", EventKind.STOPPED, "the recorder was killed; closed by repair")]
+def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> None:
+    """Record the repair as events, and mark the file as closed."""
+    lines = [("", EventKind.STOPPED, "the recorder was killed; the recording was repaired")]
     lines += [
         (
             sensor.name,
@@ -211,7 +218,7 @@ def _add_last_events(file: h5py.File, report: Report, now: HostTime) -> None:
 
 @contextlib.contextmanager
 def _replaced(path: Path) -> Iterator[Path]:
-    """Give a copy to change; it takes the original's place when all went well."""
+    """Yield a copy to be changed; it replaces the original if no error occurs."""
     copy = path.with_name(f".{path.name}.copy")
     try:
         shutil.copyfile(path, copy)
@@ -224,7 +231,7 @@ def _replaced(path: Path) -> Iterator[Path]:
         raise
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise RecordingError(
-            f"{path}: cannot be rewritten ({error}); it stays as it was"
+            f"{path}: cannot be rewritten ({error}); it was not changed"
         ) from error
     finally:
         copy.unlink(missing_ok=True)

@@ -1,9 +1,10 @@
-"""The first 48 bytes of a recording, which say where it ends and whether somebody writes it.
+"""The superblock of a recording: where the file ends, and whether a program is writing it.
 
 A killed SWMR writer leaves flags in the superblock that forbid a plain open, and an end-of-file
-address that may be too small or, on a full disk, too large. Clearing the flags alone lets HDF5 cut
-the file there; so flags, end-of-file and checksum are rewritten together. (Version 3 of the
-superblock, HDF5 file format specification II.A; all recordings have it.)
+address that may be too small or, on a full disk, too large. If only the flags are cleared, HDF5
+truncates the file at that address. So flags, end-of-file address and checksum are rewritten
+together. All recordings have version 3 of the superblock (HDF5 file format specification, II.A), in
+the first 48 bytes.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ _MASK = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class Superblock:
-    """What a file's first bytes say, and how long it is."""
+    """The first bytes of a file, and its length."""
 
     head: bytes
     n_bytes: int
 
     @classmethod
     def of(cls, path: Path) -> Superblock:
-        """Read it.
+        """Read the superblock of a file.
 
         Raises
         ------
         RecordingError
             If the file cannot be read.
         NotARecordingError
-            If it is no HDF5 file, or shorter than any.
+            If it is no HDF5 file, or shorter than a superblock.
         """
         try:
             with path.open("rb") as file:
@@ -50,24 +51,24 @@ class Superblock:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
         if head[: len(SIGNATURE)] != SIGNATURE:
-            raise NotARecordingError(f"{path}: not a huddle recording, not even an HDF5 file")
+            raise NotARecordingError(f"{path}: not a huddle recording; expected an HDF5 file")
         if n_bytes < _SIZE:
-            raise NotARecordingError(f"{path}: truncated: only {n_bytes} bytes are there")
+            raise NotARecordingError(f"{path}: truncated to {n_bytes} bytes; copy the file again")
         return cls(head, n_bytes)
 
     @property
     def version(self) -> int:
-        """3 for recordings; foreign HDF5 files have others."""
+        """3 for recordings; other HDF5 files may have another."""
         return self.head[8]
 
     @property
     def end(self) -> int:
-        """How long the file should be, in bytes; 0 where this version does not say it here."""
+        """Length of the file in bytes, as the superblock has it; 0 in other versions."""
         return int(_FIELDS.unpack_from(self.head)[_END]) if self.version == 3 else 0
 
     @property
     def is_open(self) -> bool:
-        """Whether it was not closed by who wrote it."""
+        """Whether the program that wrote the file has not closed it."""
         return self.version == 3 and _FIELDS.unpack_from(self.head)[_FLAGS] != 0
 
     def cleared(self) -> bytes:

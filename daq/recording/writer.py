@@ -1,16 +1,17 @@
-"""Writes a recording so that what was acknowledged survives kill -9 and power loss.
+"""Writes a recording so that acknowledged data survive kill -9 and power loss.
 
 Theory of operation
 -------------------
-All groups, datasets and attributes are made under a temporary name; then the file becomes SWMR
-(single writer, multiple readers) and gets its own name, so a recording never exists half made.
-From then on rows are only added. Samples go to disk in whole compressed chunks, never in parts,
-which would be rewritten elsewhere and inflate the file; so a sample waits up to one chunk.
+All groups, datasets and attributes are made under a temporary name. Then the file is switched to
+SWMR (single writer, multiple readers) and renamed, so that an incomplete recording never has the
+final name. From then on rows are only appended. Samples are written in whole compressed chunks:
+partial chunks would be rewritten elsewhere and inflate the file. So a sample is buffered for up to
+the length of one chunk.
 
-``commit`` flushes and fsyncs what was added, then writes how much that is to ``/committed``,
-fsyncs again, and only then acknowledges. ``/committed`` has fixed size and place. A crash in the
-middle of writing it leaves some of its numbers old and some new, each of which counts rows that
-are safely there; readers cut all datasets of a sensor where the shortest ends.
+``commit`` flushes and fsyncs the appended rows, then writes their numbers to ``/committed``, fsyncs
+again, and only then acknowledges. ``/committed`` has a fixed size and place. If a crash interrupts
+its writing, some numbers are old and some new; each counts rows that are safe. Readers cut all
+datasets of a sensor to the shortest.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import numpy as np
 
 from daq.errors import RecordingError
 from daq.recording import file_format
-from daq.recording.chunk_writer import SensorRows, Table
+from daq.recording.chunk_writer import SensorRows, TableBuffer
 from daq.recording.locking import WriterLock, is_being_written
 
 if TYPE_CHECKING:
@@ -42,12 +43,12 @@ if TYPE_CHECKING:
     from daq.recording.file_format import SensorLayout
 
 LIBVER = ("v110", "v110")
-_LEAST_CHUNK_ROWS = 64
+_MIN_CHUNK_ROWS = 64
 
 
 @dataclass(frozen=True, slots=True)
 class SensorCounts:
-    """How much of one sensor is safely on disk."""
+    """Numbers of rows of one sensor that are safe on disk."""
 
     rows: int
     blocks: int
@@ -56,7 +57,7 @@ class SensorCounts:
 
 @dataclass(frozen=True, slots=True)
 class Committed:
-    """What is safely on disk: the acknowledgment."""
+    """An acknowledgment: what is safe on disk."""
 
     sensors: dict[str, SensorCounts]
     events: int
@@ -64,7 +65,7 @@ class Committed:
 
 
 class RecordingWriter:
-    """The one writer of a recording; not thread-safe, but may be used from any one thread."""
+    """Writes one recording; not thread-safe, but may be used from any single thread."""
 
     def __init__(
         self, path: Path, file: h5py.File, sensors: Sequence[SensorLayout], lock: WriterLock
@@ -74,7 +75,7 @@ class RecordingWriter:
         self._file = file
         self._lock = lock
         self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
-        self._events = Table(file["events"])
+        self._events = TableBuffer(file["events"])
         self._committed = file["committed"]
         self._failed = False
 
@@ -98,17 +99,17 @@ class RecordingWriter:
         path : path
             Must not exist; its directory is made.
         bench : Bench, optional
-            What is recorded.
+            The bench that is recorded.
         sensors : sequence of SensorLayout
             In the order of the bench.
         created : HostTime
-            Now.
+            The current time.
         control : (port, token), optional
-            Where the writing recorder takes commands (:mod:`daq.recording.control`).
+            Address for commands to the recorder (:mod:`daq.recording.control`).
         attributes : dict, optional
             More attributes of the file, such as its origin.
         chunk_seconds : float
-            Length of a chunk; longer ones read faster, but a sample waits that long.
+            Length of a chunk. Longer chunks are read faster, but samples are buffered longer.
         hidden : bool
             Keep the temporary name until `close`, for a recording that is not to be seen before it
             is complete; `abandon` then removes it.
@@ -127,10 +128,10 @@ class RecordingWriter:
             raise RecordingError(f"{path}: another process is writing it; expected a new file")
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Little cache: chunks are written whole and never looked at again.
+            # A small cache: chunks are written whole and not read again.
             file = h5py.File(temporary, "w", libver=LIBVER, rdcc_nbytes=64 * 1024, locking=False)
             try:
-                _describe(file, bench, created, control, attributes or {})
+                _write_attributes(file, bench, created, control, attributes or {})
                 _make_datasets(file, sensors, chunk_seconds)
                 file.swmr_mode = True
                 writer = cls(path, file, sensors, WriterLock(temporary))
@@ -149,11 +150,11 @@ class RecordingWriter:
 
     @property
     def n_written(self) -> int:
-        """Rows of samples in whole chunks, of all sensors, committed or not."""
+        """Number of rows of samples of all sensors in the file, committed or not."""
         return sum(sensor.samples.n_written for sensor in self._sensors.values())
 
     def append(self, block: Block) -> None:
-        """Take a block; it is safe once a later ``commit`` counts it."""
+        """Add a block; it is safe once a later ``commit`` counts it."""
         with self._guarded():
             self._sensors[block.sensor].append(block)
 
@@ -161,7 +162,7 @@ class RecordingWriter:
         self, sensor: str, first_sample: int, missing: int, *, reason: str, estimated: bool = False
     ) -> None:
         """Record that samples from ``first_sample`` on are missing."""
-        row = (first_sample, missing, estimated, _fixed(reason, 100))
+        row = (first_sample, missing, estimated, _field(reason, 100))
         self._sensors[sensor].gaps.add(np.array([row], file_format.GAP_DTYPE))
 
     def event(self, event: Event) -> None:
@@ -169,30 +170,30 @@ class RecordingWriter:
         row = (
             event.received.monotonic_ns,
             event.received.utc_ns,
-            _fixed(event.sensor, 64),
-            _fixed(event.kind, 32),
-            _fixed(event.text, 200),
+            _field(event.sensor, 64),
+            _field(event.kind, 32),
+            _field(event.text, 200),
         )
         self._events.add(np.array([row], file_format.EVENT_DTYPE))
 
     def commit(self) -> Committed:
-        """Make safe what can be made safe, then say how much that is.
+        """Make all complete chunks safe on disk, and return what is safe.
 
         Raises
         ------
         RecordingError
-            If it cannot be written (disk full, device gone); what earlier commits acknowledged
-            stays.
+            If the file cannot be written (disk full, device removed); what earlier commits
+            acknowledged stays.
         """
         return self._commit(closed=False)
 
     def close(self) -> Committed:
-        """Write everything, commit it, and close the file.
+        """Write and commit everything, and close the file.
 
         Raises
         ------
         RecordingError
-            If it cannot be written; the file is closed all the same.
+            If the file cannot be written; it is closed all the same.
         """
         try:
             with self._guarded():
@@ -209,7 +210,7 @@ class RecordingWriter:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close the file without writing what waits; ``commit`` has what is safe."""
+        """Close the file without writing buffered rows."""
         try:
             self._close_file()
         finally:
@@ -251,9 +252,9 @@ class RecordingWriter:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Turn what HDF5 raises into RecordingError, and write nothing after a failure."""
+        """Convert errors of HDF5 to RecordingError, and refuse to write after a failure."""
         if self._failed:
-            raise RecordingError(f"{self.path}: writing failed before")
+            raise RecordingError(f"{self.path}: cannot be written: an earlier write failed")
         try:
             with _as_recording_error(self.path):
                 yield
@@ -269,9 +270,9 @@ def _as_recording_error(path: Path) -> Iterator[None]:
     except RecordingError:
         raise
     except (OSError, RuntimeError) as error:
-        # HDF5 reports a full disk as RuntimeError, with the system's message within its own.
-        system = re.search(r"error message = '([^']+)'", str(error))
-        reason = system[1] if system else error
+        # HDF5 raises RuntimeError for a full disk, with the system's message only in its text.
+        found = re.search(r"error message = '([^']+)'", str(error))
+        reason = found[1] if found else error
         raise RecordingError(f"{path}: cannot be written: {reason}") from error
 
 
@@ -290,12 +291,12 @@ def _publish(temporary: Path, path: Path) -> None:
     sync_directory(path.parent)
 
 
-def _fixed(text: str, n_bytes: int) -> bytes:
+def _field(text: str, n_bytes: int) -> bytes:
     """Return text as UTF-8 of at most ``n_bytes``, not cut within a character."""
     return text.encode()[:n_bytes].decode(errors="ignore").encode()
 
 
-def _describe(
+def _write_attributes(
     file: h5py.File,
     bench: Bench | None,
     created: HostTime,
@@ -333,9 +334,9 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
             group.attrs[key] = getattr(sensor, key)
         n_channels = len(sensor.channels)
-        # Every chunk costs its reader some 10 µs, however small: at low rates rather two seconds.
-        least = min(_LEAST_CHUNK_ROWS, round(2 * sensor.sampling_rate))
-        n_rows = max(4, least, round(sensor.sampling_rate * chunk_seconds))
+        # Reading a chunk takes at least 10 µs, so at low rates a chunk has two seconds.
+        min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))
+        n_rows = max(4, min_rows, round(sensor.sampling_rate * chunk_seconds))
         filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
         samples = group.create_dataset(
             "samples",
@@ -347,7 +348,7 @@ def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_secon
             **filters,
         )
         samples.attrs.update(file_format.channel_attributes(sensor.channels))
-        # Stays empty unless the sensor is polled.
+        # Remains empty unless the sensor is polled.
         instants = group.create_dataset(
             "instants",
             shape=(0,),
@@ -372,7 +373,7 @@ def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int)
 
 
 def sync_directory(path: Path) -> None:
-    """Make a new name in a directory survive a power loss (Windows has no way to ask for it)."""
+    """Make the names in a directory survive a power loss (not possible on Windows)."""
     if sys.platform == "win32":
         return
     handle = os.open(path, os.O_RDONLY)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from daq.errors import RecordingError
-from daq.recording.repair import heal, verify
+from daq.recording.repair import repair, verify
 from tui.output.console import for_people, write_json
 from tui.output.results import plain
 
@@ -23,7 +23,7 @@ def repair_recording(path: Path, *, check: bool, json: str | None) -> None:
     RecordingError
         A recorder is writing it, or acknowledged blocks are damaged.
     """
-    report = verify(path) if check else heal(path)
+    report = verify(path) if check else repair(path)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")
     for name in ("samples", "blocks", "gaps", "damaged blocks", "rows never acknowledged"):

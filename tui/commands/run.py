@@ -20,7 +20,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.follow import RecordingLeftOpenError, follow
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
-from daq.recording.repair import heal
+from daq.recording.repair import repair
 from daq.results.band_summary import reached_cov
 from daq.results.store import store_results
 from estimator.errors import EstimatorError
@@ -144,7 +144,7 @@ def result_of(
     if snapshot is None:
         _LOGGER.error("%s: the recorder ended without closing it", recorder.out)
         try:
-            heal(recorder.out)
+            repair(recorder.out)
         except HuddleError as error:  # a full disk; the file can be read all the same
             _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
         snapshot = estimate([recorder.out], settings)

@@ -94,7 +94,7 @@ def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
 
 
 def _source(path: Path) -> Source:
-    with Recording.open(path, alone=True) as recording:
+    with Recording.open(path, isolated=True) as recording:
         created = recording.created_at.utc_ns
         last = max(
             (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),

@@ -19,7 +19,7 @@ from daq.bench.model import Bench
 from daq.protocols.epson import commands
 from daq.recording.control import ask
 from daq.recording.reader import Recording
-from daq.recording.repair import heal, verify
+from daq.recording.repair import repair, verify
 from daq.recording.sensor_state import SensorState
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving
@@ -130,7 +130,7 @@ def test_killed_in_the_middle_nothing_acknowledged_is_lost(
     assert not report.closed
     assert report.intact
     assert all(sensor.n_samples >= least[sensor.name] for sensor in report.sensors)
-    assert heal(path).closed
+    assert repair(path).closed
     check_against_truth(path)
 
 
@@ -215,7 +215,7 @@ if (
                     os.kill(process.pid, signal.SIGKILL)
                 found = verify(target)
                 assert found.intact, number
-                assert heal(target).closed
+                assert repair(target).closed
                 assert verify(target).intact
                 samples += sum(sensor.n_samples for sensor in found.sensors)
                 blocks += sum(sensor.n_blocks for sensor in found.sensors)

@@ -37,7 +37,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[h5py.Dataset]:
 
 def test_a_table_is_indexed_like_an_array(dataset: h5py.Dataset) -> None:
     table, rows = BlockTable(dataset), dataset[:]
-    table.take(90_000, LENGTH * N_BLOCKS)
+    table.extend(90_000, LENGTH * N_BLOCKS)
     assert len(table) == 90_000
     rows = rows[:90_000]
     for slices in (slice(17, 20_000), slice(89_999, None), slice(-3, None), slice(5, 2)):
@@ -51,17 +51,17 @@ def test_a_table_is_indexed_like_an_array(dataset: h5py.Dataset) -> None:
 def test_only_blocks_whose_samples_are_there_count(dataset: h5py.Dataset) -> None:
     table = BlockTable(dataset)
     for n_rows, n_samples, whole in ((5, 29, 2), (5, 30, 3), (40_000, 399_999, 39_999)):
-        table.take(n_rows, n_samples)
+        table.extend(n_rows, n_samples)
         assert (len(table), table.n_samples) == (whole, LENGTH * whole)
     with pytest.raises(RecordingError, match="100000 rows where 100001 were committed"):
-        table.take(N_BLOCKS + 1, LENGTH * (N_BLOCKS + 1))
+        table.extend(N_BLOCKS + 1, LENGTH * (N_BLOCKS + 1))
 
 
 def test_what_is_clipped_is_known_without_reading_again(dataset: h5py.Dataset) -> None:
     table = BlockTable(dataset)
     assert table.clipped.shape == (0, 2)
     for n_rows in (105, N_BLOCKS):
-        table.take(n_rows, LENGTH * n_rows)
+        table.extend(n_rows, LENGTH * n_rows)
     assert table.clipped.tolist() == [[1007, 1057], [1057, 1107], [500_007, 500_017]]
 
 
@@ -69,7 +69,7 @@ def test_memory_does_not_grow_with_the_blocks(dataset: h5py.Dataset) -> None:
     tracemalloc.start()
     try:
         table = BlockTable(dataset)
-        table.take(N_BLOCKS, LENGTH * N_BLOCKS)
+        table.extend(N_BLOCKS, LENGTH * N_BLOCKS)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

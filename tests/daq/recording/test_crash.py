@@ -18,7 +18,7 @@ from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording, control_address
-from daq.recording.repair import heal, verify, write_results
+from daq.recording.repair import repair, verify, write_results
 from daq.recording.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 
@@ -107,7 +107,7 @@ def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
     for name, rows in acknowledged.items():
         assert len(kept[name]) >= rows > 0
 
-    healed = heal(path, now=NOW)
+    healed = repair(path, now=NOW)
     assert healed.closed
     assert healed.intact
     assert [s.n_uncommitted for s in healed.sensors] == [0, 0]
@@ -117,7 +117,7 @@ def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
     with Recording.open(path) as recording:
         assert recording.closed
         assert [event.kind for event in recording.events] == ["stopped"]
-    assert heal(path) == healed
+    assert repair(path) == healed
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
@@ -131,7 +131,7 @@ def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) 
             lines = [writer.stdout.readline() for _ in range(40)]
             writer.send_signal(signal.SIGKILL)
             writer.stdout.read()
-            healed = heal(path, now=NOW)
+            healed = repair(path, now=NOW)
     assert healed.intact
     for sensor in healed.sensors:
         assert sensor.n_samples >= json.loads(lines[-1])[sensor.name] > 0
@@ -155,7 +155,7 @@ def test_asking_who_writes_does_not_disturb_a_reader(tmp_path: Path) -> None:
                     seen[sensor.name] = sensor.n_samples
         writer.kill()
     assert control_address(path) == (7, "token")
-    heal(path, now=NOW)
+    repair(path, now=NOW)
     assert control_address(path) is None
 
 
@@ -186,7 +186,7 @@ def test_full_disk_is_said_and_nothing_committed_is_lost(tmp_path: Path) -> None
     assert report.intact
     for sensor in report.sensors:
         assert sensor.n_samples >= lines[-1][sensor.name] > 0
-    assert heal(path).intact
+    assert repair(path).intact
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="mounts a small disk")
@@ -214,8 +214,8 @@ def test_being_written_is_not_healed(tmp_path: Path) -> None:
         assert writer.stdout is not None
         writer.stdout.readline()
         assert verify(path).being_written
-        with pytest.raises(RecordingError, match="is being written"):
-            heal(path)
+        with pytest.raises(RecordingError, match="another program is writing it"):
+            repair(path)
         with pytest.raises(OSError, match="lock"):
             h5py.File(path, "r+")
         writer.send_signal(signal.SIGKILL)
@@ -265,7 +265,7 @@ def test_results_that_cannot_be_written_leave_the_recording_as_it_was(tmp_path: 
     make(path)
     before = path.read_bytes()
     good, bad = {"x": np.arange(3.0)}, {"a/b": np.arange(3.0), "a": np.arange(3.0)}
-    with pytest.raises(RecordingError, match="stays as it was"):
+    with pytest.raises(RecordingError, match="it was not changed"):
         write_results(path, {"first": (good, {}), "second": (bad, {})})
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
