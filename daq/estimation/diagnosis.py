@@ -1,13 +1,16 @@
-"""What the averages show of the test itself, put together for front ends."""
+"""What the averages show of the test itself, put together over octaves for front ends."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.estimation.noise_estimates import neighbours
+from daq.estimation.snapshot import Diagnosis, FrequencyDiagnosis, Synchronisation
+from estimator.diagnostics.advice import Advice, Gain
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
+from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Channel
     from daq.estimation.noise_estimates import Dimensions
     from daq.timing.clock_model import ClockState
-    from estimator.diagnostics.advice import Advice
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
 
@@ -37,7 +39,7 @@ def synchronisation(
     frequency: FloatArray,
     csm: ComplexArray,
     results: dict[str, SelfNoise],
-) -> dict[str, Any]:
+) -> Synchronisation:
     """Say what is left between the clocks, and what it does to the noise estimate.
 
     `is_reference` says which sensors run by the clock that others are measured against; `moved`,
@@ -54,16 +56,15 @@ def synchronisation(
     if len(moved):
         first = list(is_reference).index(True)
         residual = np.hypot(residual, (moved - moved[:, [first]]).std(axis=0))
-    found: dict[str, Any] = {
-        "residual": dict(zip((state.sensor for state in clocks), residual, strict=True))
-    }
+    noise_bias = None
     if results and len(residual) == len(dims):
         noise = next(iter(results.values())).noise_psd
         coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
         turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
         with np.errstate(invalid="ignore", divide="ignore"):
-            found["noise_bias"] = turn**2 * coherent / np.abs(noise)
-    return found
+            noise_bias = turn**2 * coherent / np.abs(noise)
+    by_sensor = zip((state.sensor for state in clocks), residual.tolist(), strict=True)
+    return Synchronisation(residual=dict(by_sensor), noise_bias=noise_bias)
 
 
 def vertical_channel(channels: Sequence[Channel]) -> int | None:
@@ -88,23 +89,20 @@ def diagnosis(
     channels: Sequence[tuple[str, Channel]],
     *,
     dimensions: Dimensions | None = None,
-    faulty: Collection[str] = (),
-) -> dict[str, Any]:
+    faulty: Collection[int] = (),
+) -> tuple[Diagnosis | None, Untested | None]:
     """Diagnose the test.
 
     The model tested has as many dimensions as were asked for, or as the largest sensor has
-    channels where `dimensions` were chosen by the motion. Of `faulty` channels (such as ``A.X``)
-    it is known that they are cut off, or were dead for a while: no sensitivity of theirs is called
-    wrong.
+    channels where `dimensions` were chosen by the motion. Of `faulty` channels, by column, it is
+    known that they are clipped, or were dead for a while: no sensitivity of theirs is called wrong.
 
     Returns
     -------
-    dict
-        ``bands``, ``responses`` and ``advice`` as `estimator.diagnostics.diagnose.Diagnostics` has
-        them; ``n_factors``, the dimensions of the model tested; ``pairs`` (names of sensors) and
-        ``per_frequency``, a dict of its arrays. Where each octave has its own segments, sensors are
-        compared by the octave in which they are most coherent. Empty where there is too little to
-        diagnose.
+    diagnosis : Diagnosis or None
+        None where there is too little to diagnose.
+    untested : Untested or None
+        Why the model was tested in no band; None where it was.
     """
     sensors = list(dict.fromkeys(sensor for sensor, _ in channels))
     verticals = {
@@ -127,48 +125,43 @@ def diagnosis(
                     n_effective=band.n_effective,
                     n_factors=n_factors,
                     neighbours=neighbours(band),
-                    names=tuple(sensors),
-                    channels=tuple(channel.name for _, channel in channels),
                     vertical=vertical,
                 )
-            except InsufficientDataError:  # two sensors, or too few averages
-                return {}
+            except InsufficientDataError:
+                few = len(dims) < 3
+                return None, Untested.TOO_FEW_SENSORS if few else Untested.TOO_FEW_AVERAGES
             found.append(diagnostics)
     if not found:
-        return {}
-    labels = [f"{sensor}.{channel.name}" for sensor, channel in channels]
+        return None, Untested.NO_SEGMENTS
     clearest = max(found, key=lambda each: sum(r.coherence for r in each.responses))
-    return {
-        "bands": tuple(band for each in found for band in each.bands),
-        "responses": clearest.responses,
-        "advice": tuple(
+    whole = Diagnosis(
+        n_factors=found[0].n_factors,
+        pairs=found[0].pairs,
+        bands=tuple(band for each in found for band in each.bands),
+        responses=clearest.responses,
+        advice=tuple(
             advice
             for each in found
             for advice in each.advice
-            if (each is clearest or not advice.sensors)
-            and not _is_explained(advice, labels, faulty)
+            if (each is clearest or not advice.sensors) and not _is_explained(advice, faulty)
         ),
-        "n_factors": found[0].n_factors,
-        "pairs": tuple((sensors[j], sensors[k]) for j, k in found[0].pairs),
-        "per_frequency": {
-            **{
-                name: _over(bands, [getattr(each, name) for each in found])
-                for name in ("coherence", "condition", "dimension", "snr")
-            },
-            **{
-                name: _over(bands, [getattr(each.model, name) for each in found])
-                for name in ("statistic", "degrees", "p_value")
-            },
-        },
-    }
+        per_frequency=FrequencyDiagnosis(
+            coherence=_over(bands, [each.coherence for each in found]),
+            condition=_over(bands, [each.condition for each in found]),
+            dimension=_over(bands, [each.dimension for each in found]),
+            snr=_over(bands, [each.snr for each in found]),
+            statistic=_over(bands, [each.model.statistic for each in found]),
+            degrees=_over(bands, [each.model.degrees for each in found]),
+            p_value=_over(bands, [each.model.p_value for each in found]),
+        ),
+    )
+    tested = any(np.isfinite(band.test.p_value) for band in whole.bands)
+    return whole, None if tested else found[-1].untested or Untested.SINGULAR
 
 
-def _is_explained(advice: Advice, labels: Sequence[str], faulty: Collection[str]) -> bool:
+def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:
     """Whether a gain is off because a channel is faulty."""
-    if "gain" not in advice.numbers:
-        return False
-    concerned = {labels[int(advice.numbers[key])] for key in ("of channel", "against channel")}
-    return not concerned.isdisjoint(faulty)
+    return isinstance(advice, Gain) and (advice.channel in faulty or advice.counterpart in faulty)
 
 
 def _n_known(band: Band) -> int:

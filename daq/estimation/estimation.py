@@ -17,7 +17,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,8 +39,14 @@ from daq.estimation.noise_estimates import (
 from daq.estimation.recording_set import check_same, check_span, open_another
 from daq.estimation.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, Octave, SensorTotals, Snapshot
-from estimator.errors import InsufficientDataError
+from daq.estimation.snapshot import (
+    ChannelLabel,
+    NoResultError,
+    Octave,
+    SensorTotals,
+    Snapshot,
+    SnapshotDiagnostics,
+)
 from estimator.spectra.segment_rejection import Reason, RejectionSettings
 
 if TYPE_CHECKING:
@@ -173,8 +180,8 @@ class Estimation:
 
         Raises
         ------
-        InsufficientDataError
-            If no method can say anything; the message says why.
+        NoResultError
+            If no method can say anything; the message and the snapshot's advice say why.
         WrongSettingError
             If nothing lies between start and end.
         """
@@ -203,7 +210,7 @@ class Estimation:
                 each.advance(count)
         snapshot = self._snapshot(final=True)
         if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
-            raise InsufficientDataError(self._why_nothing(snapshot))
+            raise NoResultError(self._why_nothing(snapshot), snapshot)
         return snapshot
 
     def snapshot(self) -> Snapshot:
@@ -226,8 +233,8 @@ class Estimation:
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_effective = self.n_segments, bands[-1].n_effective if bands else 0.0
         estimates = self._estimates(bands, final=final)
-        diagnostics: dict[str, Any] = {
-            "synchronisation": synchronisation(
+        diagnostics = SnapshotDiagnostics(
+            synchronisation=synchronisation(
                 last.aligned.clocks,
                 last.aligned.is_reference,
                 last.moved(),
@@ -235,20 +242,25 @@ class Estimation:
                 frequency=frequency,
                 csm=csm,
                 results=estimates.results,
-            )
-        }
-        if estimates.dimensions is not None and estimates.dimensions.chosen:
-            diagnostics["dimension"] = estimates.dimensions.chosen
+            ),
+            dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
+        )
         if final:
-            faulty = self._clipped() | self._dead_for_a_while()
-            diagnostics |= diagnosis(
+            clipped, stood_still = self._clipped(), self._dead_for_a_while()
+            found, untested = diagnosis(
                 bands,
                 dims,
                 channels,
                 dimensions=estimates.dimensions,
-                faulty=set().union(*faulty.values()),
+                faulty={*clipped, *stood_still},
             )
-            diagnostics |= faulty
+            diagnostics = replace(
+                diagnostics,
+                clipped=clipped,
+                stood_still=stood_still,
+                diagnosis=found,
+                untested=untested,
+            )
         return Snapshot(
             frequency=frequency,
             csm=csm,
@@ -302,44 +314,38 @@ class Estimation:
         before = () if self._dimensions is None else self._dimensions.n_factors
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
 
-    def _clipped(self) -> dict[str, dict[str, float]]:
-        """Return which channels stand at the end of their range, and in what share of samples."""
-        taking_part = {
-            (sensor, channel.name) for sensor, channel in self._passes[0].aligned.channels
+    def _clipped(self) -> dict[int, float]:
+        """Return the share of samples at the end of the range, by column, of channels with any."""
+        columns = {
+            (sensor, channel.name): column
+            for column, (sensor, channel) in enumerate(self._passes[0].aligned.channels)
         }
-        shares: dict[str, float] = {}
+        shares: dict[int, float] = {}
         for recording in self._recordings:
             for record in recording.sensors:
                 for channel, share in clipped_shares(record).items():
-                    if (record.name, channel) in taking_part:
-                        label = f"{record.name}.{channel}"
-                        shares[label] = max(share, shares.get(label, 0.0))
-        return {"clipped": shares} if shares else {}
+                    column = columns.get((record.name, channel))
+                    if column is not None:
+                        shares[column] = max(share, shares.get(column, 0.0))
+        return shares
 
-    def _dead_for_a_while(self) -> dict[str, dict[str, float]]:
-        """Return which channels stood still for a while in segments that count, and how long.
+    def _dead_for_a_while(self) -> dict[int, float]:
+        """Return for how long channels stood still in segments that count, by column.
 
         Rejection leaves such segments out, but takes what lasts for a change for good.
         """
         welch = self._passes[0].welch
         lasting = RejectionSettings().start_up * welch.hop / welch.sampling_rate
         least = lasting if self.settings.reject else 0.0
-        seconds = sum(each.stillness.for_a_while() for each in self._passes)
-        found = {
-            f"{sensor}.{channel.name}": float(still)
-            for (sensor, channel), still in zip(
-                self._passes[0].aligned.channels, np.atleast_1d(seconds), strict=True
-            )
-            if still > least
-        }
-        return {"stood_still": found} if found else {}
+        seconds = np.atleast_1d(sum(each.stillness.for_a_while() for each in self._passes))
+        return {column: float(still) for column, still in enumerate(seconds) if still > least}
 
-    def _left_out(self) -> dict[str, int]:
+    def _left_out(self) -> dict[Reason, int]:
         counts: Counter[Reason] = Counter()
         for each in self._passes:
             counts.update(each.left_out)
         counts[Reason.TRANSIENT] = self.n_seen - self.n_segments - counts.total()
-        return {reason.value: counts[reason] for reason in Reason}
+        return {reason: counts[reason] for reason in Reason}
 
     def _why_nothing(self, snapshot: Snapshot) -> str:
         names = ", ".join(str(recording.path) for recording in self._recordings)
@@ -352,12 +358,9 @@ class Estimation:
                 f" takes {self.settings.segment:g} s; record longer or choose a shorter segment"
             )
         if snapshot.results:
-            advice = snapshot.diagnostics.get("advice", ())
-            why = [f"{each.text} {each.remedy}" for each in advice if each.level != "note"]
             return (
-                f"{names}: nothing can be said of any channel at any frequency by "
-                f"{', '.join(snapshot.results)}: "
-                + (" ".join(why) or "look at the samples and the bench file")
+                f"{names}: no channel's noise can be estimated at any frequency by "
+                f"{', '.join(snapshot.results)}: check the samples and the bench file"
             )
         return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
 
@@ -383,7 +386,7 @@ def estimate(
     ------
     RecordingError, CannotAlignError
         If a file cannot be read, or its sensors not be aligned.
-    InsufficientDataError
+    NoResultError
         If there is too little for any of the methods.
     """
     with Estimation(paths, settings) as estimation:

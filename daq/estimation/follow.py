@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
+from daq.estimation.snapshot import NoResultError
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording, control_address
-from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -122,7 +122,7 @@ def follow(
         If the recorder has ended without closing the recording.
     RecordingError, CannotAlignError
         If the file cannot be read, or its sensors not be aligned.
-    InsufficientDataError
+    NoResultError
         If the whole recording is too little for any of the methods.
     """
     cancelled = threading.Event() if cancelled is None else cancelled
@@ -181,8 +181,8 @@ def _result(
         snapshot = estimation.finish(progress)
     except _CancelledError:
         return None
-    except InsufficientDataError:
-        observer.snapshot(estimation.snapshot(), estimation.settings)
+    except NoResultError as error:
+        observer.snapshot(error.snapshot, estimation.settings)
         raise
     observer.snapshot(snapshot, estimation.settings)
     return snapshot

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.diagnostics.kinds import Untested
+from estimator.errors import InsufficientDataError
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from daq.recording.interface import ReadableSensor
     from daq.timing.clock_model import ClockState
+    from estimator.diagnostics.advice import Advice
+    from estimator.diagnostics.band import BandDiagnosis
+    from estimator.diagnostics.relative_response import RelativeResponse
+    from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
+    from estimator.spectra.segment_rejection import Reason
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
@@ -26,6 +36,11 @@ class ChannelLabel:
     sensor: str
     channel: str
     unit: str
+
+    @property
+    def name(self) -> str:
+        """Sensor and channel, as in ``A.X``: to be read, not to be taken apart."""
+        return f"{self.sensor}.{self.channel}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +79,8 @@ class Octave:
     """Seconds."""
     n_segments: int
     n_effective: float
-    left_out: dict[str, int] = field(default_factory=dict)
-    """Its segments that do not count: "gap" (or clipped), and "transient"."""
+    left_out: Mapping[Reason, int] = field(default_factory=dict)
+    """Its segments that do not count, by reason; clipped ones count as gaps."""
 
     @classmethod
     def of(cls, band: Band) -> Octave:
@@ -76,8 +91,108 @@ class Octave:
             segment=band.settings.segment_length / band.settings.sampling_rate,
             n_segments=band.n_segments,
             n_effective=band.n_effective,
-            left_out={reason.value: count for reason, count in band.left_out.items()},
+            left_out=dict(band.left_out),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Synchronisation:
+    """What is left between the clocks, and its effect on the noise.
+
+    Attributes
+    ----------
+    residual : mapping of str to float
+        Seconds rms, by sensor.
+    noise_bias : float64, shape (n_freqs, n_channels), or None
+        What it is expected to add to the noise PSD, as a fraction of it; None where there is no
+        estimate.
+    """
+
+    residual: Mapping[str, float] = field(default_factory=dict)
+    noise_bias: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrequencyDiagnosis:
+    """The diagnosis at every frequency of a snapshot.
+
+    Attributes
+    ----------
+    coherence, condition : float64, shape (n_freqs, n_pairs)
+        As in `estimator.diagnostics.diagnose.Diagnostics`, and so are `dimension` and `snr`.
+    dimension : float64, shape (n_freqs,)
+    snr : float64, shape (n_freqs, n_channels)
+    statistic, degrees, p_value : float64, shape (n_freqs,)
+        Of the model test: `estimator.likelihood.goodness_of_fit.ModelTest`.
+    """
+
+    coherence: FloatArray
+    condition: FloatArray
+    dimension: FloatArray
+    snr: FloatArray
+    statistic: FloatArray
+    degrees: FloatArray
+    p_value: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """What the averages of a finished estimate show of the test.
+
+    Attributes
+    ----------
+    n_factors : int
+        Dimensions of the motion in the model tested.
+    pairs : tuple of (int, int)
+        Pairs of sensors, from 0.
+    bands : tuple of BandDiagnosis
+        Rising.
+    responses : tuple of RelativeResponse
+        Where each octave has its own segments, of the octave in which sensors are most coherent.
+    advice : tuple of Advice
+        Worst first within each octave.
+    per_frequency : FrequencyDiagnosis
+    """
+
+    n_factors: int
+    pairs: tuple[tuple[int, int], ...]
+    bands: tuple[BandDiagnosis, ...]
+    responses: tuple[RelativeResponse, ...]
+    advice: tuple[Advice, ...]
+    per_frequency: FrequencyDiagnosis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SnapshotDiagnostics:
+    """What is known of the test itself.
+
+    Attributes
+    ----------
+    synchronisation : Synchronisation
+    dimensions : tuple of BandDimension
+        Where the dimension of the motion was chosen by band; rising.
+    clipped : mapping of int to float
+        Share of samples at the end of the range, by column of the channel; of a finished estimate,
+        and without channels that have none.
+    stood_still : mapping of int to float
+        Seconds for which a channel had a constant count though it has a signal otherwise; likewise.
+    diagnosis : Diagnosis or None
+        Of a finished estimate; None where there is too little to diagnose.
+    untested : Untested or None
+        Why the model of one common motion was tested in no band; None where it was.
+    """
+
+    synchronisation: Synchronisation = field(default_factory=Synchronisation)
+    dimensions: tuple[BandDimension, ...] = ()
+    clipped: Mapping[int, float] = field(default_factory=dict)
+    stood_still: Mapping[int, float] = field(default_factory=dict)
+    diagnosis: Diagnosis | None = None
+    untested: Untested | None = Untested.UNFINISHED
+
+    @property
+    def advice(self) -> tuple[Advice, ...]:
+        """Advice on the test; none before it is finished."""
+        return () if self.diagnosis is None else self.diagnosis.advice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,17 +229,11 @@ class Snapshot:
         sensor's own count of time then lags, in seconds: what the clocks do. Of the last recording.
     closed : bool
         Whether nothing more will come.
-    left_out : dict
-        How many segments were left out, by reason: "gap", "clipped", "transient".
+    left_out : mapping of Reason to int
+        How many segments were left out, by reason.
     octaves : tuple of Octave
         Rising; empty where all frequencies rest on the same segments.
-    diagnostics : dict
-        ``synchronisation``: ``residual`` between the clocks in seconds by sensor, and the fraction
-        ``noise_bias``, shape (n_freqs, n_channels), that it is expected to add to the noise PSD.
-        ``dimension``: tuple of `estimator.likelihood.dimension.BandDimension`, where it was chosen.
-        Of a finished estimate also ``clipped``, the share of samples that stand at the end of the
-        range by channel ("B.X") where there are any, and what
-        `daq.estimation.diagnosis.diagnosis` returns.
+    diagnostics : SnapshotDiagnostics
     """
 
     frequency: FloatArray
@@ -144,11 +253,31 @@ class Snapshot:
     clocks: tuple[ClockState, ...]
     drift: FloatArray
     closed: bool
-    left_out: dict[str, int] = field(default_factory=dict)
+    left_out: Mapping[Reason, int] = field(default_factory=dict)
     octaves: tuple[Octave, ...] = ()
-    diagnostics: dict[str, Any] = field(default_factory=dict)
+    diagnostics: SnapshotDiagnostics = field(default_factory=SnapshotDiagnostics)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensors whose channels are estimated, in the order of `dims`."""
+        return tuple(dict.fromkeys(label.sensor for label in self.channels))
 
     @property
     def data_psd(self) -> FloatArray:
         """PSD of what each channel recorded, shape (n_freqs, n_channels), in unit**2/Hz."""
         return np.ascontiguousarray(np.diagonal(self.csm, axis1=1, axis2=2).real)
+
+
+class NoResultError(InsufficientDataError):
+    """No method can say anything of any channel.
+
+    Parameters
+    ----------
+    message : str
+    snapshot : Snapshot
+        Of the whole recording, with the advice on what is wrong.
+    """
+
+    def __init__(self, message: str, snapshot: Snapshot) -> None:
+        super().__init__(message)
+        self.snapshot = snapshot

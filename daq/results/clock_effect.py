@@ -23,7 +23,7 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
 
     Shape (n_channels,); NaN where it is not known (yet).
     """
-    share = snapshot.diagnostics.get("synchronisation", {}).get("noise_bias")
+    share = snapshot.diagnostics.synchronisation.noise_bias
     if share is None or not snapshot.results:
         return np.full(len(snapshot.channels), np.nan)
     low, high = band_of(settings, snapshot)
@@ -54,8 +54,8 @@ def residuals(snapshot: Snapshot) -> dict[str, float]:
 
     Where the motion measures it, it is against the reference sensor, which has none itself.
     """
-    known = snapshot.diagnostics.get("synchronisation", {}).get("residual")
-    return {clock.sensor: clock.residual for clock in snapshot.clocks} if known is None else known
+    known = snapshot.diagnostics.synchronisation.residual
+    return dict(known) or {clock.sensor: clock.residual for clock in snapshot.clocks}
 
 
 def reference(snapshot: Snapshot) -> str | None:

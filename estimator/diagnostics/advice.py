@@ -1,409 +1,341 @@
-"""Diagnostics in plain words: section 5 of the paper, and what the model test adds to it.
+"""What there is to know about a test: one type for each kind of advice, in numbers.
 
-A model that does not hold is graded by what that may do to the noise estimate. What the averages
-show of the misfit is a share ``sqrt((ratio - 1) / (n - d))`` of the noise, with the statistic
-``ratio`` times its expectation. The estimate is off by more, because it takes up most of a misfit
-before the test sees the rest: computed on true matrices by up to `TYPICAL` times as much for noise
-that channels share, noise of a sensor's own stand, or one more dimension of motion; for waves that
-cross sensors 0.1 m apart by up to `CROSSING` times with four sensors or more, `CROSSING_THREE`
-times with three triaxial ones, and without bound with three sensors of fewer channels. See
-`docs/decisions/0035`.
+Sensors and channels are positions from 0, in the order of the cross-spectral matrix. Front ends
+turn advice into sentences.
 """
 
 from __future__ import annotations
 
-from itertools import groupby
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import ClassVar
 
-import numpy as np
-
-from estimator.diagnostics.orientation import stance
-from estimator.likelihood.goodness_of_fit import rejected_below
-from estimator.self_noise.live_channels import presence
-from estimator.self_noise.result import Flag
-from estimator.wording import Advice, in_hz, listed, percent, ratio
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from estimator.diagnostics.band import BandDiagnosis
-    from estimator.diagnostics.relative_response import RelativeResponse
-    from estimator.self_noise.coherency import Coherency
-    from estimator.wording import Level
-
-__all__ = ["Advice", "advise"]
-
-TYPICAL = 10.0
-CROSSING = 20.0
-CROSSING_THREE = 100.0
-FAR_OFF = 0.5
-"""Of the noise: an estimate that is off by this is wrong."""
-LITTLE_OFF = 0.05
+from estimator.diagnostics.kinds import AdviceKind, Level
 
 
-def advise(
-    bands: tuple[BandDiagnosis, ...],
-    responses: tuple[RelativeResponse, ...],
-    given: Coherency,
-    *,
-    dims: tuple[int, ...],
-    names: tuple[str, ...],
-    channels: tuple[str, ...],
-    n_factors: int,
-    n_effective: float,
-    nyquist: float,
-) -> tuple[Advice, ...]:
-    """Put diagnostics into words, worst first.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Advice:
+    """One thing to know about the test; each kind is a class of its own.
 
-    Parameters
+    Attributes
     ----------
-    bands : tuple of BandDiagnosis
-        Rising.
-    responses : tuple of RelativeResponse
-    given : Coherency
-        The averages.
-    dims : tuple of int
-    names : tuple of str
-        Of the sensors.
-    channels : tuple of str
-        Names of all channels.
+    kind : AdviceKind
+        Of the class.
+    level : Level
+    sensors : tuple of int
+        The sensors concerned; empty for all.
+    band : (float, float) or None
+        Hz; None for all frequencies.
+    """
+
+    kind: ClassVar[AdviceKind]
+    level: Level
+    sensors: tuple[int, ...] = ()
+    band: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSignal(Advice):
+    """Channels of one sensor have no power, or a constant count.
+
+    Attributes
+    ----------
+    channels : tuple of int
+    whole_sensor : bool
+        Whether these are all channels of a sensor that has several.
+    share_of_frequencies : float
+        At which the worst of them is dead.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NO_SIGNAL
+    channels: tuple[int, ...]
+    whole_sensor: bool
+    share_of_frequencies: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Copies(Advice):
+    """Channels repeat others sample for sample.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+        The original, and the channel that repeats it.
+    share_of_frequencies : float
+        At which they are the same.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.COPIES
+    channels: tuple[tuple[int, int], ...]
+    share_of_frequencies: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TooFewSensors(Advice):
+    """Fewer than three sensors, `sensors`, have a signal of their own."""
+
+    kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_SENSORS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingChannels(Advice):
+    """Channels of `sensors` are missing, so that fewer than three sensors are whole.
+
+    Attributes
+    ----------
+    whole_sensors : tuple of int
+        Those whose channels all have a signal of their own.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MISSING_CHANNELS
+    whole_sensors: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TooFewDimensions(Advice):
+    """A model of fewer dimensions than the sensors sense does not explain the averages.
+
+    Attributes
+    ----------
     n_factors : int
-        Dimensions of the motion in the model that was tested.
-    n_effective : float
-    nyquist : float
-        Hz.
-
-    Returns
-    -------
-    tuple of Advice
+        Dimensions of the motion in the model.
+    statistic : float
+        Of the model test, over its expectation, in the whole `band`.
+    worst_statistic : float
+        The same where it is largest.
+    worst_band : (float, float)
+        There, Hz.
     """
-    alive = presence(given, dims).dims
-    found = [
-        *_absent(given, dims, names, channels),
-        *(
-            _too_few_dimensions(bands, n_factors)
-            if n_factors < max(alive, default=0)
-            else _incoherence(bands, dims, n_factors, n_effective)
-        ),
-        *_sensor_space(bands, dims, names),
-        *_dimensions(bands, alive, n_effective),
-        *_weak_motion(bands),
-        *_left_in(bands, max(dims), n_effective),
-        *(
-            advice
-            for response in responses
-            for advice in stance(response, names, channels, dims, nyquist)
-        ),
-    ]
-    order = {"problem": 0, "warning": 1, "note": 2}
-    return tuple(sorted(found, key=lambda advice: order[advice.level]))
+
+    kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_DIMENSIONS
+    n_factors: int
+    statistic: float
+    worst_statistic: float
+    worst_band: tuple[float, float]
 
 
-def model(n_factors: int) -> str:
-    """Say what motion a model has, as the subject of a sentence."""
-    if n_factors == 0:
-        return "a model without motion"
-    return f"one motion of {n_factors} dimension{'s' if n_factors > 1 else ''}"
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelMisfit(Advice):
+    """One common motion does not explain the averages.
 
-
-def _runs(
-    bands: Iterable[BandDiagnosis], applies: Callable[[BandDiagnosis], bool]
-) -> Iterator[list[BandDiagnosis]]:
-    """Neighbouring bands to which something applies, together."""
-    for true, run in groupby(bands, applies):
-        if true:
-            yield list(run)
-
-
-def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
-    return run[0].low, run[-1].high
-
-
-def _is_weak(band: BandDiagnosis) -> bool:
-    known = band.snr[~np.isnan(band.snr)]
-    return len(known) > 0 and bool(known.max() < 1)
-
-
-def _absent(
-    given: Coherency, dims: tuple[int, ...], names: tuple[str, ...], channels: tuple[str, ...]
-) -> Iterator[Advice]:
-    """Channels that are dead or copies, and what can be said without them."""
-    valid = given.valid
-    sensor_of = np.repeat(np.arange(len(dims)), dims)
-    labels = [f"{names[s]}.{name}" for s, name in zip(sensor_of, channels, strict=True)]
-    dead = ((given.flags[valid] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
-    copies = given.duplicates[valid].mean(axis=0)
-    for sensor, name in enumerate(names):
-        own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
-        if not len(own):
-            continue
-        which = f"{listed([labels[c] for c in own])} {'has' if len(own) == 1 else 'have'} no signal"
-        if len(own) == dims[sensor] > 1:
-            which = f"Sensor {name} has no signal on any channel"
-        yield Advice(
-            "problem",
-            (sensor,),
-            None,
-            f"{which} (no power, or always the same count): nothing can be said of its noise.",
-            {"share of frequencies": float(dead[own].max())},
-            "Look at cable, supply and the channel's place in the bench file.",
-        )
-    pairs = np.argwhere(np.triu(copies > 0.5))
-    if len(pairs):
-        same = listed([f"{labels[q]} repeats {labels[p]}" for p, q in pairs])
-        yield Advice(
-            "problem",
-            tuple(int(s) for s in np.unique(sensor_of[pairs])),
-            None,
-            f"{same}, sample for sample: they share their noise, and nothing can be said of it.",
-            {"share of frequencies": float(copies.max())},
-            "One signal is wired or named twice: look at ports and channels of the bench file.",
-        )
-    there = presence(given, dims)
-    missing = [s for s in range(len(dims)) if s not in there.whole]
-    if len(there.sensors) < 3:
-        left = [names[s] for s in there.sensors]
-        who = (
-            f"Only sensors {listed(left)} have" if len(left) == 2 else "Fewer than two sensors have"
-        )
-        yield Advice(
-            "problem",
-            there.sensors,
-            None,
-            f"{who} a signal of their own: whether one motion is common to all cannot be tested, "
-            "and how the sensors stand cannot be measured. What is certain: no channel's noise is "
-            "above its own spectrum.",
-            {"sensors": float(len(left))},
-            "Two methods are left. Two-channel (--method two-channel), if like channels point the "
-            "same way and their gains are known (--gain): a gain wrong by 1 % leaves 1 % of the "
-            "motion in the noise, a channel turned by 1° leaves 0.03 % of the motion across it. "
-            "Maximum likelihood (--method maximum-likelihood) needs neither, but says the less the "
-            "better the two are aligned: its interval shows how much. For more mend or exchange "
-            "the third sensor."
-            if len(left) == 2
-            else "Mend or exchange sensors until three have a signal.",
-        )
-    elif missing and len(there.whole) < 3:
-        whole = [names[s] for s in there.whole]
-        yield Advice(
-            "warning",
-            tuple(missing),
-            None,
-            f"With channels of {listed([names[s] for s in missing])} missing, three-sensor "
-            f"estimates say nothing of {listed(whole) if whole else 'any sensor'}: each needs two "
-            "others with all their channels. Nor can the stance of all sensors be compared.",
-            {"whole sensors": float(len(whole))},
-            "Maximum likelihood uses the channels that are left (--method maximum-likelihood).",
-        )
-
-
-def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Iterator[Advice]:
-    """Where fewer dimensions were asked for than the sensors feel."""
-    rejected = rejected_below(band.test for band in bands)
-    for run in _runs(bands, lambda band: band.test.p_value < rejected):
-        worst = max(run, key=lambda b: b.test.statistic / b.test.degrees)
-        most = worst.test.statistic / worst.test.degrees
-        mean = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
-        yield Advice(
-            "problem",
-            (),
-            _span(run),
-            f"At {in_hz(_span(run))} {model(n_factors)} does not explain what the sensors have in "
-            f"common (statistic {mean:.3g} times its expectation). The maximum likelihood estimate "
-            "is wrong there: what moves in further dimensions is counted as noise.",
-            {
-                "statistic over expectation": mean,
-                "worst": most,
-                "worst_low_hz": worst.low,
-                "worst_high_hz": worst.high,
-                "dimensions": n_factors,
-            },
-            "Leave out --dimension, or let it be chosen (--dimension auto).",
-        )
-
-
-def _incoherence(
-    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_factors: int, n_effective: float
-) -> Iterator[Advice]:
-    d = max(dims)
-    crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
-    rejected = rejected_below(band.test for band in bands)
-    for run in _runs(bands, lambda band: band.test.p_value < rejected):
-        ratios = [b.test.statistic / b.test.degrees for b in run]
-        mean = sum(b.test.statistic for b in run) / sum(b.test.degrees for b in run)
-        most = max(ratios)
-        worst = run[ratios.index(most)]
-        seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
-        off, at_most = TYPICAL * seen, crossing * seen
-        at = f", {most:.3g} at {in_hz((worst.low, worst.high))}" if len(run) > 1 else ""
-        likely = float(np.sqrt(off * at_most)) if np.isfinite(at_most) else off
-        level: Level = "warning" if likely >= LITTLE_OFF else "note"
-        if likely >= FAR_OFF:
-            level = "problem"
-        apart = (
-            f"up to {percent(at_most)} of it where waves cross sensors that stand apart"
-            if np.isfinite(at_most)
-            else "any amount where waves cross sensors that stand apart, which three sensors of "
-            f"{d} channel{'s' if d > 1 else ''} cannot show"
-        )
-        text = (
-            f"At {in_hz(_span(run))} {model(n_factors)} does not explain what the sensors have in "
-            f"common (statistic {mean:.3g} times its expectation{at}"
-            f"{'' if level == 'problem' else ': certain, but small'}). At worst "
-            f"{percent(seen)} of the noise is unexplained, and the estimate "
-            f"{'is wrong' if off >= FAR_OFF else 'may be off'}, by up to about "
-            f"{percent(off)} of it, and by {apart}."
-        )
-        remedy = (
-            "Put the sensors closer together; look for tilt, noise that two channels share (cable, "
-            "digitizer), and clocks that drift."
-        )
-        if d < 3:
-            remedy += (
-                f" If the motion has more than {d} dimension{'s' if d > 1 else ''}, sensors of {d} "
-                f"channel{'s' if d > 1 else ''} must stand exactly alike: align them, or use "
-                "triaxial data."
-            )
-        if len(dims) > 3:
-            remedy += (
-                f" With {len(dims)} sensors more dimensions can be allowed (--dimension auto)."
-            )
-        yield Advice(
-            level,
-            (),
-            _span(run),
-            text,
-            {
-                "statistic over expectation": mean,
-                "worst": most,
-                "worst_low_hz": worst.low,
-                "worst_high_hz": worst.high,
-                "least p value": min(b.test.p_value for b in run),
-                "unexplained": seen,
-                "off": off,
-                "off at most": at_most,
-            },
-            remedy,
-        )
-
-
-def _sensor_space(
-    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], names: tuple[str, ...]
-) -> Iterator[Advice]:
-    """Section 5: the motion's dimension against that of what the compared channels can feel."""
-    strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
-    if not strong:
-        return
-    snr = float(max(np.nanmax(band.snr) for band in strong))
-    leaked = snr * np.sin(np.deg2rad(1)) ** 2
-    shared = [sorted(dims[:i] + dims[i + 1 :])[-2] for i in range(len(dims))]
-    for d in sorted({n for n in shared if n < 3}):
-        which = "planes" if d == 2 else "axes"
-        few = f"{d} channel{'s' if d > 1 else ''}"
-        targets = tuple(i for i, n in enumerate(shared) if n == d)
-        more = listed([name for name, n in zip(names, dims, strict=True) if n > d] or [""])
-        who = f"Sensors of {few} feel"
-        remedy = "triaxial data"
-        if more:
-            compared = listed([names[i] for i in targets])
-            who = (
-                f"For {compared} three-sensor and three-channel estimates compare {few} of every "
-                "sensor, and these feel"
-            )
-            remedy = f"maximum likelihood, which compares with the further channels of {more} too"
-        yield Advice(
-            "note",
-            targets if more else (),
-            _span(strong),
-            f"{who} {d} of three dimensions of motion: no bias if the motion has no more, or if "
-            f"their {which} are parallel; otherwise motion across them is taken for noise. At the "
-            f"SNR here ({ratio(snr)}) 1° between their {which} adds up to {percent(leaked)} of "
-            "the noise.",
-            {"SNR": snr, "added by 1 degree": leaked},
-            f"Level or align the sensors so that their {which} are parallel, or use {remedy}.",
-        )
-
-
-def _dimensions(
-    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
-) -> Iterator[Advice]:
-    if len(dims) < 2:
-        return
-    full = min(sorted(dims)[-2:])
-    for run in _runs(bands, lambda band: band.dimension < full and not _is_weak(band)):
-        least = min(b.dimension for b in run)
-        yield Advice(
-            "warning",
-            (),
-            _span(run),
-            f"At {in_hz(_span(run))} the motion has only {least:.0f} of {full} dimensions: the "
-            "three-sensor estimate stays unbiased but scatters more.",
-            {"dimension": least, "condition": max(b.condition for b in run)},
-            "Choose the dimension by the motion (--dimension auto), or stir the floor in all "
-            "directions.",
-        )
-    limit = float(np.sqrt(n_effective))
-    for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
-        worst = max(b.condition for b in run)
-        yield Advice(
-            "note",
-            (),
-            _span(run),
-            f"At {in_hz(_span(run))} the cross-spectral matrix between two sensors is nearly "
-            f"singular (condition {worst:.3g}): one direction moves far less than the others, "
-            "and the three-sensor estimate scatters more.",
-            {"condition": worst},
-        )
-
-
-def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
-    for run in _runs(bands, _is_weak):
-        snr = float(np.nanmax([b.snr for b in run]))
-        yield Advice(
-            "note",
-            (),
-            _span(run),
-            f"At {in_hz(_span(run))} the motion is weaker than the noise (SNR {ratio(snr)} at "
-            "most): the spectra are nearly the noise itself, and neither alignment nor method "
-            "matters much.",
-            {"SNR": snr},
-        )
-
-
-def left_in(d: int, n_effective: float) -> float:
-    """Return how much of weak motion the triad methods leave in at worst, as a share of the noise.
-
-    Parameters
+    Attributes
     ----------
-    d : int
-        Dimensions of the motion.
-    n_effective : float
-
-    Returns
-    -------
-    float
-        The largest over the SNR s of ``ρ (1 − g)^(n / d)``, with ``ρ = s / (1 + 2 s)`` what two
-        like sensors do not predict and ``g = (s / (1 + s))²`` their coherence: exact for d = 1
-        (`docs/decisions/0033`), and for d = 2 and 3 no less than was measured there.
+    n_factors : int
+        Dimensions of the motion in the model.
+    statistic : float
+        Of the model test, over its expectation, in the whole `band`.
+    worst_statistic : float
+        The same where it is largest.
+    worst_band : (float, float)
+        There, Hz.
+    p_value : float
+        The least.
+    unexplained : float
+        Of the noise, as a fraction, where the statistic is largest.
+    error : float
+        What the estimate may be off by there, as a fraction of the noise; see
+        `estimator.diagnostics.rules`.
+    largest_error : float
+        The same where waves cross sensors that stand apart; infinite where these sensors do not
+        bound it.
+    is_wrong : bool
+        Whether `error` is so large that the estimate is wrong.
     """
-    s = np.geomspace(1e-4, 10, 501)
-    return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MODEL_MISFIT
+    n_factors: int
+    statistic: float
+    worst_statistic: float
+    worst_band: tuple[float, float]
+    p_value: float
+    unexplained: float
+    error: float
+    largest_error: float
+    is_wrong: bool
 
 
-def _left_in(bands: tuple[BandDiagnosis, ...], d: int, n_effective: float) -> Iterator[Advice]:
-    """Weak motion of most channels: of all is not asked, as some SNR is far too high by scatter."""
-    share = left_in(d, n_effective)
-    if share < LITTLE_OFF:
-        return
-    for run in _runs(bands, lambda b: bool((b.snr < 1).sum() > np.isfinite(b.snr).sum() / 2)):
-        yield Advice(
-            "note",
-            (),
-            _span(run),
-            f"At {in_hz(_span(run))} the motion is too weak for {n_effective:.0f} averages to "
-            "find: three-sensor and three-channel estimates may be up to about "
-            f"{percent(share)} too high, by motion that is left in them; maximum likelihood by "
-            "less.",
-            {"left in": share},
-            "Record longer to take it out.",
-        )
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionAcross(Advice):
+    """Sensors that are compared by fewer than three channels miss motion across these.
+
+    Attributes
+    ----------
+    n_channels : int
+        Channels of each sensor that are compared: 1 (axes) or 2 (planes).
+    larger_sensors : tuple of int
+        Sensors with more channels; empty where no sensor has.
+    snr : float
+        The largest ratio of the motion's PSD to the noise's.
+    added_by_one_degree : float
+        Noise that an angle of 1° between planes or axes adds at most, as a fraction of the noise.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MOTION_ACROSS
+    n_channels: int
+    larger_sensors: tuple[int, ...]
+    snr: float
+    added_by_one_degree: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingDimension(Advice):
+    """The motion has fewer dimensions than the sensors sense.
+
+    Attributes
+    ----------
+    n_dimensions : float
+        Of the motion: the least, as a median over the frequencies of a band.
+    n_channels : int
+        Dimensions that the sensors sense.
+    condition : float
+        Largest condition number of the matrix between two sensors.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MISSING_DIMENSION
+    n_dimensions: float
+    n_channels: int
+    condition: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NearlySingular(Advice):
+    """The cross-spectral matrix between two sensors is nearly singular.
+
+    Attributes
+    ----------
+    condition : float
+        Its largest condition number.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NEARLY_SINGULAR
+    condition: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeakMotion(Advice):
+    """The motion is weaker than the noise in every channel.
+
+    Attributes
+    ----------
+    snr : float
+        The largest ratio of the motion's PSD to the noise's.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.WEAK_MOTION
+    snr: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionLeftIn(Advice):
+    """The averages are too few to remove weak motion from the estimate.
+
+    Attributes
+    ----------
+    share : float
+        What is left in three-sensor and three-channel estimates at most, as a fraction of the
+        noise.
+    n_effective : float
+        Averages.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.MOTION_LEFT_IN
+    share: float
+    n_effective: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwappedChannels(Advice):
+    """Two channels of the second of `sensors` have traded places.
+
+    Attributes
+    ----------
+    channels : tuple of (int, int)
+        Channel of the second sensor, and the channel of the first that it follows.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.SWAPPED_CHANNELS
+    channels: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rotated(Advice):
+    """Two sensors do not point the same way.
+
+    Attributes
+    ----------
+    angle_deg : float
+        Of the rotation between them.
+    horizontal_deg : float
+        In the horizontal plane, with the sign of `RelativeResponse.horizontal_deg`; NaN without
+        two horizontal channels.
+    error_deg : float
+        Standard error of both.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.ROTATED
+    angle_deg: float
+    horizontal_deg: float
+    error_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotOrthogonal(Advice):
+    """Channels of one of two sensors are not at right angles.
+
+    Attributes
+    ----------
+    deviation_deg : float
+        Largest deviation from a right angle.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NOT_ORTHOGONAL
+    deviation_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReversedPolarity(Advice):
+    """A channel has the opposite sign of its counterpart.
+
+    Attributes
+    ----------
+    channel, counterpart : int
+        Of the second and of the first of `sensors`.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.REVERSED_POLARITY
+    channel: int
+    counterpart: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gain(Advice):
+    """A channel's gain differs from that of its counterpart.
+
+    Attributes
+    ----------
+    channel, counterpart : int
+        Of the second and of the first of `sensors`.
+    ratio : float
+        Gain of the channel over that of its counterpart.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.GAIN
+    channel: int
+    counterpart: int
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delay(Advice):
+    """One sensor lags another.
+
+    Attributes
+    ----------
+    delay : float
+        By which the second of `sensors` lags the first, s; negative where it leads.
+    delay_samples : float
+        The same, in samples.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.DELAY
+    delay: float
+    delay_samples: float

@@ -1,8 +1,8 @@
-"""What the averages say about the test itself, in numbers and in words.
+"""What the averages say about the test itself.
 
-Coherences, conditioning, the dimension and strength of the motion, whether one motion explains
-all sensors, how these stand to each other; and section 5's recommendations of the paper where
-they apply.
+Coherences, conditioning, the dimension and strength of the motion, whether one motion explains all
+sensors, the orientation of the sensors, and the recommendations of the paper's section 5 where they
+apply.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.advice import Advice, advise
 from estimator.diagnostics.band import BandDiagnosis
+from estimator.diagnostics.kinds import Untested
 from estimator.diagnostics.relative_response import (
     CanonicalCoherence,
     RelativeResponse,
@@ -22,7 +22,8 @@ from estimator.diagnostics.relative_response import (
     own_channels,
     relative_response,
 )
-from estimator.errors import EstimatorError, InsufficientDataError
+from estimator.diagnostics.rules import advise
+from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.chi_square import critical_value
 from estimator.likelihood.dimension import bands
@@ -39,6 +40,7 @@ from estimator.self_noise.coherency import (
 from estimator.self_noise.live_channels import Presence, presence
 
 if TYPE_CHECKING:
+    from estimator.diagnostics.advice import Advice
     from estimator.types import ComplexArray, FloatArray
 
 DIMENSION_LEVEL = 0.01
@@ -71,6 +73,8 @@ class Diagnostics:
         At every frequency.
     n_factors : int
         Dimensions of the motion in that model.
+    untested : Untested or None
+        Why that model was not tested at any frequency; None where it was.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
         Of the pairs that can be compared: of sensors with all their channels.
@@ -86,6 +90,7 @@ class Diagnostics:
     snr: FloatArray
     model: ModelTest
     n_factors: int
+    untested: Untested | None
     bands: tuple[BandDiagnosis, ...]
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
@@ -99,8 +104,6 @@ def diagnose(
     n_effective: float,
     n_factors: int | None = None,
     neighbours: FloatArray | None = None,
-    names: tuple[str, ...] | None = None,
-    channels: tuple[str, ...] | None = None,
     vertical: int | None = None,
 ) -> Diagnostics:
     """Diagnose a huddle test.
@@ -124,10 +127,6 @@ def diagnose(
         diagnosis goes with; ``max(dims)`` by default.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
-    names : tuple of str, optional
-        Of the sensors; "1", "2", … by default.
-    channels : tuple of str, optional
-        Names of all channels, each within its sensor; "1", "2", … by default.
     vertical : int, optional
         Which channel of every sensor is vertical, for the horizontal angles.
 
@@ -141,20 +140,12 @@ def diagnose(
         As `estimator.self_noise.coherency.coherency` says, or if `frequency` does not fit.
     InsufficientDataError
         With fewer than three sensors, or if averages are not a finite number above zero.
-    EstimatorError
-        If there are not as many `names` as sensors, or `channels` as channels.
     """
     check_dims(dims)
     check_averages(n_effective)
     csm = np.asarray(csm, dtype=np.complex128)
     given = coherency(csm, dims)
     frequency = check_frequency(frequency, len(csm))
-    names = names or tuple(str(i + 1) for i in range(len(dims)))
-    channels = channels or tuple(str(r + 1) for d in dims for r in range(d))
-    if (len(names), len(channels)) != (len(dims), sum(dims)):
-        raise EstimatorError(
-            f"{len(names)} names and {len(channels)} channels: expected {len(dims)} and {sum(dims)}"
-        )
     pairs = tuple(combinations(range(len(dims)), 2))
     coherence = np.stack(
         [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
@@ -169,11 +160,11 @@ def diagnose(
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     fit = _fit(matrix, there, d, n_effective)
-    model = _test(
+    model, untested = _test(
         fit if q == d else _fit(matrix, there, q, n_effective), there, n_effective, len(csm)
     )
     snr = np.full((len(csm), sum(dims)), np.nan)
-    if fit is not None:
+    if isinstance(fit, Maximum):
         known = standard_error(fit, n_effective=n_effective) < fit.psi
         snr = there.spread(np.where(known, 1 / fit.psi - 1, np.nan), sum(dims))
     canonical = CanonicalCoherence(matrix)
@@ -202,6 +193,7 @@ def diagnose(
         snr=snr,
         model=model,
         n_factors=q,
+        untested=untested,
         bands=found,
         responses=responses,
         advice=advise(
@@ -209,8 +201,6 @@ def diagnose(
             responses,
             given,
             dims=dims,
-            names=names,
-            channels=channels,
             n_factors=q,
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
@@ -241,36 +231,42 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
     return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
 
 
-def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | None:
-    """Fit motion of q dimensions; None with too few averages, sensors or channels for it."""
-    if n_effective <= matrix.shape[1] or len(there.sensors) < 3:
-        return None
+def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | Untested:
+    """Fit motion of q dimensions, or say why that cannot be done."""
+    if len(there.sensors) < 3:
+        return Untested.TOO_FEW_SENSORS
+    if n_effective <= matrix.shape[1]:
+        return Untested.TOO_FEW_AVERAGES
     try:
         return maximise(matrix, q)
     except InsufficientDataError:
-        return None
+        return Untested.TOO_FEW_CHANNELS
 
 
-def _test(maximum: Maximum | None, there: Presence, n_effective: float, n_freqs: int) -> ModelTest:
-    """Model test at every frequency, NaN where there is none.
+def _test(
+    fit: Maximum | Untested, there: Presence, n_effective: float, n_freqs: int
+) -> tuple[ModelTest, Untested | None]:
+    """Test the model at every frequency; NaN, and why, where it is tested at none.
 
-    Where two channels alone feel a dimension their noise can be divided between them anyhow. Such
+    Where two channels alone sense a dimension their noise can be divided between them anyhow. Such
     a direction of ln psi, known to no better than a factor e, is a parameter that does not help
     the fit. With equal sensors there is none, but for further dimensions.
     """
     unknown = np.full(n_freqs, np.nan)
-    if maximum is None:
-        return ModelTest(unknown, unknown, unknown)
+    if isinstance(fit, Untested):
+        return ModelTest(unknown, unknown, unknown), fit
     try:
-        test = model_test(maximum, n_effective=n_effective)
+        test = model_test(fit, n_effective=n_effective)
     except InsufficientDataError:  # as many parameters as the matrix has
-        return ModelTest(unknown, unknown, unknown)
-    if len(set(there.dims)) == 1 and maximum.n_factors <= there.dims[0]:
-        return test
-    information = fisher.information(maximum.eigenvectors[:, :, maximum.n_factors :])
+        return ModelTest(unknown, unknown, unknown), Untested.TOO_FEW_CHANNELS
+    untested = None if np.isfinite(test.p_value).any() else Untested.SINGULAR
+    if len(set(there.dims)) == 1 and fit.n_factors <= there.dims[0]:
+        return test, untested
+    information = fisher.information(fit.eigenvectors[:, :, fit.n_factors :])
     idle = (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
     degrees = test.degrees + idle
-    return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic))
+    p_value = p_values(degrees, test.statistic)
+    return ModelTest(test.statistic, degrees, p_value), untested
 
 
 def _dimension(

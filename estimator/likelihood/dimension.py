@@ -79,29 +79,6 @@ class BandDimension:
         """Whether no dimension explains the band, beyond what chance does to one in a hundred."""
         return not self.accepted and self.test.p_value < SURE
 
-    @property
-    def text(self) -> str:
-        """The choice and its price in words."""
-        band = f"{self.low:.3g}–{self.high:.3g} Hz"
-        price = f"c.o.v. of one bin {self.cov:.2g}"
-        if np.isfinite(self.usual_cov):
-            price += f" instead of {self.usual_cov:.2g}"
-        if not self.accepted:
-            effect = "the noise estimate is biased here"
-            return (
-                f"{band}: not even {self.n_factors} dimensions of motion explain the averages "
-                f"(statistic {self.test.statistic / self.test.degrees:.3g} times its expectation): "
-                f"{effect if self.is_biased else 'by chance, or just so'}"
-            )
-        if self.n_factors < self.usual:
-            return f"{band}: the motion has {self.n_factors} of {self.usual} dimensions; {price}"
-        if self.n_factors > self.usual:
-            return (
-                f"{band}: the sensors do not feel one motion of {self.usual} dimensions; "
-                f"{self.n_factors} explain it; {price}"
-            )
-        return f"{band}: the motion has all {self.usual} dimensions"
-
 
 def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:
     """Divide frequencies into bands of constant ratio, none with fewer than `least` of them.

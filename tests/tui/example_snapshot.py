@@ -11,7 +11,15 @@ import numpy as np
 
 from daq.drivers.bench_file import parse
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, SensorTotals, Snapshot
+from daq.estimation.snapshot import (
+    ChannelLabel,
+    Diagnosis,
+    FrequencyDiagnosis,
+    SensorTotals,
+    Snapshot,
+    SnapshotDiagnostics,
+    Synchronisation,
+)
 from daq.host_clock import SystemClock
 from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
@@ -19,6 +27,7 @@ from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
 from daq.recording.writer import RecordingWriter
 from daq.timing.clock_model import ClockSource, ClockState
+from estimator.diagnostics.diagnose import diagnose
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
@@ -26,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
+    from estimator.types import FloatArray
 
 SETTINGS = Settings(
     segment=2.0, methods=("three-sensor", "three-channel"), band=(1.0, 20.0), target_cov=0.05
@@ -83,12 +93,69 @@ def made_snapshot(
         ),
         drift=made_drift(),
         closed=closed,
-        diagnostics={
-            "synchronisation": {
-                "residual": dict(zip(SENSORS, RESIDUALS, strict=True)),
-                "noise_bias": np.full((len(frequency), 9), clock_share),
-            }
-        },
+        diagnostics=SnapshotDiagnostics(
+            synchronisation=Synchronisation(
+                residual=dict(zip(SENSORS, RESIDUALS, strict=True)),
+                noise_bias=np.full((len(frequency), 9), clock_share),
+            )
+        ),
+    )
+
+
+def diagnosed(
+    change: FloatArray | None = None,
+    *,
+    n_effective: float = 400.0,
+    n_factors: int | None = None,
+    sensors: tuple[str, ...] = SENSORS,
+    channels: tuple[str, ...] = CHANNELS,
+) -> Snapshot:
+    """Return a finished snapshot with the diagnosis of its averages, changed before."""
+    snapshot = made_snapshot(n_effective=n_effective, closed=True)
+    csm = snapshot.csm if change is None else change @ snapshot.csm @ change.T
+    found = diagnose(
+        csm,
+        snapshot.frequency,
+        dims=snapshot.dims,
+        n_effective=n_effective,
+        n_factors=n_factors,
+        vertical=2,
+    )
+    diagnosis = Diagnosis(
+        n_factors=found.n_factors,
+        pairs=found.pairs,
+        bands=found.bands,
+        responses=found.responses,
+        advice=found.advice,
+        per_frequency=FrequencyDiagnosis(
+            coherence=found.coherence,
+            condition=found.condition,
+            dimension=found.dimension,
+            snr=found.snr,
+            statistic=found.model.statistic,
+            degrees=found.model.degrees,
+            p_value=found.model.p_value,
+        ),
+    )
+    return replace(
+        snapshot,
+        csm=csm,
+        channels=tuple(ChannelLabel(s, c, "m/s²") for s in sensors for c in channels),
+        sensors=tuple(
+            replace(each, name=name) for each, name in zip(snapshot.sensors, sensors, strict=True)
+        ),
+        clocks=tuple(
+            replace(each, sensor=name) for each, name in zip(snapshot.clocks, sensors, strict=True)
+        ),
+        diagnostics=replace(
+            snapshot.diagnostics,
+            synchronisation=replace(
+                snapshot.diagnostics.synchronisation,
+                residual=dict(zip(sensors, RESIDUALS, strict=True)),
+            ),
+            diagnosis=diagnosis,
+            untested=found.untested,
+        ),
     )
 
 

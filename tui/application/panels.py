@@ -12,10 +12,9 @@ from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means, correlation_of, decibels, reached_cov
-from estimator.self_noise.result import Flag
 from tui.application.curves import data_curve, noise_curve
 from tui.output.formatting import clock_time, roughly, several, time_left
-from tui.output.vocabulary import STATE_ALERTS
+from tui.output.vocabulary import FLAG_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -194,19 +193,12 @@ def _channel_noise(
 
 
 def _flagged(snapshot: Snapshot, column: int) -> str:
-    """Say why most frequencies of a channel have no noise; nothing where they do."""
-    words = {
-        Flag.DEAD_CHANNEL: "no signal",
-        Flag.DUPLICATE: "a copy",
-        Flag.NOT_FINITE: "no number",
-        Flag.INVALID: "no number",
-        Flag.NO_COUNTERPART: "unmatched",
-    }
+    """Say why most frequencies of a channel have no estimate; nothing where they have one."""
     for noise in snapshot.results.values():
         flags = noise.flags[1:-1, column]
-        for flag, word in words.items():
-            if 2 * np.count_nonzero(flags & flag) > flags.size:
-                return word
+        for flag, words in FLAG_WORDS.items():
+            if flag & WITHOUT_ESTIMATE and 2 * np.count_nonzero(flags & flag) > flags.size:
+                return words.short
     return ""
 
 

@@ -107,7 +107,7 @@ def _channels(snapshot: Snapshot, settings: Settings) -> Table:
         mean = means[column]
         low, high = float(mean.low[0]), float(mean.high[0])
         table.add_row(
-            Text(f"{label.sensor}.{label.channel}", "bold"),
+            Text(label.name, "bold"),
             level(float(data[column])),
             level_with_error(float(mean.mean[0]), high),
             level(low),
@@ -127,10 +127,7 @@ def details(
         parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
         parts += [_item(f"{method}: {why}") for method, why in snapshot.refused.items()]
         parts += ["", Text("diagnosis", HEADER)]
-        if "bands" in snapshot.diagnostics:
-            parts += diagnosis_details(snapshot)
-        else:
-            parts.append(Text("made from the whole recording, when it has ended", MUTED))
+        parts += diagnosis_details(snapshot)
     parts += ["", Text("events, latest first", HEADER), _events(now)]
     return Group(*parts)
 
@@ -147,7 +144,7 @@ def _sensors(now: RecordingStatus) -> Table:
             grouped(sensor.n_gaps),
             f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
             f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
-            sensor.port,
+            Text(sensor.port),
         )
     return table
 
@@ -172,7 +169,7 @@ def _events(now: RecordingStatus) -> Table:
     for event in reversed(shown):
         at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
         style = "bold #f4a261" if event.kind == EventKind.MARK else ""
-        table.add_row(clock_time(at), event.sensor, Text(event.kind, style), Text(event.text))
+        table.add_row(clock_time(at), Text(event.sensor), Text(event.kind, style), Text(event.text))
     if len(shown) < len(now.events):
         table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
     return table

@@ -98,6 +98,11 @@ def messages(error: BaseException) -> Iterator[str]:
         yield ": ".join(str(part) for part in (error.filename, error.strerror) if part)
     else:
         yield from (str(error) or type(error).__name__).splitlines()
+        loaded = sys.modules.get("daq.estimation.snapshot")
+        if loaded is not None and isinstance(error, loaded.NoResultError):
+            from tui.output.diagnostics import problems  # noqa: PLC0415 - seldom needed
+
+            yield from problems(error.snapshot)
 
 
 app = typer.Typer(

@@ -17,7 +17,7 @@ from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
 from tui.output.console import check_places, console, for_people, write_json, write_text
 from tui.output.formatting import signed
-from tui.output.results import plain
+from tui.output.json_values import plain
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
             screen.print(_device_table(found))
             for entry in found:
                 for remark in _remarks(entry):
-                    screen.print(f"  {entry.information.sensor}: {remark}", markup=False)
+                    screen.print(f"  {entry.information.sensor}: {remark}")
             screen.print(_channel_table(found))
     write_json(
         json,

@@ -12,7 +12,8 @@ from daq.results.limits import exceeded
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
 from tui.output.exit_codes import ExitCode
-from tui.output.results import curves_csv, document, limit_line, remarks, result_table, result_title
+from tui.output.json_document import document
+from tui.output.results import curves_csv, limit_line, remarks, result_table, result_title
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def estimate_recordings(
     check_places(json, csv)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
     met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
-    hint(f"for a report of it: huddle report {files[0]}")
+    hint(f"for a report: huddle report {files[0]}")
     if not met:
         raise typer.Exit(ExitCode.LIMIT_NOT_MET)
 
@@ -100,8 +101,8 @@ def show_result(
         write_text(csv, curves_csv(snapshot))
     failures = exceeded(bench, snapshot, settings)
     for failure in failures:
-        screen.print(f"[red]{limit_line(failure)}[/]")
+        screen.print(limit_line(failure), style="red")
     if bench is not None and bench.limits and not failures:
         names = ", ".join(limit.name for limit in bench.limits)
-        screen.print(f"[green]every channel meets {names}[/]")
+        screen.print(f"every channel meets {names}", style="green")
     return not failures

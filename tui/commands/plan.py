@@ -11,9 +11,8 @@ from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from estimator.planning import plan, planned_csm
 from estimator.spectra.welch import WelchSettings
-from estimator.wording import percent
 from tui.output.console import for_people, write_json
-from tui.output.formatting import signed
+from tui.output.formatting import percent, signed
 from tui.simulation.devices import scenario_of
 
 if TYPE_CHECKING:

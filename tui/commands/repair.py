@@ -9,7 +9,7 @@ from rich.table import Table
 from daq.errors import RecordingError
 from daq.recording.repair import repair, verify
 from tui.output.console import for_people, write_json
-from tui.output.results import plain
+from tui.output.json_values import plain
 
 if TYPE_CHECKING:
     from pathlib import Path

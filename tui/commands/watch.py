@@ -12,6 +12,7 @@ from daq.results.band_summary import band_of, channel_means, reached_cov
 from tui.commands.estimate import show_result
 from tui.output.console import console, finite, write_text
 from tui.output.formatting import clock_time, time_left
+from tui.output.json_values import plain
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class _Lines:
             at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
             if self._json is None:
                 said = " ".join(part for part in (event.sensor, event.kind, event.text) if part)
-                console().print(f"{clock_time(at)}  {said}", markup=False, soft_wrap=True)
+                console().print(f"{clock_time(at)}  {said}", soft_wrap=True)
             else:
                 document = {
                     "at": at,
@@ -125,14 +126,14 @@ def _update(snapshot: Snapshot, settings: Settings, now: RecordingStatus | None)
             }
             for sensor in (() if now is None else now.sensors)
         },
-        "left_out": snapshot.left_out,
+        "left_out": plain(snapshot.left_out),
     }
     if snapshot.results:
         band = band_of(settings, snapshot)
         document["band_hz"] = band
         document["noise"] = {
             method: {
-                f"{label.sensor}.{label.channel}": {
+                label.name: {
                     "psd": float(mean.mean[0]),
                     "low": float(mean.low[0]),
                     "high": float(mean.high[0]),

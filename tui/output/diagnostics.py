@@ -1,4 +1,4 @@
-"""What the averages show of the test itself, in words: what applies, or all of it."""
+"""What the averages show of the test itself: what applies, or all of it."""
 
 from __future__ import annotations
 
@@ -6,122 +6,113 @@ import math
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
-from estimator.diagnostics.advice import model
-from estimator.wording import ratio
-from tui.output.formatting import signed
+from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions, TooFewSensors
+from estimator.diagnostics.kinds import Level, Untested
+from estimator.spectra.segment_rejection import Reason
+from tui.output.advice_summary import summarise
+from tui.output.advice_text import Names, explain, model
+from tui.output.formatting import degrees, ratio, signed, span
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from rich.console import RenderableType
 
-    from daq.estimation.snapshot import Snapshot
-    from estimator.diagnostics.advice import Advice
+    from daq.estimation.snapshot import Diagnosis, Snapshot
+    from estimator.likelihood.dimension import BandDimension
 
-FAILS = "statistic over expectation"
-MOST_PAIRS = 10
-"""Of sensors that are listed in a sentence: all those of five."""
 _LEGEND = (
-    "Coherence: the least between like channels. Condition: of the worst pair of sensors, 1 is "
-    "best. Dimension: of the motion. SNR: motion over noise, least and most of all channels. Model "
-    "test: 1 where one common motion explains everything; p: how often chance alone makes it as "
-    "large."
+    "Coherence: the lowest between like channels of two sensors. Condition: condition number of "
+    "the cross-spectral matrix between two sensors, of the worst pair; 1 is best. Dimension: of "
+    "the motion. SNR: motion over noise, lowest and highest of all channels. Model test: its "
+    "statistic over the expectation, 1 where one common motion explains everything; p: "
+    "probability of so large a statistic by chance."
 )
 
 
 def summary(snapshot: Snapshot) -> list[str]:
     """Return what applies to this test, a line for each kind of thing; worst first."""
-    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
-    kinds: dict[str, list[Advice]] = {}
-    for advice in snapshot.diagnostics.get("advice", ()):
-        kinds.setdefault(next(iter(advice.numbers)), []).append(advice)
-    lines = []
-    for kind, found in kinds.items():
-        in_short = _SHORT.get(kind)
-        if in_short is None or (len(found) == 1 and kind != FAILS):
-            lines += [_with_remedy(advice.text, advice.remedy) for advice in found]
-        else:
-            lines.append(
-                _with_remedy(f"{in_short(found, names)}.{_odd_one(found, names)}", found[0].remedy)
-            )
-    tested = [band.test.p_value for band in snapshot.diagnostics.get("bands", ())]
-    if FAILS not in kinds and any(math.isfinite(p_value) for p_value in tested):
-        lines.append(
-            f"model test: {_model(snapshot)} explains what the sensors share, in all bands"
-        )
-    if tested and not any(math.isfinite(p_value) for p_value in tested) and "sensors" not in kinds:
-        lines.append(f"model test: {why_not_tested(snapshot)}")
-    if "dimension" in snapshot.diagnostics:
-        lines += _dimensions(snapshot)
-    return lines
+    diagnostics = snapshot.diagnostics
+    lines = summarise(diagnostics.advice, Names.of(snapshot))
+    found = diagnostics.diagnosis
+    if found is not None:
+        failing = any(isinstance(a, ModelMisfit | TooFewDimensions) for a in found.advice)
+        if diagnostics.untested is None:
+            if not failing:
+                lines.append(
+                    f"The model test passes in all bands: {model(found.n_factors, snapshot.dims)} "
+                    "explains what the sensors have in common."
+                )
+        elif not any(isinstance(advice, TooFewSensors) for advice in found.advice):
+            lines.append(why_untested(snapshot))
+    return lines + _dimensions(diagnostics.dimensions)
 
 
-def why_not_tested(snapshot: Snapshot) -> str:
-    """Return what the model test lacks, where it could be done in no band."""
-    n_channels = len(snapshot.channels)
-    if snapshot.n_effective > n_channels:
-        return (
-            f"not possible: {model(_n_factors(snapshot))} explains whatever these "
-            "channels share, as they are too few for it"
-        )
-    return (
-        f"none yet: it takes more averages ({snapshot.n_effective:.0f} now) than "
-        f"channels ({n_channels})"
-    )
+def problems(snapshot: Snapshot) -> list[str]:
+    """Return what is wrong with the test, or may be, a line each."""
+    names, found = Names.of(snapshot), snapshot.diagnostics.advice
+    return [str(explain(each, names)) for each in found if each.level is not Level.NOTE]
 
 
-def _n_factors(snapshot: Snapshot) -> int:
-    return int(snapshot.diagnostics.get("n_factors", max(snapshot.dims)))
+_WHY_UNTESTED = {
+    Untested.UNFINISHED: "The test is diagnosed when the recording has ended.",
+    Untested.NO_SEGMENTS: "The model test takes averages, and there is no segment.",
+    Untested.TOO_FEW_SENSORS: "The model test takes three sensors with a signal of their own.",
+    Untested.TOO_FEW_AVERAGES: "The model test takes more averages ({n:.0f} now) than channels "
+    "({channels}).",
+    Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
+    "few channels.",
+    Untested.SINGULAR: "The model test is not possible: at no frequency is the cross-spectral "
+    "matrix finite and regular.",
+}
 
 
-def _model(snapshot: Snapshot) -> str:
-    """Say what was tested: of how many dimensions, where these are not the usual ones."""
-    n_factors = _n_factors(snapshot)
-    return "one common motion" if n_factors == max(snapshot.dims) else model(n_factors)
-
-
-def _odd_one(found: Sequence[Advice], names: list[str]) -> str:
-    """Say which sensor all pairs that something is wrong with have in common."""
-    common = set.intersection(*(set(advice.sensors) for advice in found))
-    harmless = {"angle_deg", "condition"}  # every sensor may be turned
-    at_fault = not any(harmless & set(advice.numbers) for advice in found)
-    if len(common) != 1 or not at_fault:
+def why_untested(snapshot: Snapshot) -> str:
+    """Return why the model of one common motion was not tested; nothing where it was."""
+    why, found = snapshot.diagnostics.untested, snapshot.diagnostics.diagnosis
+    if why is None:
         return ""
-    return f" All of these have {names[common.pop()]} in common: look there first."
-
-
-def _with_remedy(text: str, remedy: str) -> str:
-    return f"{text} {remedy}" if remedy else text
+    n_factors = max(snapshot.dims) if found is None else found.n_factors
+    return _WHY_UNTESTED[why].format(
+        n=snapshot.n_effective,
+        channels=len(snapshot.channels),
+        model=model(n_factors, snapshot.dims),
+    )
 
 
 def details(snapshot: Snapshot) -> list[RenderableType]:
     """Return the diagnosis of every band and pair of sensors, and all advice."""
-    found = snapshot.diagnostics
-    if "bands" not in found:
-        return ["too few sensors or averages to diagnose the test"]
-    parts: list[RenderableType] = [
-        "[b]What the sensors have in common, band by band[/b]",
-        _bands(snapshot),
-        _LEGEND,
-    ]
-    if found["responses"]:
-        parts += ["[b]How the sensors stand to each other[/b]", _pairs(snapshot)]
+    found = snapshot.diagnostics.diagnosis
+    if found is None:
+        return [Text(why_untested(snapshot))]
+    parts: list[RenderableType] = [_heading("Common motion by band"), _bands(found), Text(_LEGEND)]
+    if found.responses:
+        pairs = _pairs(found, snapshot.sensor_names)
+        parts += [_heading("Orientation, gain and delay of the sensors"), pairs]
     if snapshot.octaves:
-        parts += ["[b]What each octave rests on[/b]", _octaves(snapshot)]
-    parts += [
-        f"{advice.level}: {_with_remedy(advice.text, advice.remedy)}" for advice in found["advice"]
-    ]
-    if "dimension" in found:
-        parts += _dimensions(snapshot)
+        parts += [_heading("Segments of each octave"), _octaves(snapshot)]
+    names = Names.of(snapshot)
+    parts += [Text(f"{advice.level}: {explain(advice, names)}") for advice in found.advice]
+    parts += [Text(line) for line in _dimensions(snapshot.diagnostics.dimensions)]
     return parts
 
 
-def _bands(snapshot: Snapshot) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), title_justify="left")
-    for name in ("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p"):
-        table.add_column(name, justify="right")
-    for band in snapshot.diagnostics["bands"]:
+def _heading(text: str) -> Text:
+    return Text(text, style="bold")
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in columns:
+        table.add_column(name, justify="left" if name == "sensors" else "right")
+    return table
+
+
+def _bands(found: Diagnosis) -> Table:
+    table = _table("band (Hz)", "coherence", "condition", "dimension", "SNR", "model test", "p")
+    for band in found.bands:
         known = [float(value) for value in band.snr if math.isfinite(value)]
         statistic = band.test.statistic / band.test.degrees if band.test.degrees else math.nan
         table.add_row(
@@ -141,29 +132,24 @@ def _known(value: float, spec: str) -> str:
 
 
 def _octaves(snapshot: Snapshot) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("octave (Hz)", "segment", "segments", "left out: gap", "disturbed", "averages"):
-        table.add_column(name, justify="right")
+    table = _table("octave (Hz)", "segment", "segments", "left out: gap", "disturbed", "averages")
     for octave in snapshot.octaves:
         table.add_row(
             f"{octave.low:.3g}–{octave.high:.3g}",
             f"{octave.segment:.4g} s",
             str(octave.n_segments),
-            str(octave.left_out.get("gap", 0)),
-            str(octave.left_out.get("transient", 0)),
+            str(octave.left_out.get(Reason.GAP, 0)),
+            str(octave.left_out.get(Reason.TRANSIENT, 0)),
             f"{octave.n_effective:.0f}",
         )
     return table
 
 
-def _pairs(snapshot: Snapshot) -> Table:
-    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("sensors", "turned", "horizontal", "±", "gains", "delay", "not orthogonal"):
-        table.add_column(name, justify="left" if name == "sensors" else "right")
-    for pair in snapshot.diagnostics["responses"]:
+def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:
+    table = _table("sensors", "rotation", "horizontal", "±", "gains", "delay", "not orthogonal")
+    for pair in found.responses:
         table.add_row(
-            f"{names[pair.first]} → {names[pair.second]}",
+            Text(f"{names[pair.first]} → {names[pair.second]}"),
             degrees(pair.rotation_deg),
             degrees(pair.horizontal_deg),
             degrees(pair.angle_error_deg),
@@ -174,122 +160,34 @@ def _pairs(snapshot: Snapshot) -> Table:
     return table
 
 
-def _dimensions(snapshot: Snapshot) -> list[str]:
+def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
     """Return the choice and its price for the bands where it is not the usual one, in short."""
-    choices = snapshot.diagnostics["dimension"]
+    if not choices:
+        return []
     unusual = [choice for choice in choices if choice.accepted and choice.n_factors != choice.usual]
     failing = [choice for choice in choices if choice.is_biased]
-    lines = [choice.text for choice in unusual]
+    lines = [_choice(choice) for choice in unusual]
     if failing:
-        where = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
-        lines.append(f"no dimension that these sensors allow explains {where} Hz")
+        bands = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
+        lines.append(
+            f"At {bands} Hz no dimension that these sensors allow explains the averages: the noise "
+            "estimate is biased there."
+        )
     if len(unusual) + len(failing) < len(choices):
-        where = "elsewhere" if lines else "in all bands"
-        lines.append(f"{where} the motion has all {choices[0].usual} dimensions")
+        elsewhere = "Elsewhere" if lines else "In all bands"
+        lines.append(f"{elsewhere} the motion has all {choices[0].usual} dimensions.")
     return lines
 
 
-def degrees(angle: float) -> str:
-    """Return an angle to a thousandth of a degree."""
-    return f"{signed(angle, '.3f')}°" if math.isfinite(angle) else "?"
-
-
-def _fails(found: Sequence[Advice], _names: list[str]) -> str:
-    by_worst = sorted(found, key=lambda advice: advice.numbers["worst"], reverse=True)
-    most = by_worst[0].numbers
-    where = ", ".join(f"{_span(advice)} ({advice.numbers['worst']:.3g})" for advice in by_worst)
-    effect = by_worst[0].text.partition("). ")[2].rstrip(".")
-    tested = "one common motion"
-    if "dimensions" in most:
-        tested = model(int(most["dimensions"]))
+def _choice(choice: BandDimension) -> str:
+    """Return an unusual choice of the dimension, and its price."""
+    price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
+    if math.isfinite(choice.usual_cov):
+        price += f" instead of {choice.usual_cov:.2g}"
+    at = f"At {span(choice.low, choice.high)}"
+    if choice.n_factors < choice.usual:
+        return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
     return (
-        f"model test fails at {where}: {tested} does not explain what the sensors share "
-        f"(in brackets its statistic over the expectation, at worst, which is at "
-        f"{most['worst_low_hz']:.3g}–{most['worst_high_hz']:.3g} Hz). {effect}"
+        f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
+        f"{choice.n_factors} dimensions explain the averages; {price}."
     )
-
-
-def _listed(
-    found: Sequence[Advice],
-    names: list[str],
-    number: str,
-    words: Callable[[float], str],
-    *,
-    usual: float = 0.0,
-) -> str:
-    """Return pairs of sensors with a number each; of very many those furthest from the usual."""
-    shown = found
-    if len(found) > MOST_PAIRS:
-        by_size = sorted(found, key=lambda each: abs(each.numbers[number] - usual), reverse=True)
-        shown = by_size[:MOST_PAIRS]
-    text = ", ".join(f"{_pair(each, names)} {words(each.numbers[number])}" for each in shown)
-    left = len(found) - len(shown)
-    return text + (f" and less in {left} more pairs" if left else "")
-
-
-def _turned(found: Sequence[Advice], names: list[str]) -> str:
-    horizontal = all(math.isfinite(advice.numbers["horizontal_deg"]) for advice in found)
-    which = "horizontal_deg" if horizontal else "angle_deg"
-    pairs = _listed(found, names, which, degrees)
-    return (
-        f"sensors are turned{' in the horizontal' if horizontal else ''}: {pairs}: no bias in the "
-        "three-sensor or maximum likelihood estimate, but a three-channel or two-channel estimate "
-        "leaks motion"
-    )
-
-
-def _gains(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = _listed(found, names, "gain", lambda gain: f"{gain:.3f}", usual=1.0)
-    return f"gains differ: {pairs}: no bias, but a sensitivity is wrong, and the noise with it"
-
-
-def _delayed(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = _listed(found, names, "delay_s", lambda delay: f"{signed(delay * 1e3, '.3g')} ms")
-    return f"sensors lag each other: {pairs}: segments then differ at their ends"
-
-
-def _skewed(found: Sequence[Advice], names: list[str]) -> str:
-    pairs = _listed(found, names, "nonorthogonality_deg", lambda angle: f"{angle:.1f}°")
-    return (
-        f"channels are away from a right angle: {pairs}: no bias, but the noise estimate scatters "
-        "more the more collinear they are"
-    )
-
-
-def _reversed(found: Sequence[Advice], _names: list[str]) -> str:
-    pairs = ", ".join(advice.text.split(":")[0] for advice in found)
-    return f"{pairs}: no bias, but a sensitivity has the wrong sign"
-
-
-def _swapped(found: Sequence[Advice], _names: list[str]) -> str:
-    pairs = "; ".join(advice.text.split(": ", 1)[1].split(". ")[0] for advice in found)
-    return f"channels are swapped: {pairs}: no bias, but the noise stands under the wrong names"
-
-
-def _singular(found: Sequence[Advice], _names: list[str]) -> str:
-    where = ", ".join(_span(advice) for advice in found)
-    return (
-        f"nearly singular at {where}: one direction moves far less than the others there, and the "
-        "three-sensor estimate scatters more"
-    )
-
-
-_SHORT: dict[str, Callable[[Sequence[Advice], list[str]], str]] = {
-    FAILS: _fails,
-    "angle_deg": _turned,
-    "gain": _gains,
-    "delay_s": _delayed,
-    "nonorthogonality_deg": _skewed,
-    "channel": _reversed,
-    "swapped": _swapped,
-    "condition": _singular,
-}
-
-
-def _pair(advice: Advice, names: list[str]) -> str:
-    return "–".join(names[sensor] for sensor in advice.sensors)
-
-
-def _span(advice: Advice) -> str:
-    low, high = advice.band or (math.nan, math.nan)
-    return f"{low:.3g}–{high:.3g} Hz"

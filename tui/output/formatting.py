@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from daq.results.band_summary import decibels
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 def utc(ns: int) -> str:
@@ -69,3 +73,29 @@ def signed(value: float, spec: str) -> str:
 def several(count: int, one: str, more: str | None = None) -> str:
     """Return a count with its noun."""
     return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")
+
+
+def degrees(angle: float) -> str:
+    """Return an angle to a thousandth of a degree."""
+    return f"{signed(angle, '.3f')}°" if math.isfinite(angle) else "?"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent, to two digits."""
+    value = float(f"{100 * share:.2g}")
+    return f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
+
+
+def ratio(value: float) -> str:
+    """Return a ratio to two digits, without an exponent where people need none."""
+    return f"{float(f'{value:.2g}'):.0f}" if 10 <= value < 1e6 else signed(value, ".2g")
+
+
+def span(low: float, high: float) -> str:
+    """Return a band of frequencies."""
+    return f"{low:.3g}–{high:.3g} Hz"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return words as a list with "and"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -1,20 +1,23 @@
-"""A finished estimate as a table, as JSON and as CSV."""
+"""A finished estimate as a table with remarks, as arrays and as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
-from dataclasses import asdict, is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 
 from daq.results.band_summary import band_of, channel_means, highest_known
 from daq.timing.clock_model import ClockSource
+from estimator.diagnostics.advice import Copies, NoSignal
 from estimator.self_noise.band_means import band_edges
 from estimator.self_noise.result import Flag
-from tui.output.formatting import clock_time, level, level_with_error, several, utc
+from estimator.spectra.segment_rejection import Reason
+from tui.output.formatting import clock_time, level, level_with_error, several, signed, utc
+from tui.output.vocabulary import FLAG_WORDS, REASONS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
@@ -32,14 +35,14 @@ def limit_line(result: LimitResult) -> str:
     )
 
 
-def result_title(snapshot: Snapshot, settings: Settings) -> str:
+def result_title(snapshot: Snapshot, settings: Settings) -> Text:
     """Return what the table of results holds."""
     low, high = band_of(settings, snapshot)
     wanted = high if settings.band is None else settings.band[1]
     asked = f" ({wanted:.3g} was asked for)" if wanted > high else ""
-    return (
-        f"[b]Self-noise, mean over {low:.3g} to {high:.3g} Hz[/b]{asked}, "
-        f"dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval"
+    return Text.assemble(
+        (f"Self-noise, mean over {low:.3g} to {high:.3g} Hz", "bold"),
+        f"{asked}, dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval",
     )
 
 
@@ -59,16 +62,17 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
     data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
     for number, label in enumerate(snapshot.channels):
         power = float(data[number])
-        row = [label.sensor, label.channel, "no signal" if power == 0 else level(power)]
+        no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
+        row = [label.sensor, label.channel, no_signal if power == 0 else level(power)]
         for means in columns:
             mean = means[number]
             row.append(level_with_error(float(mean.mean[0]), float(mean.high[0])))
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     return table
 
 
 def remarks(snapshot: Snapshot) -> list[str]:
-    """Return what must be said beside the numbers, in plain words."""
+    """Return what must be said beside the numbers."""
     taken = (
         f"{several(snapshot.n_segments, 'segment')} ({snapshot.n_effective:.0f} effective averages)"
     )
@@ -76,7 +80,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
     if snapshot.octaves:
         lowest, highest = snapshot.octaves[0], snapshot.octaves[-1]
         if lowest is highest:
-            lines.append("octaves: too few segments as yet for longer ones at lower frequencies")
+            lines.append("octaves: still too few segments for longer ones at lower frequencies")
         else:
             lines[0] += f" above {highest.low:.3g} Hz"
             lines.append(
@@ -84,12 +88,12 @@ def remarks(snapshot: Snapshot) -> list[str]:
                 f" ({lowest.n_effective:.0f} effective averages) below {lowest.high:.3g} Hz"
             )
         disturbed = [
-            f"{octave.left_out['transient']} at {octave.low:.3g}–{octave.high:.3g} Hz"
+            f"{octave.left_out[Reason.TRANSIENT]} at {octave.low:.3g}–{octave.high:.3g} Hz"
             for octave in snapshot.octaves
-            if octave.left_out.get("transient")
+            if octave.left_out.get(Reason.TRANSIENT)
         ]
         if disturbed:
-            lines.append(f"segments left out that something disturbed: {', '.join(disturbed)}")
+            lines.append(f"disturbed segments left out: {', '.join(disturbed)}")
     if snapshot.n_dropped:
         lines.append(f"{several(snapshot.n_dropped, 'segment')} left out{left_out(snapshot)}")
     lines += [
@@ -100,99 +104,89 @@ def remarks(snapshot: Snapshot) -> list[str]:
     ]
     fitted = [clock for clock in snapshot.clocks if clock.source is ClockSource.ARRIVAL_TIMES]
     if fitted:
-        rates = ", ".join(f"{clock.sensor} {clock.ppm:+.1f} ppm" for clock in fitted)
-        left = snapshot.diagnostics["synchronisation"]["residual"]  # between them
+        rates = ", ".join(f"{clock.sensor} {signed(clock.ppm, '+.1f')} ppm" for clock in fitted)
+        left = snapshot.diagnostics.synchronisation.residual  # between them
         worst = max(left[clock.sensor] for clock in fitted) * 1e6
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
-        lines.append(f"clocks {rates}, aligned to about {within} µs".replace("-", "−"))
+        lines.append(f"clocks {rates}, aligned to about {within} µs")
     if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
-        lines.append(f"above {limit:.4g} Hz nothing can be said: samples have been resampled")
+        lines.append(f"above {limit:.4g} Hz there is no estimate: samples have been resampled")
     lines += faulty_channels(snapshot)
     if "two-channel" in snapshot.results:
         lines.append(
-            "two-channel: takes like channels to point the same way, and their gains as given "
-            "(--gain) or alike"
+            "two-channel: assumes that like channels point the same way, and that their gains are "
+            "as given (--gain) or equal"
         )
-    named = any("share of frequencies" in a.numbers for a in snapshot.diagnostics.get("advice", ()))
+    named = any(isinstance(each, NoSignal | Copies) for each in snapshot.diagnostics.advice)
     for method, noise in snapshot.results.items():
-        lines += flagged(snapshot, method, besides=_NAMED if named else 0)
+        lines += flagged(snapshot, method, besides=_NAMED if named else _NONE)
         lines += unresolved(snapshot, method)
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
-                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values came out at or below "
-                "zero, and are kept so"
+                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values are at or below "
+                "zero, and are kept"
             )
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines
 
 
 def faulty_channels(snapshot: Snapshot) -> list[str]:
-    """Return which channels are cut off, or were dead for a while, and what to do."""
+    """Return which channels are clipped, or were dead for a while, and what to do."""
     lines = []
-    clipped = snapshot.diagnostics.get("clipped")
+    clipped, stood_still = snapshot.diagnostics.clipped, snapshot.diagnostics.stood_still
     if clipped:
-        names = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in clipped.items())
-        lines.append(
-            f"clipped: {names} of the samples stand at the largest or smallest count there is: the "
-            "noise of these channels comes out too high. Use a larger range, or less motion"
+        names = ", ".join(
+            f"{snapshot.channels[column].name} ({100 * share:.2g} %)"
+            for column, share in clipped.items()
         )
-    still = snapshot.diagnostics.get("stood_still")
-    if still:
-        names = ", ".join(f"{name} (for {seconds:.2g} s)" for name, seconds in still.items())
         lines.append(
-            f"dead for a while: {names} stood at one count and moved otherwise: the motion missing "
-            "there counts as noise. Leave that time out (--reject; --start and --end for minutes), "
-            "and look at cable and supply"
+            f"Clipped: {names} of the samples are at the largest or smallest count of the range: "
+            "the noise of these channels is too high. Use a larger range, or less motion."
+        )
+    if stood_still:
+        names = ", ".join(
+            f"{snapshot.channels[column].name} (for {seconds:.2g} s)"
+            for column, seconds in stood_still.items()
+        )
+        lines.append(
+            f"Dead for a while: {names} had a constant count, and a signal otherwise: the motion "
+            "missing there counts as noise. Exclude that time (--reject; --start and --end for "
+            "minutes), and check the cable and the power supply."
         )
     return lines
 
 
 def left_out(snapshot: Snapshot) -> str:
     """Return why segments were left out, to follow their number."""
-    words = {
-        "gap": "where a sensor has a gap",
-        "clipped": "where a sensor is at the end of its range",
-        "transient": "that something disturbed",
-    }
     counts = {reason: count for reason, count in snapshot.left_out.items() if count}
     if len(counts) == 1:
-        return " " + words[next(iter(counts))]
-    return ": " + ", ".join(f"{count} {words[reason]}" for reason, count in counts.items())
+        return " " + REASONS[next(iter(counts))]
+    return ": " + ", ".join(f"{count} {REASONS[reason]}" for reason, count in counts.items())
 
 
+_NONE = Flag(0)
 _NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # with its advice, once for all methods
 
 
-def flagged(snapshot: Snapshot, method: str, *, besides: int = 0) -> list[str]:
-    """Return which channels have frequencies at which nothing can be said, and why.
+def flagged(snapshot: Snapshot, method: str, *, besides: Flag = _NONE) -> list[str]:
+    """Return which channels have frequencies without a sound estimate, and why.
 
     ``besides`` are flags that have been named already.
     """
-    words = {
-        Flag.DEAD_CHANNEL: "no signal",
-        Flag.DUPLICATE: "a copy of another channel",
-        Flag.NOT_FINITE: "not finite",
-        Flag.INVALID: "no cross-spectral matrix (not Hermitian, negative or too coherent)",
-        Flag.SINGULAR: "nothing can be said, as other channels are missing or do not move enough "
-        "to compare with (the matrix is singular)",
-        Flag.NO_COUNTERPART: "the other sensors have too few channels to compare with",
-        Flag.NOT_CONVERGED: "the iteration did not reach the maximum",
-    }
     flags = snapshot.results[method].flags[snapshot.frequency <= highest_known(snapshot)]
-    flags = flags[1:-1] & ~besides
     lines = []
-    for flag, why in words.items():
-        counts = ((flags & flag) != 0).sum(axis=0)
+    for flag, words in FLAG_WORDS.items():
+        if not flag & (WITHOUT_ESTIMATE | Flag.NOT_CONVERGED) & ~besides:
+            continue
+        counts = ((flags[1:-1] & flag) != 0).sum(axis=0)
         if counts.any():
             names = ", ".join(
-                f"{label.sensor}.{label.channel}"
-                for label, count in zip(snapshot.channels, counts, strict=True)
-                if count
+                label.name for label, count in zip(snapshot.channels, counts, strict=True) if count
             )
-            most = counts.max()
-            at = "all frequencies" if most == len(flags) else f"{most} of {len(flags)} frequencies"
-            lines.append(f"{method}: {names}: {why}, at {at}")
+            most, n_freqs = counts.max(), len(flags[1:-1])
+            at = "all frequencies" if most == n_freqs else f"{most} of {n_freqs} frequencies"
+            lines.append(f"{method}: {names}: {words.long}, at {at}")
     return lines
 
 
@@ -207,76 +201,11 @@ def unresolved(snapshot: Snapshot, method: str) -> list[str]:
     frequency = snapshot.frequency[1:-1][where]
     line = (
         f"{method}: at {where.sum()} of {len(where)} frequencies ({frequency[0]:.3g} to "
-        f"{frequency[-1]:.3g} Hz) fewer averages than the weak motion there needs: some of it may "
-        f"be left in the noise, by up to about {100 * float(np.median(left_in)):.2g} % of it. "
-        "Record longer to take it out"
+        f"{frequency[-1]:.3g} Hz) there are too few averages for the weak motion: some of it may "
+        f"be left in the noise, up to about {100 * float(np.median(left_in)):.2g} % of it. Record "
+        "longer to remove it"
     )
     return [line]
-
-
-def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
-    """Return one method's result as the JSON that ``--json`` writes (design.md)."""
-    noise = snapshot.results[method]
-    data = snapshot.data_psd
-    return {
-        "method": method,
-        "segments": snapshot.n_segments,
-        "effective_averages": snapshot.n_effective,
-        "frequency_hz": snapshot.frequency.tolist(),
-        "channels": [
-            {
-                "sensor": label.sensor,
-                "channel": label.channel,
-                "unit": label.unit,
-                "data_psd": data[:, column].tolist(),
-                "noise_psd": noise.noise_psd[:, column].tolist(),
-                "noise_psd_low": noise.low[:, column].tolist(),
-                "noise_psd_high": noise.high[:, column].tolist(),
-                "cov": noise.cov[:, column].tolist(),
-                "flags": noise.flags[:, column].tolist(),
-            }
-            for column, label in enumerate(snapshot.channels)
-        ],
-        "diagnostics": _diagnostics(snapshot),
-    }
-
-
-def document(snapshot: Snapshot) -> dict[str, Any]:
-    """Return the JSON of a result: of its one method, or of all of them under ``results``."""
-    documents = [result_document(snapshot, method) for method in snapshot.results]
-    return documents[0] if len(documents) == 1 else {"results": documents}
-
-
-def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
-    return {
-        "elapsed": snapshot.elapsed,
-        "dropped_segments": snapshot.n_dropped,
-        "left_out": snapshot.left_out,
-        "octaves": [asdict(octave) for octave in snapshot.octaves],
-        "flags": {flag.name: flag.value for flag in Flag},
-        "start_utc_ns": snapshot.start_utc_ns,
-        "closed": snapshot.closed,
-        "refused": snapshot.refused,
-        "sensors": [asdict(sensor) for sensor in snapshot.sensors],
-        "clocks": [asdict(clock) for clock in snapshot.clocks],
-        "drift": snapshot.drift.tolist(),
-    } | {key: plain(value) for key, value in snapshot.diagnostics.items()}
-
-
-def plain(value: Any) -> Any:  # noqa: ANN401 - any result of a diagnostic
-    """Return dataclasses and arrays as what JSON knows."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = {name: getattr(value, name) for name in value.__dataclass_fields__}
-    if isinstance(value, np.ndarray | np.generic):
-        if np.iscomplexobj(value):
-            value = {"real": value.real, "imag": value.imag}
-        else:
-            return value.tolist()
-    if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    return value
 
 
 def curves_csv(snapshot: Snapshot) -> str:
@@ -284,7 +213,7 @@ def curves_csv(snapshot: Snapshot) -> str:
     header = ["frequency (Hz)"]
     columns = [snapshot.frequency]
     for number, label in enumerate(snapshot.channels):
-        name, unit = f"{label.sensor}.{label.channel}", f"(({label.unit})²/Hz)"
+        name, unit = label.name, f"(({label.unit})²/Hz)"
         header.append(f"{name} data {unit}")
         columns.append(snapshot.data_psd[:, number])
         for method, noise in snapshot.results.items():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.recording.sensor_state import SensorState
 from daq.timing.clock_model import ClockSource
+from estimator.self_noise.result import Flag
+from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,6 +36,64 @@ STATE_ALERTS: Mapping[SensorState, str] = {
     SensorState.SILENT: "{sensor} has been silent for {time}: check power and cable",
 }
 """What is wrong, and what to do, in each state in which a sensor is overdue."""
+REASONS: Mapping[Reason, str] = {
+    Reason.GAP: "where a sensor has a gap",
+    Reason.CLIPPED: "where a sensor is at the end of its range",
+    Reason.TRANSIENT: "with a transient",
+}
+"""Why segments were left out, to follow their number."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlagWords:
+    """What a flag is called.
+
+    Attributes
+    ----------
+    short : str
+        For a cell of a table.
+    long : str
+        For a line of text, after the name of a channel.
+    """
+
+    short: str
+    long: str
+
+
+FLAG_WORDS: Mapping[Flag, FlagWords] = {
+    Flag.DEAD_CHANNEL: FlagWords("no signal", "no signal"),
+    Flag.DUPLICATE: FlagWords("a copy", "a copy of another channel"),
+    Flag.NOT_FINITE: FlagWords("not finite", "the cross-spectral matrix is not finite"),
+    Flag.INVALID: FlagWords(
+        "invalid",
+        "no cross-spectral matrix (not Hermitian, a negative PSD or a coherence above 1)",
+    ),
+    Flag.SINGULAR: FlagWords(
+        "singular",
+        "no estimate, as the other channels are missing or move too little to compare with (a "
+        "matrix is singular)",
+    ),
+    Flag.NO_COUNTERPART: FlagWords(
+        "unmatched", "no estimate, as the other sensors have too few channels to compare with"
+    ),
+    Flag.NOT_CONVERGED: FlagWords("not converged", "the iteration did not reach the maximum"),
+    Flag.NEGATIVE: FlagWords("below 0", "the estimate is at or below zero"),
+    Flag.BOUNDARY: FlagWords("at zero", "the likelihood is largest without any noise"),
+    Flag.UNRESOLVED: FlagWords(
+        "unresolved", "too few averages for the weak motion: some of it may be left in"
+    ),
+}
+"""In the order in which they are named."""
+
+WITHOUT_ESTIMATE = (
+    Flag.DEAD_CHANNEL
+    | Flag.DUPLICATE
+    | Flag.NOT_FINITE
+    | Flag.INVALID
+    | Flag.SINGULAR
+    | Flag.NO_COUNTERPART
+)
+"""Flags of frequencies that have no estimate."""
 
 
 def clock_source(clock: ClockState, *, short: bool = False) -> str:

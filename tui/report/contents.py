@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.results.band_summary import band_of
+from tui.output.formatting import span
 from tui.report.evidence import (
     advice_section,
     alignment_section,
@@ -16,7 +17,7 @@ from tui.report.evidence import (
 )
 from tui.report.noise import judgements, limits_section, noise_section, verdict
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
-from tui.report.wording import is_known, local_time, plain_number, span, utc_time
+from tui.report.wording import is_known, local_time, plain_number, utc_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,8 +12,8 @@ from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
 from estimator.likelihood.goodness_of_fit import rejected_below
-from tui.output.diagnostics import summary, why_not_tested
-from tui.output.formatting import several, utc
+from tui.output.diagnostics import summary, why_untested
+from tui.output.formatting import several, span, utc
 from tui.output.results import faulty_channels, left_out
 from tui.output.vocabulary import clock_source
 from tui.report.drift import drift_plot
@@ -25,7 +25,6 @@ from tui.report.wording import (
     probability,
     scientific,
     share,
-    span,
 )
 
 if TYPE_CHECKING:
@@ -47,12 +46,10 @@ _USUAL = {EventKind.STARTED, EventKind.CONNECTED, EventKind.STOPPED, EventKind.M
 def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     """Return where one common motion explains the sensors, and where not."""
     title = "Model test: do the sensors share one motion?"
-    bands: Sequence[BandDiagnosis] = snapshot.diagnostics.get("bands", ())
-    tested = [band for band in bands if math.isfinite(band.test.p_value)]
-    if not tested:
-        few = len(snapshot.dims) < 3
-        why = "it takes three sensors" if few else why_not_tested(snapshot)
-        return Section(title, (Paragraph(f"{why[0].upper()}{why[1:]}.", "doubtful"),))
+    found = snapshot.diagnostics.diagnosis
+    if found is None or snapshot.diagnostics.untested is not None:
+        return Section(title, (Paragraph(why_untested(snapshot), "doubtful"),))
+    tested = [band for band in found.bands if math.isfinite(band.test.p_value)]
     rejected = rejected_below(band.test for band in tested)
 
     def fails(band: BandDiagnosis) -> bool:
@@ -64,23 +61,27 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
         where = "; ".join(_run_in_words(run) for run in runs)
         parts.append(
             Paragraph(
-                f"The test fails at {where}. There the sensors do not feel, or do not tell, the "
-                "same motion, and what they do not share counts as noise.",
+                f"The test fails at {where}. There the sensors do not sense, or do not report, the "
+                "same motion. What they do not share counts as noise.",
                 "bad" if any(_ratio(band) > 2 for run in runs for band in run) else "doubtful",
             )
         )
         if len(runs[0]) < len(tested):
-            parts.append(Paragraph("Elsewhere one common motion explains what they share."))
+            parts.append(
+                Paragraph("Elsewhere one common motion explains what they have in common.")
+            )
     else:
         parts.append(
-            Paragraph("One common motion explains what the sensors share, in all bands.", "good")
+            Paragraph(
+                "One common motion explains what the sensors have in common, in all bands.", "good"
+            )
         )
     plot = model_test_plot(snapshot, settings)
     if plot is not None:
         parts += [
             Paragraph(
-                "Likelihood ratio statistic over its expectation; chance puts one point in a "
-                "hundred above the dashed line.",
+                "Likelihood ratio statistic over its expectation. By chance one point in a hundred "
+                "is above the dashed line.",
                 "quiet",
             ),
             plot,
@@ -93,7 +94,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
             tones[number, 6] = "bad" if _ratio(band) > 2 else "doubtful"
         rows.append(
             (
-                span(band.low, band.high).removesuffix(" Hz"),
+                f"{band.low:.3g}–{band.high:.3g}",
                 plain_number(band.coherence, ".4f"),
                 scientific(band.condition, 2),
                 plain_number(band.dimension, ".0f"),
@@ -110,8 +111,8 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
     parts += [
         Table(header, tuple(rows), left=frozenset({6}), tones=tones),
         Paragraph(
-            f"A band fails where p is below {rejected:.2g}: then one good test in a hundred has a "
-            "band that does.",
+            f"A band fails where p is below {rejected:.2g}. One sound test in a hundred has a band "
+            "that fails.",
             "quiet",
         ),
     ]
@@ -119,13 +120,14 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
 
 
 def alignment_section(snapshot: Snapshot) -> Section:
-    """Return how the sensors stand to the first one."""
+    """Return the orientation, gain and delay of the sensors against the first one."""
     title = "Alignment of the sensors"
-    found: Sequence[RelativeResponse] = snapshot.diagnostics.get("responses", ())
+    diagnosis = snapshot.diagnostics.diagnosis
+    found = () if diagnosis is None else diagnosis.responses
     if not found:
-        text = "Not known: that takes three sensors and motion that they share."
+        text = "Not known: this takes three sensors and motion that they share."
         return Section(title, (Paragraph(text, "quiet"),))
-    names = list(dict.fromkeys(label.sensor for label in snapshot.channels))
+    names = snapshot.sensor_names
     reference = min(response.first for response in found)
     shown = [response for response in found if response.first == reference]
     rows = []
@@ -140,11 +142,11 @@ def alignment_section(snapshot: Snapshot) -> Section:
                 " / ".join(plain_number(gain, ".4f") for gain in response.gains),
                 plain_number(response.nonorthogonality_deg, ".2f"),
                 plain_number(response.delay * 1e6, ".1f"),
-                _reversed(snapshot, names[response.second], response) or "none",
+                _reversed(snapshot, response) or "none",
             )
         )
     header = (
-        "sensor", "turned (°)", "in the horizontal (°)", "standard error (°)", "gains",
+        "sensor", "rotation (°)", "in the horizontal (°)", "standard error (°)", "gains",
         "not orthogonal (°)", "delay (µs)", "reversed",
     )  # fmt: skip
     missing = [
@@ -154,9 +156,9 @@ def alignment_section(snapshot: Snapshot) -> Section:
     ]
     parts: list[Part] = [
         Paragraph(
-            f"Against sensor {names[reference]}, from the motion they share at "
+            f"Against sensor {names[reference]}, from the common motion at "
             f"{span(min(r.low for r in shown), max(r.high for r in shown))}. Gains are of like "
-            "channels. Turning alone does not bias the three-sensor and maximum-likelihood "
+            "channels. Rotation alone does not bias the three-sensor and maximum-likelihood "
             "estimates.",
             "quiet",
         ),
@@ -259,11 +261,11 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
 
 
 def advice_section(snapshot: Snapshot) -> Section:
-    """Return what to know and to do, in plain words."""
+    """Return what to know and to do."""
     lines = [*faulty_channels(snapshot), *summary(snapshot)]
     if not lines:
         return Section("Advice", (Paragraph("Nothing to remark."),))
-    return Section("Advice", (Items(tuple(Paragraph(_sentence(line)) for line in lines)),))
+    return Section("Advice", (Items(tuple(map(Paragraph, lines))),))
 
 
 def _ratio(band: BandDiagnosis) -> float:
@@ -281,9 +283,10 @@ def _decibels(ratio: float) -> str:
     return plain_number(10 * math.log10(ratio), ".0f") if ratio > 0 else "< 0"
 
 
-def _reversed(snapshot: Snapshot, sensor: str, response: RelativeResponse) -> str:
-    channels = [label.channel for label in snapshot.channels if label.sensor == sensor]
-    return ", ".join(channels[number] for number in response.reversed_channels)
+def _reversed(snapshot: Snapshot, response: RelativeResponse) -> str:
+    first = sum(snapshot.dims[: response.second])
+    channels = (snapshot.channels[first + number] for number in response.reversed_channels)
+    return ", ".join(label.channel for label in channels)
 
 
 def _clock_row(
@@ -320,7 +323,3 @@ def _when(utc_ns: int, *, after: int | None = None) -> str:
     """Return an instant to the second, without its day where that is the day of one before."""
     text = utc(utc_ns)[:19].replace("T", " ")
     return text[11:] if after is not None and utc(after)[:10] == text[:10] else text
-
-
-def _sentence(line: str) -> str:
-    return line[:1].upper() + line[1:] + ("" if line.endswith((".", "!", "?")) else ".")

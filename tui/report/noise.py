@@ -10,11 +10,13 @@ import numpy as np
 from daq.results.band_summary import band_of, channel_means, decibels
 from daq.results.limits import judged
 from estimator.self_noise.band_means import band_edges
-from tui.output.formatting import several
+from estimator.self_noise.result import Flag
+from tui.output.formatting import several, span
 from tui.output.results import flagged
+from tui.output.vocabulary import FLAG_WORDS
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.plots import noise_plots
-from tui.report.wording import decibel, plain_number, scientific, span
+from tui.report.wording import decibel, plain_number, scientific
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -160,6 +162,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
     inside = slice(*band_edges(snapshot.frequency, band))
     width = np.gradient(snapshot.frequency)[inside]
     data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
+    no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
     rows = []
     for number, label in enumerate(snapshot.channels):
         mean = _only(means[number])
@@ -168,7 +171,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
         rows.append(
             (
                 f"{label.sensor}.{label.channel}",
-                decibel(float(data[number])) if data[number] > 0 else "no signal",
+                decibel(float(data[number])) if data[number] > 0 else no_signal,
                 decibel(mean[0], 2),
                 _interval(mean[1], mean[2]),
                 scientific(math.sqrt(mean[0])) if mean[0] > 0 else decibel(mean[0]),

@@ -134,10 +134,10 @@ def noise_plots(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> 
 
 def model_test_plot(snapshot: Snapshot, settings: Settings) -> Plot | None:
     """Return the statistic of the model test over its expectation; None where there is none."""
-    found = snapshot.diagnostics.get("per_frequency", {})
-    statistic, degrees = found.get("statistic"), found.get("degrees")
-    if statistic is None or not np.isfinite(statistic[1:-1]).any():
+    found = snapshot.diagnostics.diagnosis
+    if found is None or not np.isfinite(found.per_frequency.statistic[1:-1]).any():
         return None
+    statistic, degrees = found.per_frequency.statistic, found.per_frequency.degrees
     window = get_window(settings.window, _SHAPE_LENGTH)
     hop = max(1, round(_SHAPE_LENGTH * (1 - settings.overlap)))
     r = neighbour_correlation(window, hop, max(1, snapshot.n_segments))

@@ -67,11 +67,6 @@ def decibel(psd: float, digits: int = 1) -> str:
     return "below 0" if psd <= 0 else plain_number(decibels(psd), f".{digits}f")
 
 
-def span(low: float, high: float) -> str:
-    """Return a band of frequencies."""
-    return f"{low:.3g}–{high:.3g} Hz"
-
-
 def utc_time(moment: datetime) -> str:
     """Return an instant in UTC to the second."""
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC" if is_known(moment) else "not known"

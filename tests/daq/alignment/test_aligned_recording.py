@@ -16,6 +16,7 @@ from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
 from daq.timing.clock_model import ClockSource, OffsetSource
+from estimator.diagnostics.advice import Copies
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 if TYPE_CHECKING:
@@ -363,8 +364,9 @@ def test_a_sensor_wired_twice_is_named_and_stops_nothing(
     methods = ("three-sensor", "maximum-likelihood")
     path = write(tmp_path / "r.h5", sensors)
     snapshot = estimate([path], Settings(segment=4.0, methods=methods))
-    problems = [each.text for each in snapshot.diagnostics["advice"] if each.level == "problem"]
-    assert problems[0].startswith("d.c0 repeats b.c0 and d.c1 repeats b.c1")
+    copies = snapshot.diagnostics.advice[0]
+    assert isinstance(copies, Copies)
+    assert copies.channels == ((2, 6), (3, 7))  # d's and b's
     apart = snapshot.drift[:, 4] - snapshot.drift[:, 2]
     assert np.abs(apart - missed / 100.0).max() < 1e-6
     for method in methods:

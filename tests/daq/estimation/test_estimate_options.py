@@ -14,9 +14,13 @@ from daq.errors import CannotAlignError
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
+from estimator.diagnostics.advice import Copies, Gain, NoSignal
+from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 from estimator.methods import Flag, self_noise
+from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
 
@@ -69,7 +73,9 @@ def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snap
             if number % 60 == 59:
                 writer.commit()
                 live.update()
-                assert "advice" not in live.snapshot().diagnostics  # only of a finished estimate
+                growing = live.snapshot().diagnostics
+                assert growing.diagnosis is None  # only of a finished estimate
+                assert growing.untested is Untested.UNFINISHED
         writer.close()
         live.update()
         return live.finish()
@@ -98,8 +104,8 @@ def test_what_was_followed_ends_as_the_estimate_from_the_file(
     assert live.left_out == offline.left_out
     assert live.octaves == offline.octaves
     if "reject" in options:
-        assert live.left_out["transient"] == 2
-        assert all(octave.left_out["transient"] == 2 for octave in live.octaves[-1:])
+        assert live.left_out[Reason.TRANSIENT] == 2
+        assert all(octave.left_out[Reason.TRANSIENT] == 2 for octave in live.octaves[-1:])
     if live.octaves:
         assert live.n_segments == live.octaves[-1].n_segments
     (one,), (other,) = live.results.values(), offline.results.values()
@@ -118,7 +124,7 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
             writer.append(replace(block, flags=flags, counts=counts))
     writer.close()
     found = estimate([tmp_path / "r.h5"], SETTINGS)
-    assert "clipped" not in found.diagnostics  # what says so itself is left out
+    assert not found.diagnostics.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
     assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0}
     np.testing.assert_allclose(found.csm, spectra_of(sensors, kept).csm(), rtol=1e-9, atol=1e-3)
@@ -133,13 +139,13 @@ def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -
     sensors["b"].counts[:, 1] = np.clip(sensors["b"].counts[:, 1], -30_000, 20_000)
     sensors["c"].counts[:, 1] = 5
     found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, methods=("all",)))
-    shares = found.diagnostics["clipped"]
-    assert set(shares) == {"b.c1"}
+    shares = found.diagnostics.clipped
+    assert set(shares) == {4}  # b.c1
     at_ends = np.mean(
         (sensors["b"].counts[:, 1] == 20_000) | (sensors["b"].counts[:, 1] == -30_000)
     )
-    assert shares["b.c1"] == pytest.approx(at_ends, rel=0.2)
-    assert "clipped" not in estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics
+    assert shares[4] == pytest.approx(at_ends, rel=0.2)
+    assert not estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics.clipped
 
 
 @pytest.mark.parametrize(("reject", "duration"), [(None, 5), (True, 5), (True, 30)])
@@ -151,14 +157,14 @@ def test_a_channel_that_was_dead_for_a_while_is_named_and_its_sensitivity_is_not
     sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 3e4)  # coarse, often at rest
     sensors["c"].counts[:, 0] = 5  # dead throughout is said elsewhere
     found = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, reject=reject))
-    blamed = [each.text for each in found.diagnostics["advice"] if "gain" in each.numbers]
-    assert not any("b.c1" in text for text in blamed)
+    blamed = [each for each in found.diagnostics.advice if isinstance(each, Gain)]
+    assert not any(4 in {each.channel, each.counterpart} for each in blamed)  # b.c1
     if reject and duration == 5:  # all of it is left out; what lasts is taken for a new level
-        assert "stood_still" not in found.diagnostics
-        assert found.left_out["transient"] >= 9
+        assert not found.diagnostics.stood_still
+        assert found.left_out[Reason.TRANSIENT] >= 9
     else:
-        assert set(found.diagnostics["stood_still"]) == {"b.c1"}
-        assert found.diagnostics["stood_still"]["b.c1"] == pytest.approx(duration, abs=1)
+        assert set(found.diagnostics.stood_still) == {4}
+        assert found.diagnostics.stood_still[4] == pytest.approx(duration, abs=1)
 
 
 def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_path: Path) -> None:
@@ -196,11 +202,12 @@ def test_the_dimension_is_chosen_by_band_and_lowers_the_scatter(tmp_path: Path) 
     path = write(tmp_path / "r.h5", bench(motion=1))
     usual = replace(SETTINGS, methods=("maximum-likelihood",))
     found = estimate([path], replace(usual, dimension="auto"))
-    choices = found.diagnostics["dimension"]
+    choices = found.diagnostics.dimensions
     assert sum(choice.n_factors == 1 for choice in choices) >= 0.8 * len(choices)
     one, three = (estimate([path], replace(usual, dimension=q)) for q in (1, None))
     with_one, with_three = (each.results["maximum-likelihood"].cov for each in (one, three))
-    assert [each.diagnostics["n_factors"] for each in (one, three, found)] == [1, 3, 3]
+    diagnoses = [each.diagnostics.diagnosis for each in (one, three, found)]
+    assert [each.n_factors for each in diagnoses if each is not None] == [1, 3, 3]
     assert np.nanmedian(with_one[1:-1]) < 0.9 * np.nanmedian(with_three[1:-1])
     with pytest.raises(InsufficientDataError, match="at most"):
         estimate([path], replace(usual, dimension=9))
@@ -224,8 +231,8 @@ def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
             if number % 30 == 29:
                 writer.commit()
                 live.update()
-                choices = live.snapshot().diagnostics.get("dimension")
-                if choices is not None and choices is not last:
+                choices = live.snapshot().diagnostics.dimensions
+                if choices and choices is not last:
                     chosen_at.append(live.n_segments)
                     last = choices
         writer.close()
@@ -249,7 +256,8 @@ def test_gains_known_beforehand_are_those_of_the_two_channel_method(tmp_path: Pa
     np.testing.assert_array_equal(found.results["two-channel"].noise_psd, known.noise_psd)
     by_channel = estimate([path], replace(settings, gains={"b.c0": 3.0}))
     np.testing.assert_array_equal(by_channel.results["two-channel"].noise_psd, known.noise_psd)
-    assert found.diagnostics.get("advice") is None  # two sensors: nothing to diagnose with
+    assert found.diagnostics.diagnosis is None  # two sensors: nothing to diagnose with
+    assert found.diagnostics.untested is Untested.TOO_FEW_SENSORS
     for wrong in ({"z": 1.0}, {"b": 0.0}):
         with pytest.raises(CannotAlignError, match="gain"):
             estimate([path], replace(settings, gains=wrong))
@@ -279,8 +287,12 @@ def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
         assert np.isnan(noise.noise_psd[:, 4]).all()
     others = np.delete(found.results["maximum-likelihood"].noise_psd[1:-1], 4, axis=1)
     assert np.isfinite(others).all()
-    assert found.diagnostics["advice"][0].text.startswith("b.c1 has no signal")
-    assert np.isfinite([band.test.p_value for band in found.diagnostics["bands"]]).all()
+    worst = found.diagnostics.advice[0]
+    assert isinstance(worst, NoSignal)
+    assert worst.channels == (4,)
+    assert found.diagnostics.diagnosis is not None
+    assert np.isfinite([band.test.p_value for band in found.diagnostics.diagnosis.bands]).all()
+    assert found.diagnostics.untested is None
 
 
 def test_duplicates_are_flagged_and_nothing_alive_is_an_error(tmp_path: Path) -> None:
@@ -291,13 +303,17 @@ def test_duplicates_are_flagged_and_nothing_alive_is_an_error(tmp_path: Path) ->
     flags = found.results["maximum-likelihood"].flags
     copies = (flags[1:-1] & Flag.DUPLICATE).any(axis=0)
     assert np.flatnonzero(copies).tolist() == [1, 4]
-    # by three-sensor nothing is left, and the message says why, and what is
-    with pytest.raises(InsufficientDataError, match=r"b\.c1 repeats a\.c1.*maximum-likelihood"):
+    # by three-sensor nothing is left, and the advice says why
+    with pytest.raises(NoResultError, match="by three-sensor: check the samples") as nothing:
         estimate([tmp_path / "r.h5"], SETTINGS)
+    worst, *_ = nothing.value.snapshot.diagnostics.advice
+    assert isinstance(worst, Copies)
+    assert worst.channels == ((1, 4),)
     for sensor in sensors.values():
         sensor.counts[:] = 0
-    with pytest.raises(InsufficientDataError, match="no signal"):
+    with pytest.raises(NoResultError) as nothing:
         estimate([write(tmp_path / "0.h5", sensors)], settings)
+    assert sum(isinstance(a, NoSignal) for a in nothing.value.snapshot.diagnostics.advice) == 3
 
 
 def test_sensors_with_different_numbers_of_channels(tmp_path: Path) -> None:
@@ -309,7 +325,9 @@ def test_sensors_with_different_numbers_of_channels(tmp_path: Path) -> None:
     truth = 100.0**2 / (RATE / 2)
     np.testing.assert_allclose(noise[1:-1, ~alone].mean(axis=0), truth, rtol=0.1)
     # By three directions nobody but they themselves feels they cannot be compared.
-    assert all({pair.first, pair.second} != {0, 3} for pair in found.diagnostics["responses"])
+    assert found.diagnostics.diagnosis is not None
+    responses = found.diagnostics.diagnosis.responses
+    assert all({pair.first, pair.second} != {0, 3} for pair in responses)
 
 
 def test_the_diagnosis_is_that_of_the_estimator(tmp_path: Path) -> None:
@@ -317,14 +335,15 @@ def test_the_diagnosis_is_that_of_the_estimator(tmp_path: Path) -> None:
     angle = np.radians(4.0)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     sensors["c"].counts[:, :2] = np.rint(sensors["c"].counts[:, :2] @ turn)
-    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS).diagnostics
-    assert found["pairs"] == (("a", "b"), ("a", "c"), ("b", "c"))
-    turned = {(pair.first, pair.second): pair.rotation_deg for pair in found["responses"]}
-    assert turned[0, 1] == pytest.approx(0.0, abs=0.2)
-    assert turned[0, 2] == pytest.approx(4.0, abs=0.2)
-    assert {band.test.p_value > 1e-4 for band in found["bands"]} == {True}
-    assert found["per_frequency"]["p_value"].shape == (51,)
-    assert found["per_frequency"]["coherence"].shape == (51, 3)
+    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS).diagnostics.diagnosis
+    assert found is not None
+    assert found.pairs == ((0, 1), (0, 2), (1, 2))
+    rotation = {(pair.first, pair.second): pair.rotation_deg for pair in found.responses}
+    assert rotation[0, 1] == pytest.approx(0.0, abs=0.2)
+    assert rotation[0, 2] == pytest.approx(4.0, abs=0.2)
+    assert {band.test.p_value > 1e-4 for band in found.bands} == {True}
+    assert found.per_frequency.p_value.shape == (51,)
+    assert found.per_frequency.coherence.shape == (51, 3)
 
 
 def test_which_channel_is_vertical() -> None:

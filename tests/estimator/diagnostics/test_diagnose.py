@@ -1,15 +1,35 @@
-"""Diagnostics in numbers and in words, on models whose faults are known."""
+"""Diagnostics on models whose faults are known."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from estimator.diagnostics.advice import (
+    Advice,
+    Copies,
+    Delay,
+    Gain,
+    MissingChannels,
+    MissingDimension,
+    ModelMisfit,
+    MotionAcross,
+    MotionLeftIn,
+    NoSignal,
+    NotOrthogonal,
+    ReversedPolarity,
+    Rotated,
+    SwappedChannels,
+    TooFewDimensions,
+    TooFewSensors,
+    WeakMotion,
+)
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
-from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
+from estimator.diagnostics.kinds import AdviceKind, Level, Untested
+from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import model_test
 from estimator.self_noise.three_sensor import three_sensor
@@ -21,6 +41,7 @@ if TYPE_CHECKING:
 FREQUENCY = np.linspace(1, 20, 96)
 THREE = (3, 3, 3)
 INDEPENDENT = np.zeros(0)
+Kind = TypeVar("Kind", bound=Advice)
 
 
 def averages(csm: ComplexArray, *, n: int = 1080, seed: int = 1) -> ComplexArray:
@@ -38,9 +59,19 @@ def of(csm: ComplexArray, *, dims: tuple[int, ...] = THREE, n: int = 1080) -> Di
     return diagnose(csm, FREQUENCY, dims=dims, n_effective=n, neighbours=INDEPENDENT)
 
 
+def advice_of(kind: type[Kind], found: Diagnostics) -> list[Kind]:
+    return [advice for advice in found.advice if isinstance(advice, kind)]
+
+
+def test_every_kind_of_advice_is_one_class() -> None:
+    kinds = {each.__name__: each.kind for each in Advice.__subclasses__()}
+    assert sorted(kinds.values()) == sorted(AdviceKind)
+
+
 def test_a_good_bench_gets_no_warning() -> None:
     found = of(averages(bench(np.eye(3), np.eye(3), np.eye(3))))
-    assert [advice for advice in found.advice if advice.level != "note"] == []
+    assert [advice for advice in found.advice if advice.level is not Level.NOTE] == []
+    assert found.untested is None
     assert np.all(found.dimension == 3)
     assert np.median(found.snr[:, 0]) == pytest.approx(100, rel=0.05)
     assert np.median(found.snr[:, 1]) == pytest.approx(150, rel=0.05)
@@ -50,62 +81,91 @@ def test_a_good_bench_gets_no_warning() -> None:
     assert [band.test.p_value > 0.001 for band in found.bands].count(False) == 0
 
 
-def test_turned_sensors_are_told_with_their_angle() -> None:
+def test_rotated_sensors_are_found_with_their_angle() -> None:
     turned = Rotation.from_euler("z", -4.1, degrees=True).as_matrix()
     found = of(averages(bench(np.eye(3), turned, np.eye(3))))
-    texts = [advice for advice in found.advice if "are turned by" in advice.text]
-    assert [advice.sensors for advice in texts] == [(0, 1), (1, 2)]
-    assert texts[0].text.startswith("Sensors 1 and 2 are turned by 4.1°")
-    assert "no bias" in texts[0].text
-    assert texts[0].numbers["angle_deg"] == pytest.approx(4.1, abs=0.1)
+    rotated = advice_of(Rotated, found)
+    assert [advice.sensors for advice in rotated] == [(0, 1), (1, 2)]
+    assert {advice.level for advice in rotated} == {Level.NOTE}
+    assert rotated[0].angle_deg == pytest.approx(4.1, abs=0.1)
+    assert rotated[0].error_deg < 0.1
+    assert np.isnan(rotated[0].horizontal_deg)  # nobody said which channel is vertical
+
+
+def test_a_wrong_gain_is_found_with_its_channel() -> None:
+    found = of(averages(bench(np.eye(3), np.diag([1.0, 1.05, 1.0]), np.eye(3))))
+    first, second = advice_of(Gain, found)
+    assert (first.sensors, first.channel, first.counterpart) == ((0, 1), 4, 1)
+    assert first.ratio == pytest.approx(1.05, abs=0.005)
+    assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
+    assert second.ratio == pytest.approx(1 / 1.05, abs=0.005)
+
+
+def test_reversed_polarity_is_found_with_its_channel() -> None:
+    found = of(averages(bench(np.eye(3), np.diag([1.0, -1.0, 1.0]), np.eye(3))))
+    first, second = advice_of(ReversedPolarity, found)
+    assert (first.sensors, first.channel, first.counterpart) == ((0, 1), 4, 1)
+    assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
+    assert first.level is Level.WARNING
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (np.diag([1.0, 1.05, 1.0]), "2.2 reads 1.05"),
-        (np.diag([1.0, -1.0, 1.0]), "2.2 has the opposite polarity"),
-        (np.array([[1, 0, 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]]), "5.7° away"),
-    ],
-    ids=["gain", "polarity", "not orthogonal"],
+    ("angle_deg", "level"), [(5.7, Level.NOTE), (25.0, Level.WARNING)], ids=["some", "much"]
 )
-def test_faults_of_one_sensor(fault: FloatArray, words: str) -> None:
+def test_channels_that_are_not_orthogonal(angle_deg: float, level: Level) -> None:
+    angle = np.deg2rad(angle_deg)
+    fault = np.array([[1, 0, 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     found = of(averages(bench(np.eye(3), fault, np.eye(3))))
-    assert any(words in advice.text for advice in found.advice if 1 in advice.sensors)
+    skewed = advice_of(NotOrthogonal, found)
+    assert skewed[0].sensors == (0, 1)
+    assert skewed[0].deviation_deg == pytest.approx(angle_deg, abs=0.2)
+    assert skewed[0].level is level
 
 
 def test_swapped_channels_are_told_from_a_turned_sensor() -> None:
     near = Rotation.from_euler("z", 7, degrees=True).as_matrix()
     found = of(averages(bench(np.eye(3), near[[1, 0, 2]], np.eye(3))))
-    swapped = [advice for advice in found.advice if "swapped" in advice.text]
+    swapped = advice_of(SwappedChannels, found)
     assert [advice.sensors for advice in swapped] == [(0, 1), (1, 2)]
-    assert "2.1 moves as 1.2 does, 2.2 moves as 1.1 does" in swapped[0].text
-    assert not any("polarity" in advice.text for advice in found.advice)
+    assert swapped[0].channels == ((3, 1), (4, 0))
+    assert swapped[1].channels == ((6, 4), (7, 3))
+    assert not advice_of(ReversedPolarity, found)
     turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     other = of(averages(bench(np.eye(3), turned, np.eye(3))))
-    assert not any("swapped" in advice.text for advice in other.advice)
-    assert any("turned by 90.0°" in advice.text for advice in other.advice)
+    assert not advice_of(SwappedChannels, other)
+    assert advice_of(Rotated, other)[0].angle_deg == pytest.approx(90, abs=0.1)
 
 
 def test_incoherence_is_a_problem_where_it_is() -> None:
     csm = plane_waves(FREQUENCY, pentagon()[:3], snr=400.0)
     found = of(averages(csm))
-    (problem,) = [advice for advice in found.advice if advice.level == "problem"]
-    assert "does not explain" in problem.text
+    (problem,) = [advice for advice in found.advice if advice.level is Level.PROBLEM]
+    assert isinstance(problem, ModelMisfit)
+    assert problem.n_factors == 3
+    assert problem.worst_statistic >= problem.statistic > 1
+    assert problem.p_value < 1e-10
+    assert not problem.is_wrong  # unless waves cross the sensors: then it is
+    assert problem.largest_error > 0.5 > problem.error
+    assert problem.largest_error == 10 * problem.error  # three triaxial sensors bound it
     assert problem.band is not None
     assert problem.band[0] > 2
     assert problem.band[1] == FREQUENCY[-1]
     assert found.bands[-1].test.p_value < 1e-10
-    assert "dimension auto" not in problem.remedy
+    assert problem.band[0] <= problem.worst_band[0] < problem.worst_band[1] <= problem.band[1]
     five = of(averages(plane_waves(FREQUENCY, pentagon(), snr=400.0)), dims=(3,) * 5)
-    assert any("dimension auto" in advice.remedy for advice in five.advice)
+    misfit = advice_of(ModelMisfit, five)[0]
+    assert misfit.largest_error == 2 * misfit.error  # five bound it closer
 
 
 def test_planar_sensors_in_motion_of_three_dimensions_are_told_why() -> None:
     tilted = Rotation.from_euler("x", 10, degrees=True).as_matrix()
     two = [tilted[:2], np.eye(3)[:2], tilted.T[:2]]
     found = of(averages(bench(*two)), dims=(2, 2, 2))
-    assert any("use triaxial data" in advice.remedy for advice in found.advice)
+    misfit = advice_of(ModelMisfit, found)[0]
+    assert misfit.n_factors == 2
+    assert np.isinf(misfit.largest_error)  # three planar sensors do not bound it
+    assert misfit.is_wrong
+    assert misfit.error >= 0.5
 
 
 def test_a_missing_dimension_is_seen() -> None:
@@ -113,15 +173,18 @@ def test_a_missing_dimension_is_seen() -> None:
     turned = Rotation.from_euler("y", 30, degrees=True).as_matrix()
     found = of(averages(bench(np.eye(3), turned, np.eye(3), motion=flat)))
     assert np.mean(found.dimension == 2) > 0.95
-    assert any("only 2 of 3 dimensions" in advice.text for advice in found.advice)
+    (missing,) = advice_of(MissingDimension, found)
+    assert (missing.n_dimensions, missing.n_channels) == (2, 3)
+    assert missing.condition > np.sqrt(1080)
 
 
 def test_noise_alone_is_said_to_be_so() -> None:
     rng = np.random.default_rng(3)
     csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
     found = of(averages(csm))
-    assert any("weaker than the noise" in advice.text for advice in found.advice)
-    assert not any("left in" in advice.numbers for advice in found.advice)  # too many averages
+    assert all(advice.snr < 1 for advice in advice_of(WeakMotion, found))
+    assert advice_of(WeakMotion, found)
+    assert not advice_of(MotionLeftIn, found)  # too many averages
 
 
 @pytest.mark.parametrize("snr", [0.1, 0.3])
@@ -131,26 +194,27 @@ def test_motion_left_in_by_few_averages_is_no_silent_bias(d: int, snr: float) ->
     rng = np.random.default_rng(d)
     csm = random_bench(rng, dims=(d,) * 3, snr=snr, noise_psd=np.ones(3 * d))
     found = of(averages(csm, n=20), dims=(d,) * 3, n=20)
-    said = [advice for advice in found.advice if "left in" in advice.numbers]
+    said = advice_of(MotionLeftIn, found)
     covered = sum(a.band[0] <= f <= a.band[1] for a in said if a.band for f in FREQUENCY)
     assert covered > 0.8 * len(FREQUENCY)
-    assert "too high" in said[0].text
+    assert said[0].n_effective == 20
     draws = wishart(csm, 20, rng, n_draws=8000)
     noise = three_sensor(draws, dims=(d,) * 3, n_effective=20).noise_psd
     bias = noise.mean() - 1
     error = noise.mean(axis=1).std() / np.sqrt(len(draws))
     assert bias > 5 * error
-    assert bias - 3 * error < said[0].numbers["left in"] < 2 * bias
+    assert bias - 3 * error < said[0].share < 2 * bias
 
 
 def test_a_lagging_sensor() -> None:
     phase = np.exp(-2j * np.pi * FREQUENCY[:, None] * np.repeat([0, 0.02, 0], 3))
     csm = phase[:, :, None] * (bench(*[np.eye(3)] * 3) - np.eye(9)) * phase[:, None].conj()
     found = of(averages(csm + np.eye(9)))
-    lags = [advice for advice in found.advice if "lags" in advice.text]
-    assert lags[0].sensors == (0, 1)
-    assert lags[0].numbers["delay_s"] == pytest.approx(0.02, rel=0.01)
-    assert lags[0].numbers["samples"] == pytest.approx(0.8, rel=0.01)
+    first, second = advice_of(Delay, found)
+    assert (first.sensors, second.sensors) == ((0, 1), (1, 2))
+    assert first.delay == pytest.approx(0.02, rel=0.01)
+    assert first.delay_samples == pytest.approx(0.8, rel=0.01)
+    assert second.delay == pytest.approx(-0.02, rel=0.01)  # the third leads the second
 
 
 def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
@@ -160,17 +224,11 @@ def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
     part = csm[:, alive[:, None], alive]
     csm[:, 4, :] = csm[:, :, 4] = 0
     csm[5] = np.nan
-    found = diagnose(
-        csm,
-        FREQUENCY,
-        dims=(3,) * 4,
-        n_effective=1080,
-        neighbours=INDEPENDENT,
-        names=("A", "B", "C", "D"),
-        channels=("X", "Y", "Z") * 4,
-    )
-    (problem,) = [advice for advice in found.advice if advice.level == "problem"]
-    assert problem.text.startswith("B.Y has no signal")
+    found = diagnose(csm, FREQUENCY, dims=(3,) * 4, n_effective=1080, neighbours=INDEPENDENT)
+    (problem,) = [advice for advice in found.advice if advice.level is Level.PROBLEM]
+    assert isinstance(problem, NoSignal)
+    assert (problem.sensors, problem.channels, problem.whole_sensor) == ((1,), (4,), False)
+    assert problem.share_of_frequencies == 1
     known = np.delete(np.arange(96), 5)
     assert np.isnan(found.model.statistic[5])
     direct = model_test(maximise(part[known], 3), n_effective=1080)  # never there: fewer degrees
@@ -187,19 +245,12 @@ def test_a_signal_wired_twice_is_named_with_its_twin() -> None:
     csm = averages(bench(*[np.eye(3)] * 3))
     csm[:, 4, :] = csm[:, 1, :]
     csm[:, :, 4] = csm[:, :, 1]
-    found = diagnose(
-        csm,
-        FREQUENCY,
-        dims=THREE,
-        n_effective=1080,
-        names=("A", "B", "C"),
-        channels=("X", "Y", "Z") * 3,
-    )
-    problem, warning = (a for a in found.advice if a.level != "note")
-    assert "B.Y repeats A.Y" in problem.text
-    assert problem.sensors == (0, 1)
-    assert "three-sensor estimates say nothing of A and C" in warning.text
-    assert "maximum-likelihood" in warning.remedy
+    found = diagnose(csm, FREQUENCY, dims=THREE, n_effective=1080)
+    problem, warning = (a for a in found.advice if a.level is not Level.NOTE)
+    assert isinstance(problem, Copies)
+    assert (problem.sensors, problem.channels) == ((0, 1), ((1, 4),))
+    assert isinstance(warning, MissingChannels)
+    assert (warning.sensors, warning.whole_sensors) == ((1,), (0, 2))
     assert np.median(found.model.p_value) > 0.2
     assert np.isfinite(found.model.p_value).all()
 
@@ -213,18 +264,25 @@ def test_two_sensors_that_are_left_are_told_what_can_still_be_said(how: str) -> 
         csm[:, 6:, :] = csm[:, 3:6, :]
         csm[:, :, 6:] = csm[:, :, 3:6]
     found = of(csm)
-    (left,) = [advice for advice in found.advice if "signal of their own" in advice.text]
-    assert left.text.startswith("Only sensors 1 and 2 have")
-    assert left.level == "problem"
-    assert "no channel's noise is above its own spectrum" in left.text
-    assert "--method two-channel" in left.remedy
+    (left,) = advice_of(TooFewSensors, found)
+    assert left.sensors == (0, 1)
+    assert left.level is Level.PROBLEM
+    if how == "dead":
+        (dead,) = advice_of(NoSignal, found)
+        assert (dead.sensors, dead.channels, dead.whole_sensor) == ((2,), (6, 7, 8), True)
+    else:
+        (copies,) = advice_of(Copies, found)
+        assert copies.channels == ((3, 6), (4, 7), (5, 8))
+    assert found.untested is Untested.TOO_FEW_SENSORS
     assert np.isnan(found.model.p_value).all()
     assert np.all(found.dimension == 3)
 
 
 def test_nothing_alive_is_said_too() -> None:
     found = of(np.zeros((96, 9, 9), np.complex128))
-    assert any("Fewer than two sensors" in advice.text for advice in found.advice)
+    (left,) = advice_of(TooFewSensors, found)
+    assert left.sensors == ()
+    assert found.untested is Untested.TOO_FEW_SENSORS
     assert found.responses == ()
 
 
@@ -236,18 +294,15 @@ def test_a_small_certain_misfit_is_graded_by_what_it_does() -> None:
     csm[3, 0] += 0.1
     n = 8000
     found = of(averages(csm, n=n), n=n)
-    misfits = [advice for advice in found.advice if "does not explain" in advice.text]
-    misfit = max(misfits, key=lambda advice: advice.numbers["worst"])
+    misfit = max(advice_of(ModelMisfit, found), key=lambda advice: advice.worst_statistic)
     truth = maximise(csm[None], 3)
     off = np.abs(truth.psi - 1).max()
     seen = np.sqrt(2 * truth.discrepancy[0] / 27)
-    assert misfit.level == "warning"
-    assert "certain, but small" in misfit.text
-    assert misfit.numbers["worst"] < 2.5
-    assert misfit.numbers["unexplained"] == pytest.approx(seen, rel=0.2)
-    assert off < misfit.numbers["off"] < 5 * off
-    assert "may be off, by up to about" in misfit.text
-    assert "sensors closer together" in misfit.remedy
+    assert misfit.level is Level.WARNING
+    assert misfit.worst_statistic < 2.5
+    assert misfit.unexplained == pytest.approx(seen, rel=0.2)
+    assert off < misfit.error < 5 * off
+    assert not misfit.is_wrong
 
 
 def test_a_good_test_is_seldom_said_to_fail_in_any_band() -> None:
@@ -256,16 +311,15 @@ def test_a_good_test_is_seldom_said_to_fail_in_any_band() -> None:
     csm = np.broadcast_to(bench(*[np.eye(2)] * 3, motion=np.diag([100.0, 150])), (96, 6, 6))
     draws = wishart(csm, 400, rng, n_draws=250)
     found = [of(draw, dims=(2, 2, 2), n=400) for draw in draws]
-    failing = sum(any("does not explain" in a.text for a in each.advice) for each in found)
+    failing = sum(bool(advice_of(ModelMisfit, each)) for each in found)
     assert failing <= 8  # Poisson of mean 2.5: more in one of a thousand
 
 
 def test_what_waves_do_stays_within_what_is_said() -> None:
     csm = plane_waves(FREQUENCY, pentagon()[:3], snr=100.0)
     found = of(averages(csm, n=8000), n=8000)
-    problems = [advice for advice in found.advice if "does not explain" in advice.text]
     off = np.abs(maximise(csm[-1:], 3).psi - 1).max()
-    assert any(off < advice.numbers["off at most"] < 4 * off for advice in problems)
+    assert any(off < advice.largest_error < 4 * off for advice in advice_of(ModelMisfit, found))
 
 
 @pytest.mark.parametrize("d", [1, 2])
@@ -273,39 +327,30 @@ def test_sensors_of_fewer_channels_are_told_what_their_sensor_space_asks(d: int)
     """Section 5: the motion's dimension against the sensors'."""
     motion = np.diag([100.0, 150.0])[:d, :d]
     found = of(averages(bench(*[np.eye(d)] * 3, motion=motion)), dims=(d,) * 3)
-    (space,) = [advice for advice in found.advice if "three dimensions of motion" in advice.text]
-    assert "parallel" in space.remedy
-    assert space.numbers["added by 1 degree"] == pytest.approx(
-        space.numbers["SNR"] * 3.05e-4, rel=0.01
-    )
-    assert not any(
-        "three dimensions" in a.text for a in of(averages(bench(*[np.eye(3)] * 3))).advice
-    )
+    (space,) = advice_of(MotionAcross, found)
+    assert (space.n_channels, space.sensors, space.larger_sensors) == (d, (), ())
+    assert space.added_by_one_degree == pytest.approx(space.snr * 3.05e-4, rel=0.01)
+    assert not advice_of(MotionAcross, of(averages(bench(*[np.eye(3)] * 3))))
 
 
 @pytest.mark.parametrize(
     ("dims", "concerned"),
     [
-        ((3, 2, 2), [(2, (0, 1, 2))]),
-        ((3, 3, 2), [(2, (0, 1))]),
-        ((3, 2, 1), [(1, (0, 1)), (2, (2,))]),
+        ((3, 2, 2), [(2, (0, 1, 2), (0,))]),
+        ((3, 3, 2), [(2, (0, 1), (0, 1))]),
+        ((3, 2, 1), [(1, (0, 1), (0, 1)), (2, (2,), (0,))]),
         ((3, 3, 2, 3), []),
     ],
 )
 def test_sensors_of_unequal_channels_are_told_which_of_them_are_compared(
-    dims: tuple[int, ...], concerned: list[tuple[int, tuple[int, ...]]]
+    dims: tuple[int, ...], concerned: list[tuple[int, tuple[int, ...], tuple[int, ...]]]
 ) -> None:
     """As `three_sensor` does: with the two other sensors that have most channels."""
     csm = bench(*(np.eye(3)[:k] for k in dims))
-    found = diagnose(
-        averages(csm), FREQUENCY, dims=dims, n_effective=1080, names=tuple("ABCD")[: len(dims)]
-    )
-    space = [advice for advice in found.advice if "three dimensions of motion" in advice.text]
-    assert [advice.sensors for advice in space] == [sensors for _, sensors in concerned]
-    for advice, (d, _) in zip(space, concerned, strict=True):
-        assert f"these feel {d} of three" in advice.text
-        assert 100 < advice.numbers["SNR"] < 300  # of channels whose noise is known
-        assert "maximum likelihood, which compares with the further channels of A" in advice.remedy
+    found = diagnose(averages(csm), FREQUENCY, dims=dims, n_effective=1080)
+    space = advice_of(MotionAcross, found)
+    assert [(a.n_channels, a.sensors, a.larger_sensors) for a in space] == concerned
+    assert all(100 < advice.snr < 300 for advice in space)  # of channels whose noise is known
 
 
 @pytest.mark.parametrize("dims", [(3, 2, 1), (3, 3, 1), (2, 2, 1)])
@@ -325,17 +370,18 @@ def test_a_good_bench_of_unequal_sensors_is_seldom_said_to_fail(dims: tuple[int,
 
 def test_a_model_of_fewer_dimensions_than_the_motion_fails_in_its_own_name() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
-    for q, model in ((0, "a model without motion"), (1, "one motion of 1 dimension"), (3, "")):
+    for q in (0, 1, 3):
         found = diagnose(
             csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q, neighbours=INDEPENDENT
         )
-        failing = [advice for advice in found.advice if "does not explain" in advice.text]
+        failing = advice_of(TooFewDimensions, found)
         assert found.n_factors == q
-        assert bool(failing) == bool(model)
+        assert bool(failing) == (q < 3)
+        assert not advice_of(ModelMisfit, found)
         for advice in failing:
-            assert advice.level == "problem"
-            assert f"{model} does not explain what the sensors have in common" in advice.text
-            assert "--dimension auto" in advice.remedy
+            assert advice.level is Level.PROBLEM
+            assert advice.n_factors == q
+            assert advice.worst_statistic >= advice.statistic > 2
         assert np.median(found.snr) > 50  # whatever is tested
     assert np.isfinite(found.model.p_value).all()
 
@@ -364,7 +410,22 @@ def test_early_averages_leave_the_model_open() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)), n=9)
     found = of(csm, n=9)
     assert np.isnan(found.model.p_value).all()
+    assert found.untested is Untested.TOO_FEW_AVERAGES
     assert len(found.responses) == 3
+
+
+def test_why_there_is_no_model_test() -> None:
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    for q in (6, 7):  # nothing is left for the test; more than can be told from the noise
+        many = diagnose(csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q)
+        assert many.untested is Untested.TOO_FEW_CHANNELS
+        assert np.isnan(many.model.p_value).all()
+    singular = averages(csm[0], n=1080)
+    singular[:, 8, :] = singular[:, 7, :] + singular[:, 6, :]
+    singular[:, :, 8] = singular[:, :, 7] + singular[:, :, 6]
+    found = of(singular)
+    assert found.untested is Untested.SINGULAR
+    assert np.isnan(found.model.p_value).all()
 
 
 def test_refusals() -> None:
@@ -378,9 +439,6 @@ def test_refusals() -> None:
     for n in (np.nan, np.inf, -1):
         with pytest.raises(InsufficientDataError, match="finite number above zero"):
             diagnose(csm, FREQUENCY, dims=THREE, n_effective=n)
-    for labels in ({"names": ("a", "b")}, {"channels": ("x", "y", "z")}):
-        with pytest.raises(EstimatorError, match="expected 3 and 9"):
-            diagnose(csm, FREQUENCY, dims=THREE, n_effective=100, **labels)
 
 
 def test_lists_do_as_well_as_arrays() -> None:

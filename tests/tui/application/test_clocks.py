@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from daq.drivers.bench_file import parse
+from daq.estimation.snapshot import SnapshotDiagnostics, Synchronisation
 from daq.results.clock_effect import effect, effect_by_sensor
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.application.clocks import clock_line, drift_lines, drift_title
@@ -24,9 +25,7 @@ def test_effect_is_the_share_of_the_band_s_noise() -> None:
     share = np.zeros_like(snapshot.data_psd)
     share[2:41, 3] = 0.2  # the band is 1 to 20 Hz, in steps of 0.5 Hz
     share[41:, 4] = 0.9  # above it
-    snapshot = replace(
-        snapshot, diagnostics={"synchronisation": {"noise_bias": share, "residual": {}}}
-    )
+    snapshot = replace(snapshot, diagnostics=SnapshotDiagnostics(Synchronisation(noise_bias=share)))
     shares = effect(snapshot, SETTINGS)
     np.testing.assert_allclose(shares, [0, 0, 0, 0.2, 0, 0, 0, 0, 0], atol=1e-12)
 
@@ -68,7 +67,9 @@ def test_clocks_that_are_one_or_unknown() -> None:
     assert one.plain == "clocks: all sensors share one"
     unknown = clock_line(replace(snapshot, clocks=()), SETTINGS, width=78)
     assert unknown.plain == "clocks: not known yet"
-    early = clock_line(replace(empty_snapshot(), diagnostics={}), SETTINGS, width=100)
+    early = clock_line(
+        replace(empty_snapshot(), diagnostics=SnapshotDiagnostics()), SETTINGS, width=100
+    )
     assert early.plain.endswith("effect not known yet")
 
 

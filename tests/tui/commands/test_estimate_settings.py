@@ -204,7 +204,7 @@ def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
     found = estimate([tmp_path / "r.h5"])
     assert len(found.octaves) > 1
     assert {"gap", "transient"} == set(found.octaves[0].left_out)
-    assert found.diagnostics["dimension"]
+    assert found.diagnostics.dimensions
     assert set(found.results) == {
         "two-channel",
         "three-channel",

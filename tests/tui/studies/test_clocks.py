@@ -68,16 +68,17 @@ def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> 
     scenario = free_running(snr=1e4, duration=400.0, seed=5)
     path = synthesise(tmp_path / "r.h5", scenario, duration=400.0)
     snapshot = estimate([path])
-    stated = snapshot.diagnostics["synchronisation"]
+    stated = snapshot.diagnostics.synchronisation
     left = residuals(snapshot, scenario)
-    told = [stated["residual"][name] for name in scenario.names]
+    told = [stated.residual[name] for name in scenario.names]
     assert told[0] == 0.0  # the reference
     assert np.all(left < 2 * np.array(told[1:]))
     assert np.all(left > 0.2 * np.array(told[1:]))
     at = int(np.searchsorted(snapshot.frequency, 80.0))
+    assert stated.noise_bias is not None
     # Coherent power over noise is the SNR, for a channel that sees the weaker direction.
     expected = (2 * np.pi * 80 * told[2]) ** 2 * 1e4
-    assert stated["noise_bias"][at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
+    assert stated.noise_bias[at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
 
 
 @pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
@@ -91,7 +92,7 @@ def test_half_a_minute_is_stated_by_its_samples_not_by_its_arrivals(
         synthesise(path, scenario, duration=30.0, latency=latency, seed=seed)
         snapshot = estimate([path], Settings(segment=2.0))
         left.append(residuals(snapshot, scenario))
-        told = snapshot.diagnostics["synchronisation"]["residual"]
+        told = snapshot.diagnostics.synchronisation.residual
         stated.append([told[name] for name in scenario.names[1:]])
     # Some µs a segment leave half a µs; the arrivals know no better than 5 µs, and 1 ms.
     ratio = np.sqrt(np.mean(np.square(stated)) / np.mean(np.square(left)))
@@ -112,7 +113,7 @@ def test_a_clock_that_samples_could_not_refine_is_as_far_off_as_the_arrivals_lea
         csm=np.empty((0, 3, 3), complex),
         results={},
     )
-    assert told["residual"] == pytest.approx({"A": 0.0, "B": 1e-6, "C": 13e-6})
+    assert told.residual == pytest.approx({"A": 0.0, "B": 1e-6, "C": 13e-6})
 
 
 def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None:
@@ -124,7 +125,7 @@ def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None
             tmp_path / f"{seed}.h5", scenario, duration=100.0, latency=latency, seed=seed
         )
         snapshot = estimate([path])
-        stated = snapshot.diagnostics["synchronisation"]["residual"]
+        stated = snapshot.diagnostics.synchronisation.residual
         left += residuals(snapshot, scenario).tolist()
         told += [stated[name] for name in scenario.names[1:]]
     # Both are of one slope mostly, and two of three share the reference's. Blind to polls, 700
@@ -185,12 +186,14 @@ def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     assert np.isnan(noise[beyond]).all()
     assert np.isfinite(noise[1:][~beyond[1:]]).all()
     said = "\n".join(remarks(snapshot))
-    assert "above 90 Hz nothing can be said" in said
+    assert "above 90 Hz there is no estimate" in said
     assert "not finite" not in said
-    highest = snapshot.diagnostics["bands"][-1]
+    found = snapshot.diagnostics.diagnosis
+    assert found is not None
+    highest = found.bands[-1]
     assert highest.high == pytest.approx(90.0)
     assert highest.test.p_value > 1e-3
-    assert len(snapshot.diagnostics["per_frequency"]["p_value"]) == len(snapshot.frequency)
+    assert len(found.per_frequency.p_value) == len(snapshot.frequency)
     assert "singular" not in said
     as_it_is = estimate([path], Settings(clocks="nominal"))  # nothing is resampled
     assert np.isfinite(as_it_is.csm).all()

@@ -1,0 +1,279 @@
+"""When each kind of advice applies: section 5 of the paper, and what the model test adds to it.
+
+A misfit of the model is graded by its possible effect on the noise estimate. The averages show a
+misfit of ``sqrt((statistic - 1) / (n - d))`` of the noise, where ``statistic`` is in units of its
+expectation. The error of the estimate is larger, because the fit absorbs most of a misfit before
+the test sees the rest. Computed on true matrices, it is larger by up to `TYPICAL` times for noise
+that channels share, for noise of a sensor's own mount, and for one more dimension of motion. For
+waves that cross sensors 0.1 m apart it is larger by up to `CROSSING` times with four sensors or
+more, by up to `CROSSING_THREE` times with three triaxial sensors, and without bound with three
+sensors of fewer channels. See `docs/decisions/0035`.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.diagnostics.advice import (
+    Advice,
+    Copies,
+    MissingChannels,
+    MissingDimension,
+    ModelMisfit,
+    MotionAcross,
+    MotionLeftIn,
+    NearlySingular,
+    NoSignal,
+    TooFewDimensions,
+    TooFewSensors,
+    WeakMotion,
+)
+from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.orientation import orientation
+from estimator.likelihood.goodness_of_fit import rejected_below
+from estimator.self_noise.live_channels import presence
+from estimator.self_noise.result import Flag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from estimator.diagnostics.band import BandDiagnosis
+    from estimator.diagnostics.relative_response import RelativeResponse
+    from estimator.self_noise.coherency import Coherency
+
+TYPICAL = 10.0
+CROSSING = 20.0
+CROSSING_THREE = 100.0
+LARGE_ERROR = 0.5
+"""Of the noise: an estimate with this error is wrong."""
+SMALL_ERROR = 0.05
+"""Of the noise: a smaller error does no harm."""
+
+
+def advise(
+    bands: tuple[BandDiagnosis, ...],
+    responses: tuple[RelativeResponse, ...],
+    given: Coherency,
+    *,
+    dims: tuple[int, ...],
+    n_factors: int,
+    n_effective: float,
+    nyquist: float,
+) -> tuple[Advice, ...]:
+    """Say what there is to know about a test, worst first.
+
+    Parameters
+    ----------
+    bands : tuple of BandDiagnosis
+        Rising.
+    responses : tuple of RelativeResponse
+    given : Coherency
+        The averages.
+    dims : tuple of int
+    n_factors : int
+        Dimensions of the motion in the model that was tested.
+    n_effective : float
+    nyquist : float
+        Hz.
+
+    Returns
+    -------
+    tuple of Advice
+    """
+    alive = presence(given, dims).dims
+    found = [
+        *_absent(given, dims),
+        *(
+            _too_few_dimensions(bands, n_factors)
+            if n_factors < max(alive, default=0)
+            else _incoherence(bands, dims, n_factors, n_effective)
+        ),
+        *_sensor_space(bands, dims),
+        *_dimensions(bands, alive, n_effective),
+        *_weak_motion(bands),
+        *_left_in(bands, max(dims), n_effective),
+        *(advice for response in responses for advice in orientation(response, dims, nyquist)),
+    ]
+    order = list(Level)
+    return tuple(sorted(found, key=lambda advice: order.index(advice.level)))
+
+
+def _runs(
+    bands: Iterable[BandDiagnosis], applies: Callable[[BandDiagnosis], bool]
+) -> Iterator[list[BandDiagnosis]]:
+    """Neighbouring bands to which something applies, together."""
+    for true, run in groupby(bands, applies):
+        if true:
+            yield list(run)
+
+
+def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
+    return run[0].low, run[-1].high
+
+
+def _is_weak(band: BandDiagnosis) -> bool:
+    known = band.snr[~np.isnan(band.snr)]
+    return len(known) > 0 and bool(known.max() < 1)
+
+
+def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
+    """Channels that are dead or copies, and sensors that are too few without them."""
+    valid = given.valid
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    dead = ((given.flags[valid] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
+    copies = given.duplicates[valid].mean(axis=0)
+    for sensor in range(len(dims)):
+        own = np.flatnonzero((sensor_of == sensor) & (dead > 0.5))
+        if len(own):
+            yield NoSignal(
+                level=Level.PROBLEM,
+                sensors=(sensor,),
+                channels=tuple(own.tolist()),
+                whole_sensor=len(own) == dims[sensor] > 1,
+                share_of_frequencies=float(dead[own].max()),
+            )
+    pairs = np.argwhere(np.triu(copies > 0.5))
+    if len(pairs):
+        yield Copies(
+            level=Level.PROBLEM,
+            sensors=tuple(np.unique(sensor_of[pairs]).tolist()),
+            channels=tuple((int(original), int(copy)) for original, copy in pairs),
+            share_of_frequencies=float(copies.max()),
+        )
+    there = presence(given, dims)
+    missing = tuple(s for s in range(len(dims)) if s not in there.whole)
+    if len(there.sensors) < 3:
+        yield TooFewSensors(level=Level.PROBLEM, sensors=there.sensors)
+    elif missing and len(there.whole) < 3:
+        yield MissingChannels(level=Level.WARNING, sensors=missing, whole_sensors=there.whole)
+
+
+def _statistic(*bands: BandDiagnosis) -> float:
+    """Return the statistic of the model test over its expectation, of bands together."""
+    return sum(b.test.statistic for b in bands) / sum(b.test.degrees for b in bands)
+
+
+def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Iterator[Advice]:
+    """Where fewer dimensions were asked for than the sensors sense."""
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
+        worst = max(run, key=_statistic)
+        yield TooFewDimensions(
+            level=Level.PROBLEM,
+            band=_span(run),
+            n_factors=n_factors,
+            statistic=_statistic(*run),
+            worst_statistic=_statistic(worst),
+            worst_band=_span([worst]),
+        )
+
+
+def _incoherence(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_factors: int, n_effective: float
+) -> Iterator[Advice]:
+    d = max(dims)
+    crossing = CROSSING if len(dims) > 3 else CROSSING_THREE if d == 3 else np.inf
+    rejected = rejected_below(band.test for band in bands)
+    for run in _runs(bands, lambda band: band.test.p_value < rejected):
+        worst = max(run, key=_statistic)
+        most = _statistic(worst)
+        seen = float(np.sqrt(max(0.0, most - 1) / max(n_effective - d, 1.0)))
+        error, largest = TYPICAL * seen, crossing * seen
+        likely = float(np.sqrt(error * largest)) if np.isfinite(largest) else error
+        level = Level.WARNING if likely >= SMALL_ERROR else Level.NOTE
+        if likely >= LARGE_ERROR:
+            level = Level.PROBLEM
+        yield ModelMisfit(
+            level=level,
+            band=_span(run),
+            n_factors=n_factors,
+            statistic=_statistic(*run),
+            worst_statistic=most,
+            worst_band=_span([worst]),
+            p_value=min(b.test.p_value for b in run),
+            unexplained=seen,
+            error=error,
+            largest_error=largest,
+            is_wrong=error >= LARGE_ERROR,
+        )
+
+
+def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
+    """Section 5: the motion's dimension against that of what the compared channels sense."""
+    strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
+    if not strong:
+        return
+    snr = float(max(np.nanmax(band.snr) for band in strong))
+    shared = [sorted(dims[:i] + dims[i + 1 :])[-2] for i in range(len(dims))]
+    for d in sorted({n for n in shared if n < 3}):
+        larger = tuple(i for i, n in enumerate(dims) if n > d)
+        yield MotionAcross(
+            level=Level.NOTE,
+            sensors=tuple(i for i, n in enumerate(shared) if n == d) if larger else (),
+            band=_span(strong),
+            n_channels=d,
+            larger_sensors=larger,
+            snr=snr,
+            added_by_one_degree=float(snr * np.sin(np.deg2rad(1)) ** 2),
+        )
+
+
+def _dimensions(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
+) -> Iterator[Advice]:
+    if len(dims) < 2:
+        return
+    full = min(sorted(dims)[-2:])
+    for run in _runs(bands, lambda band: band.dimension < full and not _is_weak(band)):
+        yield MissingDimension(
+            level=Level.WARNING,
+            band=_span(run),
+            n_dimensions=min(b.dimension for b in run),
+            n_channels=full,
+            condition=max(b.condition for b in run),
+        )
+    limit = float(np.sqrt(n_effective))
+    for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
+        yield NearlySingular(
+            level=Level.NOTE, band=_span(run), condition=max(b.condition for b in run)
+        )
+
+
+def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
+    for run in _runs(bands, _is_weak):
+        snr = float(np.nanmax([b.snr for b in run]))
+        yield WeakMotion(level=Level.NOTE, band=_span(run), snr=snr)
+
+
+def left_in(d: int, n_effective: float) -> float:
+    """Return how much weak motion the triad methods leave in at most, as a fraction of the noise.
+
+    Parameters
+    ----------
+    d : int
+        Dimensions of the motion.
+    n_effective : float
+
+    Returns
+    -------
+    float
+        The largest over the SNR s of ``ρ (1 − g)^(n / d)``, with ``ρ = s / (1 + 2 s)`` what two
+        like sensors do not predict and ``g = (s / (1 + s))²`` their coherence: exact for d = 1
+        (`docs/decisions/0033`), and for d = 2 and 3 no less than was measured there.
+    """
+    s = np.geomspace(1e-4, 10, 501)
+    return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())
+
+
+def _left_in(bands: tuple[BandDiagnosis, ...], d: int, n_effective: float) -> Iterator[Advice]:
+    """Where motion is weak in most channels: by scatter the SNR of some comes out far too high."""
+    share = left_in(d, n_effective)
+    if share < SMALL_ERROR:
+        return
+    for run in _runs(bands, lambda b: bool((b.snr < 1).sum() > np.isfinite(b.snr).sum() / 2)):
+        yield MotionLeftIn(
+            level=Level.NOTE, band=_span(run), share=share, n_effective=float(n_effective)
+        )

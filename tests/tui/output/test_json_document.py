@@ -1,0 +1,68 @@
+"""The document that --json writes, as docs/json.md describes it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from estimator.diagnostics.kinds import Untested
+from estimator.self_noise.result import Flag
+from estimator.spectra.segment_rejection import Reason
+from tests.tui.example_snapshot import diagnosed, made_snapshot
+from tui.output.console import finite
+from tui.output.json_document import document, result_document
+
+
+def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
+    change = np.eye(9)
+    change[5, 5] = -1
+    found = json.loads(json.dumps(finite(document(diagnosed(change)))))
+    diagnostics = found["results"][0]["diagnostics"]
+    polarity = [each for each in diagnostics["advice"] if each["kind"] == "reversed-polarity"]
+    assert [(a["sensors"], a["numbers"]) for a in polarity] == [
+        ([0, 1], {"channel": 5, "counterpart": 2}),
+        ([1, 2], {"channel": 8, "counterpart": 5}),
+    ]
+    assert polarity[0]["level"] == "warning"
+    assert polarity[0]["text"].startswith("B.Z has the opposite polarity to A.Z")
+    assert polarity[0]["remedy"].endswith(".")
+    assert set(polarity[0]) == {"kind", "level", "sensors", "band", "text", "numbers", "remedy"}
+    (rotated, *_) = [each for each in diagnostics["advice"] if each["kind"] == "rotated"]
+    assert set(rotated["numbers"]) == {"angle_deg", "horizontal_deg", "error_deg"}
+    assert diagnostics["n_factors"] == 3
+    assert diagnostics["untested"] is None
+    assert diagnostics["pairs"] == [["A", "B"], ["A", "C"], ["B", "C"]]
+    assert set(diagnostics["per_frequency"]) == {
+        "coherence", "condition", "dimension", "snr", "statistic", "degrees", "p_value",
+    }  # fmt: skip
+    assert len(diagnostics["per_frequency"]["coherence"][0]) == 3
+    assert set(diagnostics["bands"][0]["test"]) == {
+        "statistic", "degrees", "p_value", "n_frequencies",
+    }  # fmt: skip
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    snapshot = made_snapshot()
+    diagnostics = result_document(snapshot, "three-sensor")["diagnostics"]
+    assert not {"bands", "advice", "clipped", "stood_still", "dimension"} & set(diagnostics)
+    assert diagnostics["untested"] == "unfinished"
+    assert diagnostics["flags"] == {flag.name: flag.value for flag in Flag}
+    faulty = replace(
+        snapshot,
+        left_out={Reason.GAP: 2, Reason.TRANSIENT: 0},
+        diagnostics=replace(
+            snapshot.diagnostics,
+            clipped={4: 0.25},
+            stood_still={0: 3.0},
+            untested=Untested.TOO_FEW_SENSORS,
+        ),
+    )
+    told = json.loads(json.dumps(finite(result_document(faulty, "three-sensor"))))["diagnostics"]
+    assert told["clipped"] == {"B.Y": 0.25}
+    assert told["stood_still"] == {"A.X": 3.0}
+    assert told["left_out"] == {"gap": 2, "transient": 0}
+    assert told["untested"] == "too-few-sensors"
+    assert set(told["synchronisation"]) == {"residual", "noise_bias"}
+    assert told["synchronisation"]["residual"]["C"] == 0.6e-6

@@ -1,0 +1,106 @@
+"""A finished estimate as the JSON that ``--json`` writes (docs/json.md)."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+from estimator.diagnostics.advice import Advice
+from estimator.self_noise.result import Flag
+from tui.output.advice_text import Names, explain
+from tui.output.json_values import plain
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Diagnosis, Snapshot
+
+
+def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
+    """Return one method's result as the JSON that ``--json`` writes."""
+    noise = snapshot.results[method]
+    data = snapshot.data_psd
+    return {
+        "method": method,
+        "segments": snapshot.n_segments,
+        "effective_averages": snapshot.n_effective,
+        "frequency_hz": snapshot.frequency.tolist(),
+        "channels": [
+            {
+                "sensor": label.sensor,
+                "channel": label.channel,
+                "unit": label.unit,
+                "data_psd": data[:, column].tolist(),
+                "noise_psd": noise.noise_psd[:, column].tolist(),
+                "noise_psd_low": noise.low[:, column].tolist(),
+                "noise_psd_high": noise.high[:, column].tolist(),
+                "cov": noise.cov[:, column].tolist(),
+                "flags": noise.flags[:, column].tolist(),
+            }
+            for column, label in enumerate(snapshot.channels)
+        ],
+        "diagnostics": _diagnostics(snapshot),
+    }
+
+
+def document(snapshot: Snapshot) -> dict[str, Any]:
+    """Return the JSON of a result: of its one method, or of all of them under ``results``."""
+    documents = [result_document(snapshot, method) for method in snapshot.results]
+    return documents[0] if len(documents) == 1 else {"results": documents}
+
+
+def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
+    found = snapshot.diagnostics
+    document = {
+        "elapsed": snapshot.elapsed,
+        "dropped_segments": snapshot.n_dropped,
+        "left_out": snapshot.left_out,
+        "octaves": snapshot.octaves,
+        "flags": {flag.name: flag.value for flag in Flag},
+        "start_utc_ns": snapshot.start_utc_ns,
+        "closed": snapshot.closed,
+        "refused": snapshot.refused,
+        "sensors": snapshot.sensors,
+        "clocks": snapshot.clocks,
+        "drift": snapshot.drift,
+        "synchronisation": {"residual": found.synchronisation.residual},
+        "untested": found.untested,
+    }
+    if found.synchronisation.noise_bias is not None:
+        document["synchronisation"] = found.synchronisation
+    if found.dimensions:
+        document["dimension"] = found.dimensions
+    if found.diagnosis is not None:
+        document |= _diagnosis(found.diagnosis, snapshot)
+    for key, by_column in (("clipped", found.clipped), ("stood_still", found.stood_still)):
+        if by_column:
+            document[key] = {snapshot.channels[n].name: value for n, value in by_column.items()}
+    return {key: plain(value) for key, value in document.items()}
+
+
+def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
+    sensors, names = snapshot.sensor_names, Names.of(snapshot)
+    return {
+        "bands": found.bands,
+        "responses": found.responses,
+        "advice": [_advice(each, names) for each in found.advice],
+        "n_factors": found.n_factors,
+        "pairs": [(sensors[one], sensors[two]) for one, two in found.pairs],
+        "per_frequency": found.per_frequency,
+    }
+
+
+def _advice(advice: Advice, names: Names) -> dict[str, Any]:
+    words = explain(advice, names)
+    common = {field.name for field in fields(Advice)}
+    return {
+        "kind": advice.kind,
+        "level": advice.level,
+        "sensors": advice.sensors,
+        "band": advice.band,
+        "text": words.text,
+        "numbers": {
+            field.name: getattr(advice, field.name)
+            for field in fields(advice)
+            if field.name not in common
+        },
+        "remedy": words.remedy,
+    }
