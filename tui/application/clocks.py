@@ -100,7 +100,7 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
             *((wander,) if wide else ()),
             microseconds(left[clock.sensor]) if left.get(clock.sensor, 0.0) > 0 else "–",
             Text("?", MUTED) if math.isnan(share) else Text(percent(share), STYLES[grade(share)]),
-            _source(clock, is_reference=clock.sensor == against),
+            Text(_source(clock, is_reference=clock.sensor == against)),
         )
     return table
 

@@ -175,7 +175,8 @@ class Board(Vertical):
             return
         _, before = self._written.get(selector, ("", 1))
         self._written[selector] = (text, n_lines)
-        self.query_one(selector, Static).update(text, layout=n_lines != before)
+        shown = Text(text) if isinstance(text, str) else text  # names are no markup
+        self.query_one(selector, Static).update(shown, layout=n_lines != before)
 
     def _scroll_to_chosen(self) -> None:
         shown = self._shown

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from daq.bench.durations import format_duration
 from daq.bench.loading import dump
@@ -108,10 +109,12 @@ def run_demo(
     low, high = band_of(settings, snapshot)
     added = max(entry.clocks / entry.true_psd for entry in compared)
     screen.print(
-        f"[b]Self-noise from {low:g} to {high:g} Hz[/b] in dB re 1 ({snapshot.unit})²/Hz, "
-        f"{snapshot.n_segments} segments;\n"
-        "± is the 95 % interval of all nine at once, ✓ where it covers the truth"
-        + (f"\nand what its clocks may add: up to {_percent(added)}" if added >= TOLD else "")
+        Text.assemble(
+            (f"Self-noise from {low:g} to {high:g} Hz", "bold"),
+            f" in dB re 1 ({snapshot.unit})²/Hz, {snapshot.n_segments} segments;\n"
+            "± is the 95 % interval of all nine at once, ✓ where it covers the truth",
+            f"\nand what its clocks may add: up to {_percent(added)}" if added >= TOLD else "",
+        )
     )
     screen.print(comparison_table(compared, snapshot, settings))
     for line in verdict(compared):
@@ -213,13 +216,13 @@ def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Set
             for entry in compared
             if (entry.sensor, entry.channel) == (label.sensor, label.channel)
         }
-        row = [f"{label.sensor}.{label.channel}", level(float(data[column]))]
-        row.append(level(found[METHODS[0]].true_psd))
+        row = [Text(label.name), Text(level(float(data[column])))]
+        row.append(Text(level(found[METHODS[0]].true_psd)))
         for method in METHODS:
             entry = found[method]
             colour, mark = ("green", "✓") if entry.covers else ("red", "✗")
             estimate = level_with_error(entry.noise_psd, entry.high)
-            row.append(f"[{colour}]{estimate} {mark}[/]")
+            row.append(Text(f"{estimate} {mark}", colour))
         table.add_row(*row)
     return table
 

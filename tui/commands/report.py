@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.markup import escape
 
 from daq.results.limits import exceeded
 from tui.commands.estimate import estimated
@@ -80,7 +79,5 @@ def write_report(
 
     with notices().status("writing the report"):
         report = write(snapshot, out, recordings=recordings, settings=settings)
-    colour = _COLOURS.get(report.verdict.tone)
-    verdict = escape(report.verdict.text)
-    screen.print(f"[{colour}]{verdict}[/]" if colour else verdict)
-    screen.print(f"{escape(str(out))} written", soft_wrap=True)
+    screen.print(report.verdict.text, style=_COLOURS.get(report.verdict.tone))
+    screen.print(f"{out} written", soft_wrap=True)

@@ -107,7 +107,7 @@ def run_test(
     finally:
         recorder.close()
     if report is None:
-        hint(f"for a report of it: huddle report {out}")
+        hint(f"for a report: huddle report {out}")
     if interruption.pressed:
         raise typer.Exit(ExitCode.INTERRUPTED)
     if not met:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from daq.acquisition.recorder import recording_path
 from daq.drivers.bench_file import load
@@ -61,7 +62,8 @@ class BenchControls:
             table.add_column(column, no_wrap=True)
         for sensor in self.bench.sensors:
             channels = " ".join(channel.name for channel in sensor.channels)
-            table.add_row(sensor.name, sensor.model, sensor.driver, sensor.port, channels)
+            row = (sensor.name, sensor.model, sensor.driver, sensor.port, channels)
+            table.add_row(*map(Text, row))
         return table
 
     def start(self) -> Path:
@@ -209,10 +211,9 @@ def _run(app: HuddleApp, *, again: Path) -> None:
         notices().print(
             f"The recording goes on: {app.path}\nLook at it again, or stop it: huddle tui {again}",
             soft_wrap=True,
-            markup=False,
         )
     else:
-        notices().print(f"recording: {app.path}", soft_wrap=True, markup=False)
+        notices().print(f"recording: {app.path}", soft_wrap=True)
 
 
 def show_demo(path: Path, settings: Settings) -> Path | None:

@@ -1,4 +1,8 @@
-"""Where results go: tables for people to standard output, JSON for programs where it is asked."""
+"""Where results go: tables for people to standard output, JSON for programs where it is asked.
+
+Text is printed as it is: names of sensors and files may hold brackets and colons, which would
+otherwise be taken for markup and emoji. Colour is asked for with ``style=`` or ``rich.text.Text``.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +28,20 @@ _for_json = False
 
 def console() -> Console:
     """Return standard output."""
-    return Console(highlight=False, width=_width(sys.stdout))
+    return Console(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
 
 
 @cache
 def notices() -> Console:
     """Return standard error, where progress and remarks go; nowhere if it carries JSON."""
-    return Console(stderr=True, highlight=False, width=_width(sys.stderr), quiet=_for_json)
+    return Console(
+        stderr=True,
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=_width(sys.stderr),
+        quiet=_for_json,
+    )
 
 
 def reserve_standard_error(*, for_json: bool) -> None:
@@ -43,7 +54,7 @@ def reserve_standard_error(*, for_json: bool) -> None:
 def hint(text: str) -> None:
     """Tell a person at the terminal what to do next; files and pipes get no hints."""
     if notices().is_terminal:
-        notices().print(text, style="dim", markup=False, soft_wrap=True)
+        notices().print(text, style="dim", soft_wrap=True)
 
 
 def _width(stream: TextIO) -> int | None:

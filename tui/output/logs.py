@@ -75,7 +75,7 @@ class _ConsoleHandler(logging.Handler):
 
             line = self.format(record)
             if notices().is_terminal and not notices().quiet:
-                notices().print(line, markup=False, soft_wrap=True)
+                notices().print(line, soft_wrap=True)
             else:
                 sys.stderr.write(f"{line}\n")
                 sys.stderr.flush()

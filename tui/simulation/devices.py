@@ -212,7 +212,7 @@ def serve_devices(
         if out is not None:
             out.write_text(text, encoding="utf-8")
         elif json is None:
-            console().print(text, markup=False, soft_wrap=True)
+            console().print(text, soft_wrap=True)
         write_json(
             json,
             {"speed": speed, "ports": {sensor.name: sensor.port for sensor in reachable.sensors}},

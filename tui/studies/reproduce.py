@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
@@ -164,7 +165,7 @@ def _print(console: Console, studies: list[Study], folder: Path, elapsed: float)
     for heading in ("", "at", "measured", "theory", "off"):
         table.add_column(heading, justify="right")
     for study in studies:
-        table.add_row(f"[b]{study.name}[/b]  {study.title}")
+        table.add_row(Text.assemble((study.name, "bold"), f"  {study.title}"))
         for panel, series in study.series():
             letter = panel.title[:4] if panel.title.startswith("(") else ""
             label = series.title.removeprefix(letter)
@@ -181,7 +182,7 @@ def _print(console: Console, studies: list[Study], folder: Path, elapsed: float)
     )
 
 
-def _row(series: Series) -> tuple[str, ...]:
+def _row(series: Series) -> tuple[str | Text, ...]:
     point, worst = series.telling, series.worst
     off = f"{worst.deviation:+.1f}"
     return (
@@ -189,5 +190,5 @@ def _row(series: Series) -> tuple[str, ...]:
         f"{point.measured:.4g} ± {point.error:.1g}",
         (f"{point.theory:.4g}" if abs(point.theory) > 1e-9 else "0")
         + (f" ± {point.allowed:g}" if point.allowed else ""),
-        off if worst.agrees else f"[red]{off} NO[/red]",
+        off if worst.agrees else Text(f"{off} NO", "red"),
     )

@@ -10,10 +10,12 @@ import pytest
 from textual.widgets import Static
 
 from daq.recording.sensor_state import SensorState
+from daq.timing.clock_model import ClockSource
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
+    diagnosed,
     empty_snapshot,
     growing,
     made_now,
@@ -146,6 +148,52 @@ async def test_quitting_tells_the_recorder_nothing(told: ProgressCallback) -> No
         await pilot.press("q")
     assert told.told == []
     assert app.return_code == 0
+
+
+@pytest.mark.parametrize(
+    "sensors",
+    [("rack:1", "rack:2", "rack:3"), ("[red]", "[/]", "a.b :x:")],
+    ids=["colon", "markup"],
+)
+async def test_names_are_shown_as_they_are(
+    told: ProgressCallback, tmp_path: Path, sensors: tuple[str, ...]
+) -> None:
+    """In the table, the titles, the clocks, the details and the result; none is markup."""
+    app = HuddleApp(told, path=tmp_path / "[b]run.h5")
+    snapshot = diagnosed(sensors=sensors)
+    clocks = tuple(
+        replace(c, source=ClockSource.SHARED_CLOCK, shared_clock=sensors[0])
+        for c in snapshot.clocks
+    )
+    snapshot = replace(snapshot, clocks=clocks, refused={"two-channel": f"{sensors[1]} is third"})
+    now = made_now(elapsed=400.0, closed=True)
+    status = tuple(
+        replace(each, name=name, port=f"/dev/{name}")
+        for each, name in zip(now.sensors, sensors, strict=True)
+    )
+    event = replace(now.events[1], sensor=sensors[1], text=f"{sensors[2]} [/dropped]")
+    now = replace(now, sensors=status, events=(now.events[0], event))
+    async with app.run_test(size=(200, 100)) as pilot:
+        await app.workers.wait_for_complete()
+        messages = (StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
+        await shown(pilot, app, *messages)
+        board = screen_text(app)
+        assert all(name in board for name in sensors)
+        assert f"{sensors[0]} X " in board
+        await pilot.press("c")
+        await shown(pilot, app)
+        assert f"clock of {sensors[0]}" in screen_text(app)
+        await pilot.press("d")
+        await shown(pilot, app)
+        text = screen_text(app)
+        assert f"/dev/{sensors[0]}" in text
+        assert f"{sensors[2]} [/dropped]" in text
+        assert f"{sensors[0]} → {sensors[1]}" in text
+        await pilot.press("escape", "r")
+        await shown(pilot, app)
+        result = screen_text(app)
+        assert all(f"{name}.X" in result for name in sensors)
+        assert f"two-channel: {sensors[1]} is third" in result
 
 
 # --------------------------------------------------------------------- then pictures

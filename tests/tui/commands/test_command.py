@@ -107,6 +107,36 @@ def test_recording_and_estimating_never_load_textual(module: str) -> None:
     assert not {name for name in loaded if name.split(".")[0] in {"textual", "matplotlib"}}
 
 
+# ----------------------------------------------------------------------------- names
+
+
+def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
+    """Neither markup nor emoji, and never taken apart: brackets, colons, dots, spaces."""
+    rng = np.random.default_rng(5)
+    motion = rng.normal(size=(6000, 3))
+    names = ("rack:1", "[red]rack:2", "a. b :x:")
+    sensors = {name: motion + 0.1 * rng.normal(size=(6000, 3)) for name in names}
+    sensors[names[1]][:, 2] *= -1
+    source, out = tmp_path / "a.npz", tmp_path / "[b]a.h5"
+    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
+    assert f"{out} written" in "".join(huddle("import", str(source), "--out", str(out)).split("\n"))
+    json_file = tmp_path / "a.json"
+    said = huddle("estimate", str(out), "--segment", "1s", "--json", str(json_file))
+    words = " ".join(said.split())
+    for name in names:
+        assert name in said.split("segments (")[0]  # the table
+    label = [
+        f"{channel['sensor']}.{channel['channel']}"
+        for channel in json.loads(json_file.read_text(encoding="utf-8"))["channels"]
+    ]
+    reversed_ = f"{label[5]} has the opposite polarity to {label[2]}"
+    assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in words
+    assert f"All of these have {names[1]} in common" in words
+    long = " ".join(huddle("estimate", str(out), "--segment", "1s", "--diagnostics").split())
+    assert f"{names[0]} → {names[1]}" in long
+    assert f"warning: {reversed_}: no bias" in long
+
+
 # ------------------------------------------------------------------------ exit codes
 
 
@@ -137,6 +167,24 @@ def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
     assert result.exit_code == 3
     assert "none.h5" in result.stderr
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("command", ["estimate", "report"])
+def test_no_estimate_is_exit_3_and_says_what_is_wrong(tmp_path: Path, command: str) -> None:
+    rng = np.random.default_rng(5)
+    motion = rng.normal(size=(4000, 1))
+    sensors = {name: motion + 0.1 * rng.normal(size=(4000, 1)) for name in ("r:1", "r:2", "r:3")}
+    sensors["r:2"] = sensors["r:1"]
+    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
+    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
+    huddle("import", str(source), "--out", str(out))
+    options = ("--method", "three-sensor", "--segment", "1s")
+    result = CliRunner().invoke(app, [command, str(out), *options])
+    assert result.exit_code == 3
+    assert "no channel's noise can be estimated at any frequency by three-sensor" in result.stderr
+    assert re.search(r"r:2\.\S+ repeats r:1\.\S+, sample for sample", result.stderr)
+    assert "One signal is connected or named twice" in result.stderr
+    assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
 
 
 def imported(tmp_path: Path) -> Path:
