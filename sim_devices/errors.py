@@ -27,4 +27,16 @@ class ScenarioError(SimulationError, ValueError):
 
 
 class ServeError(SimulationError, RuntimeError):
-    """A simulated device cannot be served; the message is that of its process."""
+    """A simulated device cannot be served.
+
+    Parameters
+    ----------
+    message : str
+        That of the device's process, where it has failed there.
+    is_usage_error : bool
+        Whether its process failed by a scenario or a fault script.
+    """
+
+    def __init__(self, message: str, *, is_usage_error: bool = False) -> None:
+        super().__init__(message)
+        self.is_usage_error = is_usage_error

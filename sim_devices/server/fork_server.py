@@ -28,7 +28,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from sim_devices.errors import ScenarioError, ServeError
+from sim_devices.errors import ServeError, SimulationError
 from sim_devices.server.paced_clock import PacedClock, PacedLoop
 from sim_devices.server.serve import FAMILIES, serve
 
@@ -57,7 +57,7 @@ class ForkServer:
             return {"devices": self._serve(file)}
         except ServeError as error:
             self.stop(file)
-            return {"error": str(error)}
+            return {"error": str(error), "is_usage_error": error.is_usage_error}
 
     def stop(self, file: str) -> None:
         """End the devices of a specification and wait until they have ended."""
@@ -99,7 +99,8 @@ class ForkServer:
         devices = [json.loads(text or '{"error": "it ended without a word"}') for text in announced]
         for device, pid in zip(devices, pids, strict=True):
             if "error" in device:
-                raise ServeError(device["error"])
+                wrong = device.get("is_usage_error", False)
+                raise ServeError(device["error"], is_usage_error=wrong)
             device["pid"] = pid
         return devices
 
@@ -121,9 +122,11 @@ class ForkServer:
                     runner.run(serve(spec, index, clock, announce=announce, lifeline=0))
             except BaseException as error:  # noqa: BLE001 -- nothing may return to the server's loop
                 code = 1
-                expected = isinstance(error, (OSError, ScenarioError, ServeError))
+                expected = isinstance(error, (OSError, SimulationError))
+                wrong = isinstance(error, SimulationError) and error.is_usage_error
                 if not pipe.closed:
-                    announce({"error": str(error) if expected else traceback.format_exc()})
+                    message = str(error) if expected else traceback.format_exc()
+                    announce({"error": message, "is_usage_error": wrong})
                 elif not expected:
                     traceback.print_exc()
             finally:

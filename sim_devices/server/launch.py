@@ -100,7 +100,8 @@ class DeviceServer:
             file.write_text(json.dumps({**epoch, **spec}), encoding="utf-8")
             answer = self._ask({"serve": str(file)})
             if "error" in answer:
-                raise ServeError(f"a simulated device did not start: {answer['error']}")
+                message = f"a simulated device did not start: {answer['error']}"
+                raise ServeError(message, is_usage_error=answer["is_usage_error"])
             try:
                 yield tuple(
                     RunningDevice(

@@ -65,7 +65,8 @@ def test_no_device_outlives_a_server_that_is_killed() -> None:
 def test_the_server_serves_on_after_a_specification_that_it_cannot() -> None:
     wrong = spec(device("A"))
     wrong["scenario"]["motion"]["spectra"] = []
-    with pytest.raises(ServeError, match=r"did not start: .*spectra"), serving(wrong):
+    with pytest.raises(ServeError, match=r"did not start: .*spectra") as refused, serving(wrong):
         pass
+    assert refused.value.is_usage_error  # the scenario is wrong, no device
     with serving(spec(device("A"))) as (one,):
         assert Path(one.port).exists()

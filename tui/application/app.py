@@ -182,9 +182,7 @@ class HuddleApp(App[None]):
         if message.ended:
             self.trouble = message.text
         else:
-            self.notify(
-                message.text, title="ErrorReported", severity="error", timeout=30, markup=False
-            )
+            self.notify(message.text, title="Error", severity="error", timeout=30, markup=False)
 
     # -------------------------------------------------------------------- showing
 

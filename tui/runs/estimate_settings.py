@@ -64,7 +64,7 @@ def chosen(settings: Settings, **wanted: Any) -> Settings:  # noqa: ANN401 - fie
     try:
         get_window(settings.window, _LONG_WINDOW)
     except EstimatorError as error:
-        raise typer.BadParameter(f"--{error}") from None
+        raise typer.BadParameter(str(error), param_hint="--window") from None
     for name, needed in (("dimension", "maximum-likelihood"), ("gains", "two-channel")):
         if name not in changes or {needed, "all"} & set(settings.methods):
             continue

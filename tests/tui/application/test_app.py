@@ -123,7 +123,9 @@ async def test_trouble_is_told(told: ProgressCallback) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW, notifications=True) as pilot:
         await shown(pilot, app, ErrorReported("sensor B at /dev/ttyUSB1: no answer"))
-        assert "no answer" in screen_text(app)
+        text = screen_text(app)
+    assert "no answer" in text
+    assert "ErrorReported" not in text  # words for people, not names of classes
 
 
 async def test_the_result_comes_by_itself_and_its_report_on_request(

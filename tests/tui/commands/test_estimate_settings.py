@@ -168,8 +168,9 @@ def test_options_go_before_the_bench_file() -> None:
 def test_a_window_that_no_segment_can_have_is_refused() -> None:
     spectra = WelchSettings(100.0, 64, window=chosen(Settings(), window="kaiser,8").window)
     assert spectra.window == "kaiser,8"
-    with pytest.raises(typer.BadParameter, match=r"--window 'gaussian,1e-200'.*finite"):
+    with pytest.raises(typer.BadParameter, match=r"window 'gaussian,1e-200'.*finite") as refused:
         chosen(Settings(), window="gaussian,1e-200")
+    assert refused.value.param_hint == "--window"
 
 
 def test_what_the_sensors_do_not_allow_is_refused_with_what_they_do() -> None:
