@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from rich.text import Text
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import band_of, channel_means, correlation_of, decibels, reached_cov
 from tui.application.curves import data_curve, noise_curve
-from tui.output.formatting import clock_time, roughly, several, time_left
+from tui.output.formatting import clock_time, roughly, several, signed, time_left
 from tui.output.vocabulary import FLAG_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
@@ -102,28 +103,18 @@ def sensor_table(
 
     What there is no room for is left out: rates first, then numbers of samples, then of gaps.
     """
-    band = band_of(settings, snapshot)
-    of_sensor = _columns_of(snapshot)
-    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
+    noise = partial(_noise_columns, now, snapshot, settings, choice, means)
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
     columns["state"] = [state(sensor) for sensor in now.sensors]
     columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
     columns["samples"] = [Text(grouped(s.n_samples)) for s in now.sensors]
     columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
-    for number in range(max(snapshot.dims)):
-        title = titles[number] if number < len(titles) else " " * number
-        columns[title] = [
-            _channel_noise(snapshot, mine[number], means, chosen=mine[number] == choice.channel)
-            if number < len(mine := of_sensor.get(sensor.name, []))
-            else Text("")
-            for sensor in now.sensors
-        ]
+    columns |= noise(with_error=True)
     for unneeded in ("Hz", "samples", "gaps"):
         if _width(columns) > width:
             del columns[unneeded]
     if _width(columns) > width:
-        for title in list(columns)[2:]:
-            columns[title] = [cell.split("±")[0] for cell in columns[title]]
+        columns |= noise(with_error=False)
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
     for title in columns:
         right = title in {"Hz", "samples", "gaps"}
@@ -131,6 +122,31 @@ def sensor_table(
     for row in zip(*columns.values(), strict=True):
         table.add_row(*row)
     return table
+
+
+def _noise_columns(
+    now: RecordingStatus,
+    snapshot: Snapshot,
+    settings: Settings,
+    choice: Choice,
+    means: Sequence[BandMeans],
+    *,
+    with_error: bool,
+) -> dict[str, list[Text]]:
+    """Return the columns of channels, by their titles."""
+    band, of_sensor = band_of(settings, snapshot), _columns_of(snapshot)
+    titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
+    columns = {}
+    for number in range(max(snapshot.dims)):
+        title = titles[number] if number < len(titles) else " " * number
+        cells = columns[title] = [Text("") for _ in now.sensors]
+        for row, sensor in enumerate(now.sensors):
+            mine = of_sensor.get(sensor.name, [])
+            if number < len(mine):
+                cells[row] = _channel_noise(snapshot, mine[number], means, with_error=with_error)
+                if mine[number] == choice.channel:
+                    cells[row].stylize("reverse")
+    return columns
 
 
 def _width(columns: dict[str, list[Text]]) -> int:
@@ -173,7 +189,7 @@ def state(sensor: SensorStatus) -> Text:
 
 
 def _channel_noise(
-    snapshot: Snapshot, column: int, means: Sequence[BandMeans], *, chosen: bool
+    snapshot: Snapshot, column: int, means: Sequence[BandMeans], *, with_error: bool
 ) -> Text:
     name = snapshot.channels[column].channel
     value, style = "…", ""
@@ -182,14 +198,13 @@ def _channel_noise(
     elif means:
         mean, high = float(means[column].mean[0]), float(means[column].high[0])
         if mean > 0:
-            error = decibels(high) - decibels(mean)
-            value = f"{decibels(mean):.1f}±" + (f"{error:.1f}" if error >= 0.05 else "<.1")
+            value = signed(decibels(mean), ".1f")
+            if with_error:
+                error = decibels(high) - decibels(mean)
+                value += f"±{error:.1f}" if error >= 0.05 else "±<.1"
         elif not math.isnan(mean):
             value = "below 0"
-    text = Text(f"{name} {value}".replace("-", "−"), style)
-    if chosen:
-        text.stylize("reverse")
-    return text
+    return Text(f"{name} {value}", style)
 
 
 def _flagged(snapshot: Snapshot, column: int) -> str:

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from tests.tui.example_snapshot import RATE, SETTINGS, made_now, made_snapshot
-from tui.application.panels import Choice, alerts, progress_line, sensor_table
+from daq.results.band_summary import decibels
+from tests.tui.example_snapshot import RATE, SETTINGS, diagnosed, made_now, made_snapshot
+from tui.application.panels import Choice, alerts, noise_in_band, progress_line, sensor_table
 from tui.application.result_text import details
 from tui.output.console import console
 
@@ -58,3 +59,19 @@ def test_counts_are_grouped_alike() -> None:
         screen.print(details(now, None, None, trouble=""))
     assert said.get().count("113\u202f481") == 1
     assert said.get().count("13\u202f793") == 2
+
+
+@pytest.mark.parametrize(("width", "error"), [(150, "±"), (40, "")], ids=["wide", "narrow"])
+def test_names_of_channels_are_shown_whole_with_and_without_room_for_errors(
+    width: int, error: str
+) -> None:
+    snapshot = diagnosed(channels=("X-1", "Y±2", "Z"))
+    means = noise_in_band(snapshot, SETTINGS, CHOICE)
+    table = sensor_table(made_now(), snapshot, SETTINGS, CHOICE, means=means, width=width)
+    screen = console()
+    with screen.capture() as said:
+        screen.print(table, width=150)
+    for number, name in enumerate(("X-1", "Y±2", "Z")):
+        level = f"{decibels(float(means[number].mean[0])):.1f}".replace("-", "−")
+        assert f"{name} {level}{error}" in said.get()
+    assert said.get().count("±") == 3 + 9 * len(error)

@@ -14,7 +14,7 @@ from daq.python_process import python_command
 from daq.recording.sensor_state import SensorState
 from tui.cli.main import app
 from tui.commands.record import progress_line
-from tui.output.console import notices, progress, write_text
+from tui.output.console import notices, progress, reserve_standard_error, write_text
 
 FULL = Path("/dev/full")
 
@@ -53,7 +53,7 @@ def test_trouble_that_cannot_be_told_is_trouble_all_the_same() -> None:
 def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    notices.cache_clear()
+    reserve_standard_error(for_json=False)  # whatever ran before
     with progress() as bar:
         bar.advance(bar.add_task("segments", total=2.0))
     notices().print("word " * 20)
