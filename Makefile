@@ -2,17 +2,23 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := daq estimator sim_devices tui tests benchmarks docs
+PEER := tests/peers/async_labjack_peer
+PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
+SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test check bench clean
+.PHONY: demo test peers check bench docs torture clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fast,report]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	touch $@
 
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
@@ -21,15 +27,27 @@ demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over it
 test: $(VENV)/.installed-dev  ## the tests; three at a time on two cores, for many wait for their devices
 	$(BIN)/pytest -n 3
 
+peers:  ## compile the program in Rust that the tests talk to; kept in the user's cache
+	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)
+	touch $(PEER_CACHE)/debug/async_labjack_peer
+
 check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/mypy docs/images/make.py
+	$(BIN)/mypy examples/noise_from_arrays.py examples/bench_to_report.py
+	MYPYPATH=examples/driver $(BIN)/mypy -p huddle_ax3
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks
 
+docs: $(VENV)/.installed-docs  ## the documentation as a site in build/site; its examples run
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -d build/doctrees docs build/site
+
+torture: $(VENV)/.installed-dev  ## kills, power cuts, disk errors, flipped bits; writes docs/validation/torture.md
+	$(BIN)/python -m tests.torture
+
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build docs/_figures .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

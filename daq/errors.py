@@ -131,3 +131,9 @@ class WrongSettingError(CannotAlignError):
 
 class ImportFormatError(HuddleError, ValueError):
     """A foreign file cannot be understood."""
+
+
+class ArrayError(HuddleError, ValueError):
+    """An array of samples, or its labels, cannot be understood."""
+
+    is_usage_error = True

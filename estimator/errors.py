@@ -7,7 +7,7 @@ class EstimatorError(ValueError):
     """Root of the errors of this package."""
 
     is_usage_error = False
-    """Whether an argument is wrong; otherwise the data do not allow what was asked."""
+    """Whether an argument is wrong; otherwise the data are insufficient."""
 
 
 class InvalidMatrixError(EstimatorError):
@@ -15,7 +15,7 @@ class InvalidMatrixError(EstimatorError):
 
 
 class InsufficientDataError(EstimatorError):
-    """Too few averages or too few sensors for what was asked."""
+    """Too few averages or too few sensors."""
 
 
 class BandError(EstimatorError):

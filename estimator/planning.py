@@ -1,4 +1,4 @@
-"""How long to record for a wanted precision, before anything has been recorded.
+"""The duration of recording for a target precision.
 
 The scatter that a method predicts for itself, taken at the true cross-spectral matrix of the
 planned set-up, falls with the root of the averages left after the motion's dimensions are paid for:
@@ -35,7 +35,7 @@ ROUNDING = 1e-24  # coherence: what rounding leaves of none
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What one method needs, and what it will then give.
+    """Needs and results of one method.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ def planned_csm(
     noise_psd: FloatArray | None = None,
     motion: FloatArray | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return the true cross-spectral matrix of sensors that feel one motion.
+    """Return the true cross-spectral matrix of sensors that measure one motion.
 
     Parameters
     ----------

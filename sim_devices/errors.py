@@ -7,7 +7,7 @@ class SimulationError(Exception):
     """Root of the errors of this package."""
 
     is_usage_error = False
-    """Whether a scenario or a fault script is wrong; otherwise a device cannot be served."""
+    """Whether a scenario or a fault script has an error; otherwise a device cannot be served."""
 
 
 class ScenarioError(SimulationError, ValueError):
@@ -16,7 +16,7 @@ class ScenarioError(SimulationError, ValueError):
     Parameters
     ----------
     problems : str
-        One for each thing that is wrong: key, value and what was expected.
+        One for each error: key, value and expectation.
     """
 
     is_usage_error = True

@@ -1,12 +1,13 @@
-"""What goes wrong on a simulated bench, and when: the fault script.
+"""Faults of simulated devices, from a fault script.
 
-A list of tables, as ``[[faults]]`` in a TOML file or under ``[simulation]`` of a bench file::
+The script is a list of tables: ``[[faults]]`` in a TOML file, or under ``[simulation]`` of a bench
+file::
 
     [[faults]]
     kind = "corrupt"        # see below
-    sensors = ["A"]         # devices of these sensors; all, if not given
+    sensors = ["A"]         # devices of these sensors (default: all)
     at = 12.0               # world time of the first, s
-    every = 30.0            # and again so often, s; once, if not given
+    every = 30.0            # period of repetition, s (default: once)
     count = 3               # bytes, or frames
 
 Kinds that strike the next unit (frame, packet, reply) a device sends, in every family:
@@ -28,19 +29,21 @@ Kinds that last ``duration`` s:
 jitter     each unit is kept back for up to ``level`` s
 latency    each unit is kept back for an exponential time with mean ``level`` s
 batching   units leave only every ``level`` s, as through a polled USB adapter
-stall      the device sends nothing; what it would have sent is lost
-disconnect the cable is pulled; the port comes back
-silent     one of several on a line, a slave on a bus, is off; it comes back as if new
+stall      the device sends nothing; its samples are lost
+pause      the device sends nothing; afterwards it sends its buffer of ``level`` s (all samples,
+           without ``level``)
+disconnect the cable is pulled, and plugged in again
+silent     one unit of a bus is off, and restarts afterwards
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
 dead       samples are 0 (of ``channel``, or of all)
 ========== ==========================================================================
 
-Others: ``spike`` adds ``level`` counts to one sample; ``reset`` starts the device anew; ``wrap``
-lets its counter wrap ``at`` seconds after sampling starts; ``overflow`` is the device's own
-overflow of its buffer, lasting ``duration``. The last three strike devices that have such a thing.
+Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` lets
+its counter wrap ``at`` seconds after sampling starts; ``overflow`` overflows the buffer of the
+device for ``duration``. The last three apply to devices with this function.
 
-Everything is drawn from ``seed``: the same script does the same to the same stream. A wandering,
-jittering or wrong clock is no fault but a property of the sensor: ``clock`` in the scenario.
+Random numbers come from ``seed``: the same script changes the same stream in the same way. A
+wandering or wrong clock is not a fault but a property of the sensor: ``clock`` in the scenario.
 """
 
 from __future__ import annotations
@@ -79,16 +82,16 @@ if TYPE_CHECKING:
 
 Kind: TypeAlias = Literal[
     "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
-    "jitter", "latency", "batching", "stall", "disconnect", "silent",
+    "jitter", "latency", "batching", "stall", "pause", "disconnect", "silent",
     "clip", "dead", "spike",
     "reset", "wrap", "overflow",
 ]  # fmt: skip
 DELAYS = ("jitter", "latency", "batching")
-LASTING = (*DELAYS, "stall", "disconnect")
+LASTING = (*DELAYS, "stall", "pause", "disconnect")
 UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
 SAMPLE_KINDS = ("clip", "dead", "spike")
 PATIENCE = 1.0
-"""A fault that finds no unit to strike for so long, s, does not strike."""
+"""Seconds after which a fault expires that found no unit."""
 
 
 class Fault(BaseModel):
@@ -153,23 +156,23 @@ def _problem(fault: ErrorDetails) -> str:
     if fault["type"] == "list_type":
         expected = "expected a list of tables, [[faults]]"
     elif fault["type"] == "extra_forbidden":
-        expected = f"there is no such key; expected {', '.join(Fault.model_fields)}"
+        expected = f"unknown key; expected {', '.join(Fault.model_fields)}"
     return f"faults{place} = {fault['input']!r}: {expected}"
 
 
 def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
-    """Check that there is what a script strikes, given how many channels each sensor has.
+    """Check sensors and channels of a script, given the number of channels of each sensor.
 
     Raises
     ------
     ScenarioError
-        Naming every sensor and channel that is not there, and those that are.
+        With every unknown sensor and channel, and the known ones.
     """
     wrong = []  # counted from 1, as in other faults of bench files
     for number, fault in enumerate(faults, 1):
         place, named = f"faults[{number}]", fault.sensors or ()
         wrong += [
-            f"{place}.sensors = {name!r}: there is no such sensor; expected {', '.join(n_channels)}"
+            f"{place}.sensors = {name!r}: unknown sensor; expected {', '.join(n_channels)}"
             for name in named
             if name not in n_channels
         ]
@@ -249,6 +252,7 @@ class LineFaults:
         self._half = b""  # the first half of a unit to be merged with the next
         self._held: deque[tuple[float, bytes]] = deque()
         self._silent_until = self._delayed_until = -math.inf
+        self._paused_until = self._full_at = -math.inf
         self._delay: Fault | None = None
         self._phase = self._rng.uniform()  # of the polls of an adapter, in polls
         self.down_until = -math.inf
@@ -257,14 +261,14 @@ class LineFaults:
         """What struck, and when, since this was last emptied."""
 
     def next_due(self) -> float:
-        """World time of the next thing to do: strike, or send what is kept back."""
+        """World time of the next action: a fault, or a delayed unit."""
         return min(
             self._schedule[0][0] if self._schedule else math.inf,
             self._held[0][0] if self._held else math.inf,
         )
 
     def act(self, now: float) -> tuple[list[Fault], list[bytes]]:
-        """Do what is due; return what the line and the device must do, and units to send now."""
+        """Perform due faults; return actions of line and device, and units to send now."""
         outside = []
         while self._schedule and self._schedule[0][0] <= now:
             at, index, fault, times = heapq.heappop(self._schedule)
@@ -278,6 +282,9 @@ class LineFaults:
             self.struck.append((at, fault))
             if fault.kind == "stall":
                 self._silent_until = at + fault.duration
+            elif fault.kind == "pause":
+                self._paused_until = at + fault.duration
+                self._full_at = at + (fault.level or math.inf)
             elif fault.kind in DELAYS:
                 self._delayed_until, self._delay = at + fault.duration, fault
             else:
@@ -301,7 +308,11 @@ class LineFaults:
             elif self._armed and unit:
                 struck = self._strike(self._armed.popleft()[1], unit, now)
             sent += struck
-        if self._delay is not None and now < self._delayed_until:
+        if now < self._paused_until:
+            for unit in sent if now < self._full_at else ():
+                self._hold(unit, self._paused_until)
+            sent = []
+        elif self._delay is not None and now < self._delayed_until:
             for unit in sent:
                 self._hold(unit, self._delayed(self._delay, now))
             sent = []

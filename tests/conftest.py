@@ -8,11 +8,13 @@ import functools
 import inspect
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests import devices
 from tests.devices import device_loop
@@ -65,6 +67,8 @@ def nothing_left_behind() -> Iterator[None]:
     if left:
         pytest.fail(f"threads left behind: {left}")
     born = _children() - children - devices.server_pids()
+    for pid in born:  # a child of ours that nobody waited for: it takes no time from other tests
+        os.kill(int(pid), signal.SIGKILL)
     if born:
         pytest.fail(f"processes left behind: {sorted(born)}")
     opened = {n: t for n, t in _open_descriptors().items() if descriptors.get(n) != t}
@@ -87,8 +91,19 @@ def _leaving_no_task(test: Callable[..., Awaitable[None]]) -> Callable[..., Awai
 
 
 def pytest_configure() -> None:
-    """Let our commands be interrupted, even where the tests run in a shell's background."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # which all children would inherit
+    """Make tests the same whatever the environment, and however busy the computer.
+
+    Commands can be interrupted, even where the tests run in a shell's background. Examples that
+    hypothesis finds are not timed. Compiled modules are kept: the tests start hundreds of
+    processes, and each would compile all that it imports.
+    """
+    settings.register_profile(
+        "untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    )
+    settings.load_profile("untimed")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # all children inherit it
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from daq.bench.model import Bench, Channel, Sensor
-from daq.drivers.interface import DeviceInformation
+from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.protocols.block import Block, Event, HostTime
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ class PlayedSession:
 
     device: PlayedDevice
     information: tuple[DeviceInformation, ...]
+    patience: float = DEFAULT_PATIENCE
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield what the test put there; raise where it put an exception."""

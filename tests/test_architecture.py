@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -44,3 +46,41 @@ def test_headless_commands_never_load_textual(command: str) -> None:
         f"{run}\ntry:\n    main()\nexcept SystemExit as end:\n    assert end.code\nprint()"
     )
     assert "textual" not in loaded
+
+
+ARRAYS_IN = {"notebook", "report", "simulation", "studies"}
+"""Packages of the front ends that take or draw arrays."""
+ARRAYS_OF = {
+    "application/clocks.py", "application/curves.py", "application/panels.py",
+    "application/plot.py", "output/json_values.py", "output/noise_parameters.py",
+    "output/results.py",
+}  # fmt: skip
+"""Modules that draw curves, count flags, or write arrays as text."""
+
+
+def test_commands_compute_nothing() -> None:
+    """Numbers are computed once, in daq.results or the estimator: no command needs numpy."""
+    root = Path(__file__).parents[1] / "tui"
+    computing = set()
+    for path in root.rglob("*.py"):
+        name = path.relative_to(root)
+        imports = [
+            alias.name
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Import)
+            for alias in node.names
+        ]
+        if name.parts[0] not in ARRAYS_IN and {"numpy", "scipy"} & set(imports):
+            computing.add(name.as_posix())
+    assert computing == ARRAYS_OF
+
+
+def test_a_folder_has_at_most_a_dozen_modules() -> None:
+    root = Path(__file__).parents[1]
+    crowded = {}
+    for package in ("daq", "estimator", "sim_devices", "tui"):
+        for folder in (root / package).rglob("__init__.py"):
+            modules = [path for path in folder.parent.glob("*.py") if path != folder]
+            if len(modules) > 12:
+                crowded[folder.parent.relative_to(root).as_posix()] = len(modules)
+    assert set(crowded) <= {"tui/commands"}, crowded  # one module a subcommand

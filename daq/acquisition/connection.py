@@ -15,20 +15,23 @@ from typing import TYPE_CHECKING
 
 from daq.acquisition.block_checks import BlockValidator
 from daq.acquisition.device_identity import check_identity
+from daq.acquisition.port_places import PortPlaces
 from daq.acquisition.stall_detector import StallDetector
-from daq.drivers.interface import Resuming
-from daq.errors import DeviceError, NoAnswerError, WrongDeviceError
+from daq.drivers.interface import DEFAULT_PATIENCE, Resuming
+from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
 from daq.recording.sensor_state import STATE_AFTER, SensorState
+from daq.transport.serial_ports import serial_ports
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
     from contextlib import AbstractAsyncContextManager
 
     from daq.acquisition.stall_detector import OverdueState
     from daq.bench.model import Sensor
     from daq.drivers.interface import DeviceInformation, DriverType, Session
     from daq.host_clock import HostClock
+    from daq.transport.serial_ports import SerialPort
 
 FIRST_RETRY_DELAY, MAX_RETRY_DELAY = 0.2, 5.0
 """Seconds before a device is tried again: after its first failure, and at most."""
@@ -92,12 +95,27 @@ class BackOff:
 
 
 class Connection:
-    """One port with its driver and sensors."""
+    """One port with its driver and sensors.
 
-    def __init__(self, driver: DriverType, sensors: Sequence[Sensor], clock: HostClock) -> None:
+    Parameters
+    ----------
+    find_ports : callable
+        Returns the serial ports that are present.
+    """
+
+    def __init__(
+        self,
+        driver: DriverType,
+        sensors: Sequence[Sensor],
+        clock: HostClock,
+        *,
+        find_ports: Callable[[], Sequence[SerialPort]] = serial_ports,
+    ) -> None:
         self.driver = driver
         self.sensors = tuple(sensors)
         self.port = self.sensors[0].port
+        """As the bench file names it, until its adapter is found under another name."""
+        self._places = PortPlaces(self.port, find_ports)
         self.names = tuple(sensor.name for sensor in self.sensors)
         self.information: tuple[DeviceInformation, ...] = ()
         """What the devices reported about themselves when they were first connected."""
@@ -107,6 +125,7 @@ class Connection:
         self._back_off = BackOff()
         self._reported: tuple[EventKind | None, object] = None, None
         self._last_session: Session | None = None
+        self._detector: StallDetector | None = None
         self._clock = clock
 
     async def run(self, queue: asyncio.Queue[Item], start: asyncio.Event) -> None:
@@ -116,6 +135,7 @@ class Connection:
             try:
                 async with self._opened(self._open(), queue) as session:
                     self._check_identity(session)
+                    self._places.connected(self.port)
                     if not self.connected.done():
                         self.connected.set_result(None)
                         await start.wait()
@@ -145,6 +165,14 @@ class Connection:
             elif isinstance(failure, WrongDeviceError) and _summary(failure) != self._reported:
                 await self._report_lost(failure, queue)
             await asyncio.sleep(self._back_off.next_delay())
+            if isinstance(failure, (NotConnectedError, WrongDeviceError)):
+                self._move_to(self._places.next_place())
+
+    def _move_to(self, port: str) -> None:
+        """Try the port under this name next."""
+        if port != self.port:
+            self.port = port
+            self.sensors = tuple(s.model_copy(update={"port": port}) for s in self.sensors)
 
     def _open(self) -> AbstractAsyncContextManager[Session]:
         if self._last_session is not None and isinstance(self.driver, Resuming):
@@ -219,8 +247,11 @@ class Connection:
         detector = StallDetector(
             {s.name: s.sampling_rate * speed for s in self.sensors},
             report,
+            patience=patience_of(session) / speed,
+            before=self._detector,
             is_recovering=lambda: getattr(session, "recovers", False),
         )
+        self._detector = detector
         validator = BlockValidator(self.driver, self.sensors)
         suspended = self._clock.suspended
         async with contextlib.aclosing(_generator(session)) as items:
@@ -242,8 +273,10 @@ class Connection:
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise
+                hint = getattr(session, "hint", "")
                 raise NoAnswerError(
                     f"{self.port}: stalled: no block for {detector.seconds:.2g} s"
+                    f"{'; ' if hint else ''}{hint}"
                 ) from error
 
     async def _after_suspension(
@@ -275,6 +308,11 @@ class Connection:
             if now.trouble and not known:
                 raise NoAnswerError(now.trouble)
             before = known.get(sensor.name)
+            if self._places.is_moved(self.port) and not now.serial_number:
+                raise WrongDeviceError(
+                    f"sensor {sensor.name!r} on {self.port}: a device without a serial number; it"
+                    f" may be another than the one that was on {self._places.home}"
+                )
             check_identity(sensor, now, serial_number=before.serial_number if before else "")
         self.information = self.information or found
 
@@ -287,6 +325,11 @@ class Connection:
         parts = (found.model, found.serial_number, found.firmware) if found else ()
         text = " ".join(("on", self.port, *(part for part in parts if part)))
         return Event(name, EventKind.CONNECTED, text, now)
+
+
+def patience_of(session: Session) -> float:
+    """Return the seconds without a block, of the device's time, after which a port is lost."""
+    return float(getattr(session, "patience", DEFAULT_PATIENCE))
 
 
 async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:

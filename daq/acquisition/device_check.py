@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from daq.acquisition.device_identity import check_identity
+from daq.acquisition.connection import patience_of
+from daq.acquisition.device_identity import check_identity, with_owner
 from daq.drivers.epson.driver import identify
 from daq.drivers.modbus.bus import TCP, RefusedError, open_bus
 from daq.drivers.registry import driver_type
@@ -17,6 +18,9 @@ from daq.errors import DeviceError, NoAnswerError, NotConnectedError, WrongDevic
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.epson import commands
 from daq.protocols.errors import RemoteProtocolError
+from daq.protocols.text.format import MessageFinder
+from daq.protocols.text.guess import guess_settings
+from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Iterator, Mapping, Sequence
@@ -28,10 +32,11 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
 
 MIN_SAMPLES = 4
-FIRST_BLOCK_TIMEOUT = 30.0
-"""Seconds to wait for the first samples of a sensor (a Güralp block lasts many seconds)."""
 MIN_BLOCKS, MAX_RATE_ERROR = 3, 0.01
 """Blocks that a measured rate takes, and its standard error at most, as a fraction of the rate."""
+TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
+TEXT_ROWS, LISTEN, LISTEN_ON = 12, 1.0, 2.5
+"""Rows of text to guess a format from; seconds to listen for one, and for the next one."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
@@ -129,6 +134,7 @@ async def _probe(
     wanted = {s.name: max(MIN_SAMPLES, round(duration * s.sampling_rate)) for s in sensors}
     longest = max(wanted[s.name] / s.sampling_rate for s in sensors) / clock.speed
     async with driver_type(sensors[0].driver).open(sensors, clock) as session:
+        patience, hint = patience_of(session), getattr(session, "hint", "")
         information = {one.sensor: one for one in session.information}
         errors = list(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
@@ -136,7 +142,7 @@ async def _probe(
             cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
         ) as stream:
             try:
-                async with asyncio.timeout(FIRST_BLOCK_TIMEOUT + 3 * longest):
+                async with asyncio.timeout(patience + 3 * longest):
                     async for item in stream:
                         if isinstance(item, Event):
                             name = item.sensor if item.sensor in events else sensors[0].name
@@ -154,7 +160,8 @@ async def _probe(
             errors.append(
                 NoAnswerError(
                     f"sensor {sensor.name!r} on {sensor.port}: no samples in"
-                    f" {FIRST_BLOCK_TIMEOUT:g} s{reported and f'; it reported: {reported}'}"
+                    f" {patience:g} s{hint and f'; {hint}'}"
+                    f"{reported and f'; it reported: {reported}'}"
                 )
             )
     found = [
@@ -200,7 +207,7 @@ async def probe_bench(
         else:
             found.extend(answer[0])
             errors.extend(answer[1])
-    return found, errors
+    return found, [with_owner(error, bench.sensors) for error in errors]
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +228,9 @@ async def discover(
     baud_rates: Sequence[int] = MODBUS_BAUD_RATES,
     device_ids: Sequence[int] = MODBUS_DEVICES,
 ) -> list[DiscoveredDevice]:
-    """Look for Epson accelerometers and Modbus devices on a port.
+    """Look for text, Epson accelerometers and Modbus devices on a port.
+
+    Text is listened for first, for it needs no question.
 
     Parameters
     ----------
@@ -234,6 +243,13 @@ async def discover(
         If the port cannot be opened.
     """
     if not port.startswith(TCP):
+        for baud_rate in TEXT_BAUD_RATES if "://" not in port else (TEXT_BAUD_RATES[0],):
+            rows = await _text_rows(port, clock, baud_rate)
+            settings = guess_settings(rows)
+            if settings is not None:
+                remark = repr(rows[-1][:60].decode("ascii", "replace"))
+                settings = {"baud_rate": baud_rate, **settings}
+                return [DiscoveredDevice("text", port, settings, remark=remark)]
         for baud_rate in commands.BAUD_RATES if "://" not in port else (460800,):
             with contextlib.suppress(DeviceError):
                 information = await identify(port, clock, baud_rate=baud_rate)
@@ -246,17 +262,38 @@ async def discover(
     return found
 
 
+async def _text_rows(port: str, clock: HostClock, baud_rate: int) -> list[bytes]:
+    """Return whole lines that come by themselves, the first one not among them."""
+    finder = MessageFinder(b"\n")
+    rows: list[bytes] = []
+    loop = asyncio.get_running_loop()
+    async with open_port(port, clock, label=f"port {port}", baud_rate=baud_rate) as stream:
+        deadline = loop.time() + LISTEN
+        with contextlib.suppress(TimeoutError, NotConnectedError):
+            while len(rows) <= TEXT_ROWS:
+                async with asyncio.timeout_at(deadline):
+                    received, _ = await stream.read()
+                rows += finder.receive(received)
+                if rows and rows[-1].isascii():  # a slow device: its next rows are worth the wait
+                    deadline = max(deadline, loop.time() + LISTEN_ON)
+    return rows[1:]
+
+
 def search_description(port: str) -> str:
     """Return in words what `discover` looks for by default."""
     devices = "Modbus device " + ", ".join(map(str, MODBUS_DEVICES))
     if port.startswith(TCP):
         return devices
     if "://" in port:
-        return f"an Epson accelerometer or {devices}"
+        return f"rows of text, an Epson accelerometer or {devices}"
     epsons, others = (
         ", ".join(map(str, sorted(rates))) for rates in (commands.BAUD_RATES, MODBUS_BAUD_RATES)
     )
-    return f"an Epson accelerometer ({epsons} baud) or {devices} ({others} baud)"
+    texts = ", ".join(map(str, sorted(TEXT_BAUD_RATES)))
+    return (
+        f"rows of text ({texts} baud), an Epson accelerometer ({epsons} baud) or {devices}"
+        f" ({others} baud)"
+    )
 
 
 async def _modbus_devices(

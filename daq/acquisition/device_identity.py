@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from daq.errors import WrongDeviceError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daq.bench.model import Sensor
     from daq.drivers.interface import DeviceInformation
 
@@ -42,3 +44,26 @@ def check_identity(sensor: Sensor, found: DeviceInformation, *, serial_number: s
             f"{where}: expected {sensor.sampling_rate:g} Hz, the device samples at {rate:g} Hz",
             found=rate,
         )
+
+
+_Error = TypeVar("_Error", bound=Exception)
+
+
+def with_owner(error: _Error, sensors: Sequence[Sensor]) -> _Error | WrongDeviceError:
+    """Return an error that also says which sensor of the bench the device that was found is.
+
+    Parameters
+    ----------
+    error
+        As a port was opened. Other errors than of wrong devices are returned unchanged.
+    sensors
+        All sensors of the bench.
+    """
+    if not isinstance(error, WrongDeviceError):
+        return error
+    found = error.found if isinstance(error.found, tuple) else (error.found,)
+    owner = next((s for s in sensors if s.serial_number in {str(one) for one in found}), None)
+    if owner is None or not owner.serial_number:
+        return error
+    text = f"{error}; that is sensor {owner.name!r} of port {owner.port}: the ports are swapped"
+    return WrongDeviceError(text, found=error.found)

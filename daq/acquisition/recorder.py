@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from daq.acquisition.block_writer import BlockWriter, SensorProgress
 from daq.acquisition.connection import CLOSE_TIMEOUT, Connection
+from daq.acquisition.device_identity import with_owner
 from daq.drivers.registry import driver_type
 from daq.errors import DeviceError
 from daq.host_clock import SystemClock
@@ -237,7 +238,7 @@ class _Recorder:
             failures = [
                 DeviceError(f"port {connection.port}: {result}")
                 if isinstance(result, RemoteProtocolError)
-                else result
+                else with_owner(result, self._bench.sensors)
                 for connection, result in zip(connections, waiting.result(), strict=True)
                 if isinstance(result, Exception)
             ]

@@ -1,4 +1,4 @@
-"""Scheduled runs: when they are due, one at a time, and which recordings are too old.
+"""Scheduled runs: when they are due, one at a time.
 
 A run that became due while another was running, or while the computer was off or asleep, is
 reported and not repeated later. Times are in the schedule's time zone, also on the days when its
@@ -19,13 +19,10 @@ from zoneinfo import ZoneInfo
 
 from cronsim import CronSim
 
-from daq.errors import HuddleError, RecordingError
-from daq.recording.locking import is_being_written
-from daq.recording.reader import Recording
+from daq.errors import HuddleError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
-    from pathlib import Path
 
     from daq.bench.model import Schedule
 
@@ -44,6 +41,11 @@ class RunState(StrEnum):
     """The next run; not due yet."""
     STARTED = "started"
     FINISHED = "finished"
+    """Ended without an error, and every limit is met where the bench file has any."""
+    LIMIT_NOT_MET = "ended: FAIL"
+    """Ended without an error; a limit is not met."""
+    NOT_DECIDED = "ended: NOT DECIDED"
+    """Ended without an error; whether the limits are met cannot be said."""
     FAILED = "failed"
     """Ended by an error."""
     MISSED = "missed"
@@ -86,7 +88,7 @@ def utc_now() -> datetime:
 
 async def serve(
     schedule: Schedule,
-    run: Callable[[datetime], Awaitable[object]],
+    run: Callable[[datetime], Awaitable[RunNotice | None]],
     *,
     stop: asyncio.Event,
     notice: Callable[[RunNotice], None] = lambda _: None,
@@ -100,7 +102,8 @@ async def serve(
     schedule : Schedule
         Cron lines and their time zone.
     run : coroutine function of the due time
-        Does one run; a HuddleError or OSError, alone or in groups, fails that run only.
+        Does one run, and returns how it ended, or None where it is finished; a HuddleError or
+        OSError, alone or in groups, fails that run only.
     stop : asyncio.Event
         Ends the loop when set; a run in progress must check it itself.
     notice : callable
@@ -155,18 +158,19 @@ def _report_skipped(
 
 
 async def _run_once(
-    run: Callable[[datetime], Awaitable[object]],
+    run: Callable[[datetime], Awaitable[RunNotice | None]],
     due: datetime,
     notice: Callable[[RunNotice], None],
 ) -> None:
     notice(RunNotice(RunState.STARTED, due))
+    ended = None
     try:
-        await run(due)
+        ended = await run(due)
     except* (HuddleError, OSError) as group:
         text = "; ".join(str(error) for error in _leaves(group))
         notice(RunNotice(RunState.FAILED, due, text))
     else:
-        notice(RunNotice(RunState.FINISHED, due))
+        notice(ended or RunNotice(RunState.FINISHED, due))
 
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:
@@ -184,41 +188,3 @@ def _sleep_until(stop: asyncio.Event) -> Callable[[float], Awaitable[object]]:
                 await stop.wait()
 
     return sleep
-
-
-def remove_old(
-    directory: Path, retention: float, *, bench: str, now: datetime | None = None
-) -> list[Path]:
-    """Remove recordings of a bench that are older than ``retention`` seconds; return their paths.
-
-    Only closed recordings of the bench with that name are removed: never other files, recordings of
-    other benches, imported or growing ones, or those left open by a crash.
-
-    Raises
-    ------
-    RecordingError
-        If some recordings cannot be removed; the others are removed all the same.
-    """
-    limit = (now or utc_now()) - timedelta(seconds=retention)
-    removed, kept = [], []
-    for path in sorted(directory.glob("*.h5")):
-        if _is_old(path, limit, bench):
-            try:
-                path.unlink()
-            except OSError as error:
-                kept.append(f"{path}: cannot be removed: {error.strerror}")
-            else:
-                removed.append(path)
-    if kept:
-        raise RecordingError("; ".join(kept))
-    return removed
-
-
-def _is_old(path: Path, limit: datetime, bench: str) -> bool:
-    try:
-        with Recording.open(path) as recording:
-            old = recording.closed and recording.created < limit
-            own = old and recording.bench is not None and recording.bench.name == bench
-        return own and not is_being_written(path)
-    except (HuddleError, OSError):  # no recording of ours, or removed meanwhile
-        return False

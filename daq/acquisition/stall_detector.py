@@ -5,9 +5,14 @@ Theory of operation
 The *block period* of a sensor is the duration of its blocks' samples: the longest of recent blocks.
 A sensor is **late** when its next block has not arrived two block periods after the last one, and
 not before ``MIN_LATE_AFTER``. A timer reports this at that instant. One lost block makes a sensor
-late, so lateness alone has no consequence. The sensor is **stalled** after a further margin
-(``STALL_MARGIN``; more where blocks have arrived less evenly). Then, if no other sensor on the port
-delivers, the task that waits for the port is interrupted; otherwise the stall is only reported.
+late, so lateness alone has no consequence. The sensor is **stalled** after the time that the
+session states (``daq.drivers.interface``, ``PatientSession``), and never sooner than two of the
+longest recent intervals between blocks and a margin. Then, if no other sensor on the port delivers,
+the task that waits for the port is interrupted; otherwise the stall is only reported.
+
+A stall that opening the port again does not end is no stall of the connection: the device delivers
+that seldom. The interval therefore counts across sessions where the last one ended by a stall, and
+the longest interval is handed from session to session (:class:`BlockInterval`).
 
 Nothing is overdue while the event loop is blocked, or while nobody waits for blocks because writing
 lags. A device that reports its recovery from a buffer overflow is late, but not stalled, for up to
@@ -21,6 +26,7 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Literal, Self, TypeAlias
 
+from daq.drivers.interface import DEFAULT_PATIENCE
 from daq.recording.sensor_state import SensorState
 
 if TYPE_CHECKING:
@@ -36,9 +42,12 @@ MAX_FIRST_BLOCK_SAMPLES = 1100
 LATE_PERIODS = 2
 """Block periods after the last block at which the next one is late."""
 MIN_LATE_AFTER = 0.1
-MIN_STALLED_AFTER = 0.5
 STALL_MARGIN = 0.25
 """Seconds that a late block may still take: one lost block must not look like a stall."""
+MAX_LEARNED = 60.0
+"""Longest interval between blocks, in seconds, that is learned across a stall."""
+MEMORY = 8.0
+"""The longest interval is forgotten over this many times itself."""
 MAX_RECOVERY = 10.0
 """Seconds without blocks that a device may spend on its recovery."""
 BUSY_HOST_DELAY = 0.2
@@ -50,15 +59,36 @@ OverdueState: TypeAlias = Literal[SensorState.LATE, SensorState.STALLED]
 
 
 class BlockInterval:
-    """Time that the next block may take, learned from earlier blocks; seconds of one clock."""
+    """Time that the next block may take, learned from earlier blocks; seconds of one clock.
 
-    def __init__(self, now: float, first_block_timeout: float) -> None:
+    Parameters
+    ----------
+    now
+        When the session begins.
+    first_block_timeout
+        Time that the first block may take.
+    patience
+        Time that any other block may take, at least.
+    before
+        The interval of the port's last session, if there was one.
+    """
+
+    def __init__(
+        self,
+        now: float,
+        first_block_timeout: float,
+        *,
+        patience: float,
+        before: BlockInterval | None = None,
+    ) -> None:
         self.last = now
         """When the last block arrived; before the first, when the session began."""
-        self._first_block_timeout = first_block_timeout
+        self._first_block_timeout = max(first_block_timeout, patience)
+        self._patience = patience
         self._has_blocks = False
         self._period = 0.0
-        self._longest = 0.0
+        self._longest = before.longest if before else 0.0
+        self._stalled_since = before.stalled_since if before else None
         self.reported: set[OverdueState] = set()
         """States reported since the last block."""
 
@@ -72,13 +102,30 @@ class BlockInterval:
         """Seconds from the last block until the sensor is stalled."""
         if not self._has_blocks:
             return self._first_block_timeout
-        return max(MIN_STALLED_AFTER, LATE_PERIODS * self._longest + STALL_MARGIN)
+        return max(self._patience, LATE_PERIODS * self._longest + STALL_MARGIN)
+
+    @property
+    def longest(self) -> float:
+        """Longest recent interval between blocks."""
+        return self._longest
+
+    @property
+    def stalled_since(self) -> float | None:
+        """Arrival of the last block before a stall that has not ended; None without one."""
+        if SensorState.STALLED not in self.reported:
+            return None
+        return self.last if self._has_blocks else self._stalled_since
 
     def block_received(self, now: float, duration: float) -> None:
         """Learn from a block and the duration of its samples; long intervals decay slowly."""
         interval = now - self.last if self._has_blocks else 0.0
+        if self._stalled_since is not None:
+            interval = min(now - self._stalled_since, MAX_LEARNED)
+            self._stalled_since = None
         self._period = max(_DECAY * self._period, duration)
-        self._longest = max(_DECAY * self._longest, interval, duration)
+        if self._longest:
+            self._longest *= math.exp(-(now - self.last) / (MEMORY * self._longest))
+        self._longest = max(self._longest, interval, duration)
         self._has_blocks, self.last = True, now
         self.reported.clear()
 
@@ -97,6 +144,10 @@ class StallDetector:
     report : callable of sensor, state and seconds since its last block
         Called once for each state; returns whether it could take the report, and is called again
         if not.
+    patience : float
+        Seconds of the event loop's clock that the session states.
+    before : StallDetector, optional
+        Of the port's last session.
     is_recovering : callable
         Whether the device has reported that it works, though it sends no samples for now.
     """
@@ -106,6 +157,8 @@ class StallDetector:
         sampling_rates: Mapping[str, float],
         report: Callable[[str, OverdueState, float], bool],
         *,
+        patience: float = DEFAULT_PATIENCE,
+        before: StallDetector | None = None,
         is_recovering: Callable[[], bool] = lambda: False,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -114,8 +167,15 @@ class StallDetector:
         self._is_recovering = is_recovering
         now = self._loop.time()
         timeout = FIRST_BLOCK_TIMEOUT + MAX_FIRST_BLOCK_SAMPLES / min(sampling_rates.values())
-        self._port = BlockInterval(now, timeout)
-        self._sensors = {name: BlockInterval(now, timeout) for name in sampling_rates}
+        self._port = BlockInterval(
+            now, timeout, patience=patience, before=before.port if before else None
+        )
+        self._sensors = {
+            name: BlockInterval(
+                now, timeout, patience=patience, before=before.sensor(name) if before else None
+            )
+            for name in sampling_rates
+        }
         self._timeout = asyncio.timeout(None)
         self._is_waiting = False
         self._due = now
@@ -125,6 +185,15 @@ class StallDetector:
     def seconds(self) -> float:
         """Seconds since the last block of any sensor."""
         return self._loop.time() - self._port.last
+
+    @property
+    def port(self) -> BlockInterval:
+        """Interval between blocks of any sensor."""
+        return self._port
+
+    def sensor(self, name: str) -> BlockInterval:
+        """Return the interval between blocks of one sensor."""
+        return self._sensors[name]
 
     async def __aenter__(self) -> Self:
         await self._timeout.__aenter__()
@@ -170,6 +239,8 @@ class StallDetector:
             self._report_overdue(now, SensorState.LATE)
             if now >= self._port.last + MAX_RECOVERY or not self._is_recovering():
                 if now >= self._port.last + self._port.stalled_after:
+                    for interval in (self._port, *self._sensors.values()):
+                        interval.reported.add(SensorState.STALLED)
                     self._timeout.reschedule(now)
                     return
                 self._report_overdue(now, SensorState.STALLED)

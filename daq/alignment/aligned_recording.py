@@ -1,14 +1,15 @@
 """A recording on one common grid, in physical units.
 
-Theory of operation ------------------- Every sensor's samples are counted without error within an
-*epoch* of its clock; the clock says when each was taken (:mod:`daq.timing.clock_model`). The grid
-runs at one rate from the instant the last sensor has begun. Where a sensor's samples fall on the
-grid (sensors of one clock, recordings with exact times) they pass through untouched; elsewhere they
-are interpolated (:mod:`daq.alignment.resampling`).
+Theory of operation
+-------------------
+Within an *epoch* of its clock the samples of a sensor are counted without error; the clock gives
+the time of each (:mod:`daq.timing.clock_model`). The grid has one rate and begins when the last
+sensor has begun. Samples on the grid (sensors of one clock, recordings with exact times) are
+copied; others are interpolated (:mod:`daq.alignment.resampling`).
 
-A grid instant is valid if every sensor has all samples it takes; gaps are never filled. Filtering
-is done on whole spans counted from the grid's start, so that what is read does not depend on how
-the reading is cut. Memory is that of the piece asked for.
+A grid instant is valid if every sensor has all samples for it; gaps are never filled. Spans are
+filtered as a whole, counted from the start of the grid, so the result does not depend on how reads
+are divided. Memory is that of the requested span.
 """
 
 from __future__ import annotations
@@ -109,6 +110,15 @@ class AlignedRecording:
             return ()
         name = self._sources[self._reference].clock_name
         return tuple(source.clock_name == name for source in self._sources)
+
+    @property
+    def longest_stretches(self) -> dict[str, float]:
+        """Longest time in seconds without a gap, by name of the sensor."""
+        return {
+            source.record.name: max(run.n_samples for run in source.runs)
+            / source.record.sampling_rate
+            for source in self._sources
+        }
 
     @property
     def n_available(self) -> int:

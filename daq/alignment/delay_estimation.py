@@ -131,8 +131,7 @@ class DelayEstimator:
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
         if len(starts) == 0 or (not self.has_frame and len(starts) < self.fewest):
             return delays, std
-        spectra = self._spectra(samples, starts)
-        sensors = [spectra[:, :, columns] for columns in self.columns]
+        sensors = self._spectra(samples, starts)
         if self.has_frame:
             x0 = sensors[self._reference]
             found = {
@@ -220,14 +219,15 @@ class DelayEstimator:
             np.linalg.norm((np.nan_to_num(weight)[:, None, None] * response * turned).sum(0))
         )
 
-    def _spectra(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
-        """Spectra of shape (n_freqs, n_segments, n_channels)."""
+    def _spectra(self, samples: FloatArray, starts: IntArray) -> list[ComplexArray]:
+        """Return the spectra of each sensor, shape (n_freqs, n_segments, n_channels)."""
         length = len(self.window)
         frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
         frames -= frames.mean(axis=-1, keepdims=True)
         frames *= self.window
-        spectra = np.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1]
-        return np.ascontiguousarray(spectra.transpose(2, 0, 1))
+        spectra = np.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1].transpose(2, 0, 1)
+        # The numbers of one sensor lie side by side, so that products of them are fast.
+        return [np.ascontiguousarray(spectra[:, :, columns]) for columns in self.columns]
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
         return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])

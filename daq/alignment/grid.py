@@ -79,7 +79,8 @@ class Grid:
     def _pass_through(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
         second = np.array([self.start + at / self.sampling_rate])
         valid = np.zeros(len(samples), dtype=bool)
-        for epoch in source.known_clock.epochs:
+        end = second[0] + (len(samples) + 1) / self.sampling_rate
+        for epoch in source.known_clock.between(second[0] - 1 / self.sampling_rate, end):
             first = round(float(epoch.position(second)[0]))
             low = max(first, epoch.first_sample)
             high = min(first + len(samples), epoch.end_sample)
@@ -95,9 +96,7 @@ class Grid:
         samples = np.zeros((stop - start, len(source.columns)))
         valid = np.zeros(stop - start, dtype=bool)
         ratio = self._ratio(source)
-        for epoch in source.known_clock.epochs:
-            if epoch.end < seconds[0] or epoch.start > seconds[-1]:
-                continue
+        for epoch in source.known_clock.between(seconds[0], seconds[-1]):
             positions = epoch.position(seconds)
             margin = reach(ratio)
             low = math.floor(positions[0]) - margin

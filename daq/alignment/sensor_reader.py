@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import itertools
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -44,6 +43,10 @@ class _Run:
     def last_row(self) -> int:
         return self.first_row + self.n_samples
 
+    def row_of(self, sample: int) -> int:
+        """Return the row of a sample, of the nearest end where it lies outside."""
+        return self.first_row + min(max(sample - self.first_sample, 0), self.n_samples)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayMeasurement:
@@ -70,6 +73,8 @@ class SensorSource:
     clock: Clock | None = None
     learnt: list[DelayMeasurement] = field(default_factory=list)
     frame_delay: float = 0.0
+    _seconds: FloatArray = field(default_factory=lambda: np.empty(0))
+    """When the samples of a polled sensor were taken, as far as `by_instants` has read."""
     offset_in_doubt: bool = False
     """Whether how many samples apart it and others of its clock began had to be estimated."""
 
@@ -99,9 +104,9 @@ class SensorSource:
             self.runs[-1] = _Run(
                 run.first_sample, run.first_row, run.n_samples + int(length[:until].sum())
             )
-        for start, end in itertools.pairwise([*starts.tolist(), len(blocks)]):
-            n_samples = int(length[start:end].sum())
-            self.runs.append(_Run(int(first[start]), int(blocks["first_row"][start]), n_samples))
+        if len(starts):
+            row, n_samples = blocks["first_row"][starts], np.add.reduceat(length, starts)
+            self.runs += map(_Run, first[starts].tolist(), row.tolist(), n_samples.tolist())
         self.n_blocks += len(blocks)
 
     def fill(self, samples: FloatArray, first: int) -> BoolArray:
@@ -109,19 +114,31 @@ class SensorSource:
         last = first + len(samples)
         present = np.zeros(len(samples), dtype=bool)
         begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
-        for run in itertools.islice(self.runs, max(begin, 0), None):
-            if run.first_sample >= last:
-                break
-            low = max(first, run.first_sample)
-            high = min(last, run.first_sample + run.n_samples)
-            if low >= high:
-                continue
-            row = run.first_row + low - run.first_sample
-            counts = self.record.counts(row, row + high - low)
-            if len(self.columns) < counts.shape[1]:
-                counts = counts[:, self.columns]
-            np.divide(counts, self.sensitivity, out=samples[low - first : high - first])
-            present[low - first : high - first] = True
+        end = bisect.bisect_left(self.runs, last, key=lambda run: run.first_sample)
+        runs = self.runs[max(begin, 0) : end]
+        if not runs:
+            return present
+        # The rows of a stretch follow those of the one before: all are read at once.
+        row, last_row = runs[0].row_of(first), runs[-1].row_of(last)
+        if row == last_row:
+            return present
+        counts, damaged = self.record.intact_counts(row, last_row)
+        if len(self.columns) < counts.shape[1]:
+            counts = counts[:, self.columns]
+        ahead = [run.first_sample - run.first_row - first for run in runs]
+        if len(runs) == 1:
+            place = slice(row + ahead[0], last_row + ahead[0])
+            np.divide(counts, self.sensitivity, out=samples[place])
+            present[place] = True
+            for begin, end in damaged:
+                present[place][begin:end] = False
+            return present
+        rows = [row, *(run.first_row for run in runs[1:]), last_row]
+        places = np.arange(row, last_row) + np.repeat(ahead, np.diff(rows))
+        samples[places] = counts / self.sensitivity
+        present[places] = True
+        for begin, end in damaged:
+            present[places[begin:end]] = False
         return present
 
     @classmethod
@@ -149,13 +166,16 @@ class SensorSource:
 
     def by_instants(self) -> Clock:
         """Return the clock of a polled sensor: every sample has its instant."""
-        instants_ns = self.record.instants_ns(0, self.runs[-1].last_row)
+        known = len(self._seconds)
+        instants_ns = self.record.instants_ns(known, self.runs[-1].last_row)
         elapsed_ns = instants_ns - self.arrivals.origin_monotonic_ns
+        self._seconds = np.concatenate([self._seconds, elapsed_ns * 1e-9])
         return from_instants(
             self.record.name,
-            np.asarray(elapsed_ns * 1e-9, dtype=np.float64),
+            self._seconds,
             sampling_rate=self.record.sampling_rate,
-            runs=[(run.first_sample, run.first_row, run.n_samples) for run in self.runs],
+            first_samples=np.array([run.first_sample for run in self.runs]),
+            first_rows=np.array([run.first_row for run in self.runs]),
         )
 
     def measured(self, reference: Clock) -> MeasuredDelays | None:

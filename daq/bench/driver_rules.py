@@ -1,4 +1,4 @@
-"""What the bench file asks of a driver, so that the bench needs to know no driver."""
+"""The part of a driver that the bench file uses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class DriverRules(Protocol):
-    """The part of a driver that validation of a bench file and the layout of a recording need."""
+    """Used by the validation of a bench file and by the layout of a recording."""
 
     @property
     def settings(self) -> type[BaseModel]:
@@ -27,16 +27,16 @@ class DriverRules(Protocol):
         ...
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Type of the raw counts this sensor's blocks hold."""
+        """Type of the raw counts in the blocks of a sensor."""
         ...
 
 
 @runtime_checkable
 class Checking(Protocol):
-    """A driver that can tell from the bench file what would not work."""
+    """A driver with further checks of the bench file."""
 
     def check(self, sensors: Sequence[Sensor]) -> None:
-        """Refuse what no device of this kind does; ``sensors`` are all those of one port.
+        """Refuse settings that no such device accepts; ``sensors`` are all those of one port.
 
         Raises
         ------

@@ -53,12 +53,12 @@ _MAX_DIMENSION = 999
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """How one option of an estimate is written, checked and explained.
+    """Declaration of one option of an estimate: its help, check, and forms.
 
     Attributes
     ----------
     help : str
-        For people: what the option does.
+        What the option does, for people.
     check : callable
         Turns a value of the bench file into the value of the setting. Raises `ValueError` with what
         was expected.
@@ -130,12 +130,12 @@ def _yes_or_no(value: object) -> bool:
 
 
 def one_of(value: object, known: Sequence[str]) -> str:
-    """Return a name that is known.
+    """Return the value if it is one of the known names.
 
     Raises
     ------
     ValueError
-        With the names that are.
+        With the known names, and the closest one.
     """
     if isinstance(value, str) and value in known:
         return value
@@ -170,7 +170,7 @@ def _window(value: object) -> str:
     except ValueError:
         positive = False
     if not positive:
-        raise ValueError(f"expected its parameter as well, above 0, as in {name},0.5")
+        raise ValueError(f"expected the window with a parameter above 0, such as {name},0.5")
     return value
 
 
@@ -185,7 +185,7 @@ def _band(value: object) -> tuple[float, float]:
         low, high = map(_number, value)
         if 0 < low < high:
             return low, high
-    raise ValueError("expected two rising frequencies in Hz, such as 1 and 20")
+    raise ValueError("expected two increasing frequencies in Hz, such as 1 and 20")
 
 
 def _to_band(text: str) -> list[float]:
@@ -223,7 +223,7 @@ def _to_gains(texts: Sequence[str]) -> dict[str, float]:
         if not name:
             raise ValueError("expected a sensor and a number as in B=1.02")
         if name in found:
-            raise ValueError(f"{name} has {found[name]:g} already")
+            raise ValueError(f"{name} is given twice; expected it once")
         try:
             found[name] = float(number)
         except ValueError:
@@ -233,10 +233,7 @@ def _to_gains(texts: Sequence[str]) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class EstimateSettings:
-    """How self-noise is estimated, wherever nothing else is said.
-
-    `OPTIONS` explains each field.
-    """
+    """Settings of an estimate, with their defaults. `OPTIONS` explains each field."""
 
     methods: Annotated[
         tuple[str, ...],
@@ -329,7 +326,7 @@ class EstimateSettings:
         int | Literal["auto"] | None,
         Option(
             "Dimensions of the common motion for maximum likelihood: a number, or auto for as many"
-            " as the model test of each band demands. By default as many as a sensor has channels.",
+            " as the model test of each band requires. Default: as many as a sensor has channels.",
             check=_dimension,
             flags=("--dimension",),
             metavar="N|auto",
@@ -353,7 +350,7 @@ class EstimateSettings:
     unit: Annotated[
         str | None,
         Option(
-            "Unit of the motion, such as m/s², mm/s or µg; spectra are in its square per Hz.",
+            "Unit of the motion, such as m/s², mm/s or µg. Spectra are in its square per Hz.",
             check=_unit,
             flags=("--unit",),
             metavar="UNIT",
@@ -362,8 +359,8 @@ class EstimateSettings:
     band: Annotated[
         tuple[float, float] | None,
         Option(
-            "Band of interest in Hz, such as 1:20: of the table, of the wanted precision, and of"
-            " the effect of clocks.",
+            "Band of interest in Hz, such as 1:20, for the table of results, the target c.o.v. and"
+            " the effect of the clocks.",
             check=_band,
             flags=("--band",),
             metavar="LOW:HIGH",
@@ -375,7 +372,7 @@ class EstimateSettings:
     target_cov: Annotated[
         float | None,
         Option(
-            "Wanted coefficient of variation of the noise in the band, such as 0.05.",
+            "Target coefficient of variation of the noise in the band, such as 0.05.",
             check=_cov,
             flags=("--target-cov",),
             metavar="COV",
@@ -409,7 +406,7 @@ def to_table(settings: EstimateSettings) -> dict[str, object]:
 
 
 def to_arguments(changes: Mapping[str, object]) -> list[str]:
-    """Return settings, by field, as arguments of the command line; None stands for not given."""
+    """Return settings, by field, as arguments of the command line; None means not given."""
     arguments: list[str] = []
     for name, value in changes.items():
         option = OPTIONS[name]
@@ -427,7 +424,7 @@ def to_arguments(changes: Mapping[str, object]) -> list[str]:
 
 
 def from_text(name: str, text: str | Sequence[str]) -> object:
-    """Return the value of an option that the command line gives.
+    """Return the value of an option from the text of the command line.
 
     Raises
     ------
@@ -439,7 +436,7 @@ def from_text(name: str, text: str | Sequence[str]) -> object:
 
 
 def default_text(name: str) -> str:
-    """Return the default of an option as people write it; empty where there is none."""
+    """Return the default of an option as text; empty if it has none."""
     value = getattr(EstimateSettings(), name)
     option = OPTIONS[name]
     if option.is_switch or not value:
@@ -494,7 +491,7 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
         yield Misfit(
             "dimension",
             f"{settings.dimension}",
-            f"expected at most {most}: {len(channels)} channels cannot tell more dimensions of"
+            f"expected at most {most}: {len(channels)} channels cannot separate more dimensions of"
             " motion from noise",
         )
     known = (*(sensor.name for sensor in sensors), *channels)
@@ -506,14 +503,14 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
 
 
 def max_dimension(n_channels: int) -> int:
-    """Return the most dimensions q of motion that p channels can tell from noise: (p - q)² ≥ p."""
+    """Return the largest dimension q of motion that p channels identify: (p - q)² ≥ p."""
     return math.floor(n_channels - math.sqrt(n_channels) + 1e-12)
 
 
 def shortest_duration(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> tuple[int, float]:
-    """Return the fewest segments that allow any estimate, and how long they take in seconds.
+    """Return the minimum number of segments of an estimate, and their duration in seconds.
 
-    An estimate takes more averages than a sensor has channels.
+    An estimate needs more averages than a sensor has channels.
     """
     fewest = 1 + max(sum(not c.auxiliary for c in sensor.channels) for sensor in sensors)
     return fewest, settings.segment * (1 + (fewest - 1) * (1 - settings.overlap))

@@ -1,4 +1,4 @@
-"""Faults of single values of a table: pydantic's errors in our words."""
+"""Errors of single values of a table: pydantic's errors as value, key and expectation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _EXPECTED = {
     "less_than": "expected a number below {lt:g}",
     "less_than_equal": "expected at most {le:g}",
 }
-"""By pydantic's type of error, with its context; other types keep pydantic's own message."""
+"""By pydantic's type of error. Other types keep pydantic's message."""
 
 
 def field_faults(
@@ -58,30 +58,30 @@ def field_faults(
     model : type
         Model of the table.
     table : object
-        As the file has it.
+        The table as in the file.
     path : tuple of str
-        Keys under which the table is in the file, or in the table of a sensor.
+        Keys of the table in the file, or in the table of a sensor.
     sensor : str
-        Name of the sensor that the table belongs to, if to one.
+        Name of the sensor of the table, if it has one.
     """
     errors = error.errors(include_url=False)
     places = [tuple(details["loc"]) for details in errors]
     for details, location in zip(errors, places, strict=True):
         kind, value = details["type"], details["input"]
-        # Entries that are wrong do not count for pydantic, and are reported themselves.
+        # Pydantic does not count invalid entries, which are reported themselves.
         if kind == "too_short" and any(
             other != location and other[: len(location)] == location for other in places
         ):
             continue
         expected = _expectation(details, _fields(model, location[:-1]))
         key, owner = _place(table, location, path, sensor)
-        # The value of a table as a whole would only repeat the file.
+        # The value of a whole table would repeat the file.
         is_shown = kind != "missing" and not isinstance(value, dict | BaseModel)
         yield FileFault(key, expected, value if is_shown else ABSENT, owner)
 
 
 def _expectation(details: ErrorDetails, known: Mapping[str, FieldInfo]) -> str:
-    """Return what was expected; ``known`` are the fields of the table with the wrong key."""
+    """Return the expectation; ``known`` are the fields of the table with the wrong key."""
     kind, context = details["type"], details.get("ctx", {})
     name = str(details["loc"][-1]) if details["loc"] else ""
     field = known.get(name)
@@ -101,7 +101,7 @@ def _expectation(details: ErrorDetails, known: Mapping[str, FieldInfo]) -> str:
 
 
 def _fields(model: type[BaseModel], location: Sequence[int | str]) -> dict[str, FieldInfo]:
-    """Return the fields of the table at ``location``, empty where it is no table of ours."""
+    """Return the fields of the table at ``location``; empty for an unknown table."""
     current: Any = model
     for step in location:
         if isinstance(step, int):
@@ -127,9 +127,9 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
 def _place(
     table: object, location: tuple[int | str, ...], path: tuple[str, ...], sensor: str
 ) -> tuple[str, str]:
-    """Return the key at a location and the sensor that it belongs to.
+    """Return the key at a location, and its sensor.
 
-    Entries of a list are called by their name, or counted from 1.
+    Entries of a list are identified by their name, or counted from 1.
     """
     key = ".".join(path)
     for number, step in enumerate(location):
@@ -148,7 +148,7 @@ def _place(
 
 
 def one_of(value: str, known: Sequence[str]) -> str:
-    """Return that one of the known words was expected, and which one was probably meant."""
+    """Return the list of known words as an expectation, with the closest match."""
     close = difflib.get_close_matches(value, known, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     return f"expected one of {', '.join(known) or '(none)'}{hint}"

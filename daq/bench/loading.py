@@ -1,15 +1,16 @@
 """Reads bench files.
 
-``load`` and ``parse`` report every fault of a file at once, each with its key, its value and what
-was expected. The tables are in :mod:`daq.bench.model`; checks of several keys together are in
+``load`` and ``parse`` report all errors of a file together, each with key, value and expectation.
+The tables are in :mod:`daq.bench.model`; checks of several keys together are in
 :mod:`daq.bench.validation`.
 """
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 
     from daq.bench.driver_rules import DriverRules
 
+_MAX_LENGTH = 1 << 20
+_DOTTED = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
+"""A key of so many parts: the time that tomllib takes for one grows with their square."""
+
 
 def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> Bench:
     """Read and check a bench file.
@@ -30,7 +35,7 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
     Raises
     ------
     BenchFileError
-        With every fault of the file, one a line.
+        With every error in the file, one per line.
     """
     source = Path(path)
     try:
@@ -60,20 +65,17 @@ def parse(
     text : str
         TOML.
     source : path or str
-        What messages call it; recordings go beside it if it is a path.
+        Name of the text in messages; recordings go beside it if it is a path.
     drivers : mapping, optional
-        The drivers of this computer. Where given, the bench must also make sense as a huddle test
-        here. A bench that comes out of a recording need not: its drivers may be elsewhere.
+        The drivers of this computer. With them the bench is also checked as a huddle test on this
+        computer. The bench in a recording is not: its drivers may be on another computer.
 
     Raises
     ------
     BenchFileError
-        With every fault of the file, one a line.
+        With every error in the file, one per line.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BenchFileError(FileFault("", f"not TOML: {error}"), source=source) from None
+    table = _table(text, source)
     bench: Bench | None = None
     faults: list[FileFault] = []
     context = {"text": text, "source": source if isinstance(source, Path) else None}
@@ -86,6 +88,22 @@ def parse(
     if faults or bench is None:
         raise BenchFileError(*faults, source=source)
     return bench
+
+
+def _table(text: str, source: str | Path) -> dict[str, Any]:
+    """Return the table of a TOML text, in bounded time."""
+    if len(text) > _MAX_LENGTH:
+        said = f"{len(text)} characters; expected at most {_MAX_LENGTH}"
+    elif _DOTTED.search(text):
+        said = "a key of more than 64 parts; expected a bench file"
+    else:
+        try:
+            return tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            said = f"not TOML: {error}"
+        except RecursionError:
+            said = "tables or arrays nested too deeply; expected a bench file"
+    raise BenchFileError(FileFault("", said), source=source)
 
 
 def dump(bench: Bench) -> str:

@@ -32,7 +32,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def _name(value: str) -> str:
+def check_name(value: str) -> str:
+    """Return a name that a sensor, a channel, a limit or a bench may have.
+
+    Raises
+    ------
+    ValueError
+        Saying what was expected.
+    """
     if value in {".", ".."} or "/" in value or not value.isprintable() or value != value.strip():
         raise ValueError("expected a printable name without '/' and outer spaces")
     if not 0 < len(value.encode()) <= 64:
@@ -71,7 +78,7 @@ def _pair_to_complex(value: object) -> object:
 
 Number = Annotated[float, Field(strict=True)]
 PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, AfterValidator(check_name)]
 Duration = Annotated[float, BeforeValidator(parse_duration)]
 ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
 
@@ -139,6 +146,41 @@ class Channel(Table):
         return table
 
 
+def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
+    if value[0] >= value[1]:
+        raise ValueError("expected the lower frequency first, in Hz")
+    return value
+
+
+class DataSheet(Table):
+    """What a sensor's data sheet states of its noise."""
+
+    unit: str | None = None
+    """Of the values: that of the channel, if not given."""
+    noise_density: tuple[tuple[PositiveNumber, PositiveNumber], ...] = ()
+    """Pairs of a frequency in Hz and the noise there in unit/√Hz."""
+    integrated_noise: tuple[
+        Annotated[tuple[PositiveNumber, PositiveNumber, PositiveNumber], AfterValidator(_rising)],
+        ...,
+    ] = ()
+    """From and to which frequency in Hz, and the noise between in unit rms."""
+    dynamic_range: tuple[
+        Annotated[tuple[PositiveNumber, PositiveNumber, PositiveNumber], AfterValidator(_rising)],
+        ...,
+    ] = ()
+    """From and to which frequency in Hz, and in dB a sine of full scale above the noise between."""
+    full_scale: PositiveNumber | None = None
+    """Peak, in the unit."""
+    channels: tuple[str, ...] = ()
+    """Names of the channels it holds for; all, if empty."""
+
+    @model_validator(mode="after")
+    def _has_full_scale(self) -> DataSheet:
+        if self.dynamic_range and self.full_scale is None:
+            raise ValueError("dynamic_range: expected full_scale beside it, the peak in the unit")
+        return self
+
+
 class Sensor(Table):
     """One sensor with its digitizer, at one port."""
 
@@ -154,6 +196,7 @@ class Sensor(Table):
     channels: tuple[Channel, ...] = Field(min_length=1, description="[[sensors.channels]] tables")
     clock: Name | None = None
     """Sensors of one clock name are sampled by one clock."""
+    data_sheet: DataSheet | None = None
 
     def clock_name(self, *, shares_clock: bool) -> str:
         """Return the name of the clock that samples this sensor."""

@@ -1,4 +1,4 @@
-"""Faults of a bench file that only several values together show, or a driver."""
+"""Errors of a bench file between several values, and those that a driver finds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _valid(model: type[_TableT], table: object) -> _TableT | None:
 def cross_faults(
     table: Mapping[str, Any], drivers: Mapping[str, DriverRules]
 ) -> Iterator[FileFault]:
-    """Yield the faults between several keys, and those that drivers find, in the valid parts."""
+    """Yield errors between several keys, and those that drivers find, in the valid parts."""
     rate = valid_rate(table)
     entries = table.get("sensors")
     entries = entries if isinstance(entries, list) else []
@@ -128,7 +128,7 @@ def _port_faults(
 def _device_faults(
     sensors: Sequence[Sensor], drivers: Mapping[str, DriverRules]
 ) -> Iterator[FileFault]:
-    """Yield what the drivers find wrong with their sensors, port by port."""
+    """Yield the errors that drivers find in their sensors, port by port."""
     ports: dict[tuple[str, str], list[Sensor]] = {}
     for sensor in sensors:
         ports.setdefault((sensor.driver, sensor.port), []).append(sensor)
@@ -160,14 +160,14 @@ def _set_faults(
             if sensor.n_main_channels != usual:
                 yield FileFault(
                     "channels",
-                    f"expected {usual} that are not auxiliary, as the other sensors have",
+                    f"expected {usual} that are not auxiliary, as in the other sensors",
                     f"{sensor.n_main_channels} channels",
                     sensor.name,
                 )
 
 
 def _method_faults(estimate: EstimateSettings) -> Iterator[FileFault]:
-    """Yield options of a method that is not chosen."""
+    """Yield options of a method that is not selected."""
     for key, value, method in (
         ("dimension", estimate.dimension, "maximum-likelihood"),
         ("gains", estimate.gains or None, "two-channel"),
@@ -191,8 +191,8 @@ def _rate_faults(sensors: Sequence[Sensor], rate: float) -> Iterator[FileFault]:
             yield FileFault(
                 "sampling_rate",
                 (
-                    f"expected at least the bench's {rate:g} Hz: a slower sensor cannot be brought"
-                    " onto that grid (lower the bench's sampling_rate)"
+                    f"expected at least {rate:g} Hz, the rate of the bench: a slower sensor cannot"
+                    " be resampled to it; lower the sampling_rate of the bench"
                 ),
                 sensor.sampling_rate,
                 sensor.name,
@@ -211,7 +211,7 @@ def _estimate_faults(
             yield FileFault(
                 "estimate.band",
                 (
-                    f"expected [low, high] Hz from {1 / estimate.segment:.4g} (one over the"
+                    f"expected [low, high] in Hz from {1 / estimate.segment:.4g} (one over the"
                     f" segment) to {rate / 2:.4g} (half the sampling rate)"
                 ),
                 list(estimate.band),
@@ -223,8 +223,8 @@ def _estimate_faults(
         yield FileFault(
             "recording.duration",
             (
-                f"expected at least {format_duration(shortest)}: fewer than {n_segments} segments"
-                f" of {format_duration(estimate.segment)} allow no estimate"
+                f"expected at least {format_duration(shortest)}: an estimate needs {n_segments}"
+                f" segments of {format_duration(estimate.segment)}"
             ),
             format_duration(recording.duration),
         )
@@ -242,12 +242,12 @@ def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterat
         if len(limit.psd) != len(limit.frequency):
             yield FileFault(
                 f"{key}.psd",
-                f"expected {len(limit.frequency)}, one per frequency",
+                f"expected {len(limit.frequency)}, one for each frequency",
                 f"{len(limit.psd)} values",
             )
         if any(b <= a for a, b in zip(limit.frequency, limit.frequency[1:], strict=False)):
             yield FileFault(
-                f"{key}.frequency", "expected rising frequencies", list(limit.frequency)
+                f"{key}.frequency", "expected increasing frequencies", list(limit.frequency)
             )
         for name in limit.sensors:
             if name not in known_sensors:

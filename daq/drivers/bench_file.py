@@ -20,6 +20,8 @@ class InstalledDrivers(Mapping[str, DriverType]):
     """The installed drivers, each imported when it is looked up."""
 
     def __getitem__(self, name: str) -> DriverType:
+        if name not in driver_names():
+            raise KeyError(name)
         return driver_type(name)
 
     def __contains__(self, name: object) -> bool:

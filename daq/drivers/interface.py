@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event
 
 
+DEFAULT_PATIENCE = 10.0
+"""Seconds without a block after which a port is lost, if its session states nothing else."""
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceInformation:
     """What a device says about itself; empty or None where it does not say."""
@@ -91,6 +95,34 @@ class DriverType(DriverRules, Protocol):
         NotConnectedError, NoAnswerError, WrongDeviceError
             Each naming sensor, port, what was expected and what came.
         """
+        ...
+
+
+class PatientSession(Session, Protocol):
+    """A session that states how long its device may be silent without being lost.
+
+    The recorder alone decides that a silent port is lost; :meth:`Session.read` sets no time limit
+    of its own. A sensor is *late* two block periods after its last block. Its port is *lost*, and
+    is opened again, after the longest of ``patience``, twice the longest recent interval between
+    blocks, and what earlier sessions on the port have taught. A device that pauses for less and
+    then delivers everything has lost nothing, and neither has the recording.
+
+    A driver that can tell a silent device from one that has stopped (one that answers and says that
+    it does not sample) ends the session at once with ``NoAnswerError``.
+    """
+
+    @property
+    def patience(self) -> float:
+        """Seconds of the device's time without a block after which the port is lost.
+
+        The length of the buffer in the device, if longer than ``DEFAULT_PATIENCE``, or the user's
+        own setting. Sessions that state nothing have ``DEFAULT_PATIENCE``.
+        """
+        ...
+
+    @property
+    def hint(self) -> str:
+        """What to check if no block comes; the end of the error message. May be missing."""
         ...
 
 

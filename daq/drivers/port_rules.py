@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daq.errors import BenchFileError, FileFault, toml_value
-from daq.transport.address import host_and_port
+from daq.transport.address import check_serial, host_and_port
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -58,7 +58,7 @@ def require_alike(
 
 
 def require_address(sensor: Sensor) -> None:
-    """Check that a network port is an address.
+    """Check that a network port is an address, and any other a device.
 
     Raises
     ------
@@ -70,4 +70,10 @@ def require_address(sensor: Sensor) -> None:
             host_and_port(sensor.port)
         except ValueError as error:
             expected = f"expected {sensor.port.partition('://')[0]}://host:port"
+            raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error
+    else:
+        try:
+            check_serial(sensor.port)
+        except ValueError as error:
+            expected = "expected a device such as /dev/ttyUSB0, or socket://host:port"
             raise BenchFileError(FileFault("port", expected, sensor.port, sensor.name)) from error

@@ -11,7 +11,6 @@ tiltmeters take ``*9900XYC2`` and ``*9900XYC-OFF``.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
@@ -26,12 +25,19 @@ from pydantic import (
     field_validator,
 )
 
-from daq.drivers.interface import DeviceInformation
+from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.drivers.port_rules import only
-from daq.errors import BenchFileError, DeviceError, FileFault, NoAnswerError, toml_value
+from daq.errors import BenchFileError, DeviceError, FileFault, toml_value
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.text.decoder import TextDecoder
-from daq.protocols.text.format import LILY, RASPBERRY_SHAKE, TextFormat, is_readable
+from daq.protocols.text.format import (
+    LILY,
+    RASPBERRY_SHAKE,
+    SINCE_START,
+    TextFormat,
+    is_readable,
+)
+from daq.protocols.text.guess import guess_settings
 from daq.transport.ports import open_port
 from daq.transport.udp import open_datagrams
 
@@ -51,11 +57,14 @@ PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat(
 class TextSettings(BaseModel):
     """``[sensors.settings]`` of a device that sends text."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
-    layout: Literal["row", "channel"] | None = None
-    """"row": a line is one sample of every channel. "channel": name, time, samples of one."""
+    layout: Literal["row", "labelled", "json", "channel"] | None = None
+    """"row": a line is one sample of every channel. "labelled": the same as ``X:1 Y:2``. "json":
+    the same as a JSON object. "channel": name, time, samples of one channel."""
     delimiter: str | None = None
     terminator: Annotated[str, Field(min_length=1)] | None = None
     prefix: str | None = None
@@ -65,15 +74,22 @@ class TextSettings(BaseModel):
     columns: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Strict(strict=False)] | None = None
     """Field of each channel, counted from 0 (layout "row"); the first ones, if not given."""
     channel_names: Annotated[tuple[str, ...], Strict(strict=False)] | None = None
-    """Name of each channel in the messages (layout "channel"); the channels' own, if not given."""
-    time_column: Annotated[int, Field(ge=0)] | None = None
+    """Name of each channel in the messages (not in layout "row"); the channels' own, if not given.
+    In layout "json" also ``acc.0`` for the first entry of a list."""
+    time_column: Annotated[int, Field(ge=0)] | str | None = None
+    """Field of the time: its number (layout "row") or name."""
     time_format: str | None = None
-    """"epoch" (seconds since 1970) or as Python's strptime has it; UTC."""
-    counter_column: Annotated[int, Field(ge=0)] | None = None
+    """"epoch" (seconds since 1970), as Python's strptime has it (UTC), or "millis" or "micros"
+    since the device was started."""
+    counter_column: Annotated[int, Field(ge=0)] | str | None = None
     counter_modulus: PositiveInt | None = None
     nmea_checksum: bool | None = None
     whole: bool | None = None
     """Whether samples are whole numbers."""
+    decimal_comma: bool | None = None
+    """Whether numbers are written ``1,5``."""
+    hexadecimal_bits: Annotated[int, Field(ge=4, le=32)] | None = None
+    """Bits of samples written in hexadecimal, two's complement."""
     device_time: bool | None = None
     """Whether the device's time is the clock, instead of arrival."""
     start: str = ""
@@ -82,16 +98,18 @@ class TextSettings(BaseModel):
     """Sent in the end."""
     baud_rate: PositiveInt = 19200
     parity: Literal["N", "E", "O"] = "N"
-    patience: PositiveFloat = 2.0
-    """How long nothing may come, s, beyond twice the time between messages."""
+    patience: PositiveFloat = DEFAULT_PATIENCE
+    """Seconds without samples after which the device is lost and connected again; for a device that
+    sends more seldom than every minute, at least twice that interval."""
 
     @field_validator("time_format")
     @classmethod
     def _readable(cls, value: str | None) -> str | None:
-        if value not in {None, "epoch"} and not is_readable(value):
+        known = value is None or value == "epoch" or value in SINCE_START
+        if not known and not is_readable(value or ""):
             raise ValueError(
-                'expected "epoch", or date and time as Python\'s strptime has them,'
-                ' such as "%Y-%m-%d %H:%M:%S.%f"'
+                'expected "epoch", "millis", "micros", or date and time as Python\'s strptime has'
+                ' them, such as "%Y-%m-%d %H:%M:%S.%f"'
             )
         return value
 
@@ -110,14 +128,14 @@ class TextSettings(BaseModel):
         }
         format_ = replace(PRESETS[self.preset], **given)
         n_channels = len(sensor.channels)
-        if format_.layout == "channel":
+        if format_.layout != "row":
             names = self.channel_names or tuple(channel.name for channel in sensor.channels)
             format_ = replace(format_, channel_names=names)
         elif not format_.columns:
             format_ = replace(format_, columns=tuple(range(n_channels)))
-        places = format_.channel_names if format_.layout == "channel" else format_.columns
+        places = format_.channel_keys
         if len(places) != n_channels:
-            what = "channel_names" if format_.layout == "channel" else "columns"
+            what = "columns" if format_.layout == "row" else "channel_names"
             expected = f"expected one for each of the sensor's {n_channels} channels"
             raise BenchFileError(FileFault(f"settings.{what}", expected, list(places), sensor.name))
         if format_.terminator in format_.delimiter:
@@ -128,10 +146,27 @@ class TextSettings(BaseModel):
             raise BenchFileError(
                 FileFault("settings.terminator", expected, format_.terminator, sensor.name)
             )
-        if format_.device_time and format_.layout == "row" and format_.time_column is None:
-            expected = "expected settings.time_column with it"
-            raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+        _check_format(format_, sensor)
         return format_
+
+
+def _check_format(format_: TextFormat, sensor: Sensor) -> None:
+    """Raise BenchFileError for settings that do not go together."""
+    if format_.device_time and format_.layout != "channel" and format_.time_column is None:
+        expected = "expected settings.time_column with it"
+        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+    if format_.device_time and format_.time_format in SINCE_START:
+        expected = f"a time in {format_.time_format} is no UTC: leave it out"
+        raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
+    if format_.decimal_comma and "," in format_.delimiter and format_.layout == "row":
+        expected = "expected another settings.delimiter than a comma with it"
+        raise BenchFileError(FileFault("settings.decimal_comma", expected, True, sensor.name))
+    for key in ("time_column", "counter_column"):
+        value = getattr(format_, key)
+        if value is not None and isinstance(value, int) != (format_.layout == "row"):
+            what = "the number" if format_.layout == "row" else "the name"
+            expected = f'expected {what} of a field, for layout "{format_.layout}"'
+            raise BenchFileError(FileFault(f"settings.{key}", expected, value, sensor.name))
 
 
 class _Source(Protocol):
@@ -189,41 +224,41 @@ class TextSession:
         source: _Source,
         settings: TextSettings,
         *,
-        label: str,
         information: DeviceInformation,
-        interval: float,
+        decoder: TextDecoder,
     ) -> None:
         self.information = (information,)
-        self._interval = interval  # of samples, s
+        self.patience = settings.patience
+        """See :class:`daq.drivers.interface.PatientSession`."""
         self._source = source
         self._settings = settings
-        self._label = label
+        self._decoder = decoder
         self._advice = (
             "does the device cast to this computer and port, and does a firewall let it pass?"
             if isinstance(source, _DatagramSource)
             else "check cable, power, settings.baud_rate and settings.start"
         )
 
+    @property
+    def hint(self) -> str:
+        """What to check if no block comes: the format, if there are rows and none could be read."""
+        rows = self._decoder.first_rows
+        if not rows:
+            return self._advice
+        shown = ", ".join(repr(row[:60].decode("ascii", "replace")) for row in rows[:2])
+        guess = guess_settings(rows)
+        if guess is None:
+            return f"rows came that settings do not match: {shown}; is settings.baud_rate right?"
+        would = ", ".join(f"{key} = {toml_value(value)}" for key, value in guess.items())
+        return f"rows came that settings do not match: {shown}; these would: {would}"
+
     async def read(self) -> AsyncIterator[Block | Event]:
         """Ask for samples and yield blocks of them."""
         self._source.discard()
         if self._settings.start:
             await self._source.send(self._settings.start.encode())
-        loop = asyncio.get_running_loop()
-        last, between = loop.time(), self._interval  # of blocks
         while True:
-            patience = last + self._settings.patience + 2 * between
-            try:
-                async with asyncio.timeout_at(patience):
-                    items = await self._source.receive()
-            except TimeoutError as error:
-                raise NoAnswerError(
-                    f"{self._label}: no samples for {patience - last:.2g} s; {self._advice}"
-                ) from error
-            for item in items:
-                if isinstance(item, Block):
-                    between = max(0.9 * between, self._interval, loop.time() - last)
-                    last = loop.time()
+            for item in await self._source.receive():
                 yield item
 
 
@@ -258,13 +293,7 @@ class TextDriver:
         )
         async with _opened(sensor, clock, settings, decoder, label=label) as source:
             try:
-                yield TextSession(
-                    source,
-                    settings,
-                    label=label,
-                    information=information,
-                    interval=1 / sensor.sampling_rate,
-                )
+                yield TextSession(source, settings, information=information, decoder=decoder)
             finally:
                 if settings.stop:
                     with contextlib.suppress(DeviceError):

@@ -33,7 +33,7 @@ def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     rows = _rows(record)
     if len(rows) == 0:
         return {}
-    counts = np.concatenate([record.counts(int(first), int(last)) for first, last in rows])
+    counts = np.concatenate([record.intact_counts(int(a), int(b))[0] for a, b in rows])
     which = np.concatenate([np.arange(first, last) for first, last in rows])
     blocks = record.blocks
     begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]

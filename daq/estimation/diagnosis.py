@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.estimation.noise_estimates import neighbours
-from daq.estimation.snapshot import Diagnosis, FrequencyDiagnosis, Synchronisation
+from daq.estimation.snapshot import (
+    Diagnosis,
+    FrequencyDiagnosis,
+    SnapshotDiagnostics,
+    Synchronisation,
+)
 from estimator.diagnostics.advice import Advice, Gain
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -28,6 +34,31 @@ if TYPE_CHECKING:
     ComplexArray = NDArray[np.complex128]
 
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What is known of the test itself, as `SnapshotDiagnostics` has it; nothing at first."""
+
+    clipped: Mapping[int, float] = field(default_factory=dict)
+    stood_still: Mapping[int, float] = field(default_factory=dict)
+    diagnosis: Diagnosis | None = None
+    untested: Untested | None = Untested.UNFINISHED
+
+    def fits(self, frequency: FloatArray) -> bool:
+        """Whether it is about these frequencies: with octaves, there are more as time goes by."""
+        found = self.diagnosis
+        return found is None or len(found.per_frequency.dimension) == len(frequency)
+
+    def added_to(self, diagnostics: SnapshotDiagnostics) -> SnapshotDiagnostics:
+        """Return diagnostics with these findings."""
+        return replace(
+            diagnostics,
+            clipped=self.clipped,
+            stood_still=self.stood_still,
+            diagnosis=self.diagnosis,
+            untested=self.untested,
+        )
 
 
 def synchronisation(

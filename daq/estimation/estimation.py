@@ -25,7 +25,7 @@ import numpy as np
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
 from daq.estimation.clipping import clipped_shares
-from daq.estimation.diagnosis import diagnosis, synchronisation
+from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
 from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
@@ -33,7 +33,7 @@ from daq.estimation.noise_estimates import (
     in_units,
     known_gains,
     noise_estimates,
-    time_left,
+    quantisation_psd,
     up_to,
 )
 from daq.estimation.recording_set import check_same, check_span, open_another
@@ -42,11 +42,14 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
     ChannelLabel,
     NoResultError,
+    NoSegment,
     Octave,
     SensorTotals,
     Snapshot,
     SnapshotDiagnostics,
+    added_by_clocks,
 )
+from daq.estimation.throttle import Throttle
 from estimator.spectra.segment_rejection import Reason, RejectionSettings
 
 if TYPE_CHECKING:
@@ -63,7 +66,10 @@ _FINAL_TOLERANCE = 1e-7
 _REVIEW = 1.25  # growth after which that is looked at
 _FIRST_REVIEW = 8  # segments
 _RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
+DIAGNOSIS_SHARE = 0.02
+"""Share of the time that diagnoses of a growing recording may take."""
 _MOST_PASSES = 4
+_SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
 _MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
 
 
@@ -109,6 +115,8 @@ class Estimation:
             raise
         self._next_review = _FIRST_REVIEW
         self._dimensions: Dimensions | None = None
+        self._findings = Findings()
+        self._diagnoses = Throttle(DIAGNOSIS_SHARE)
         self._chosen_at = 0
 
     def close(self) -> None:
@@ -145,8 +153,13 @@ class Estimation:
         end = last.n_seen * welch.hop + welch.segment_length
         return (end - last.aligned.n_available) / welch.sampling_rate
 
-    def update(self) -> bool:
+    def update(self, progress: Progress | None = None) -> bool:
         """Take what has been committed since; return whether there was a new segment.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Receives the number of segments taken, and of those there are.
 
         Raises
         ------
@@ -156,7 +169,16 @@ class Estimation:
         before = self.n_seen
         for each in self._passes:
             each.aligned.refresh()
-            each.advance()
+        total, done = sum(each.n_complete for each in self._passes), before
+
+        def count(n: int) -> None:
+            nonlocal done
+            done += n
+            if progress is not None:
+                progress(done, total)
+
+        for each in self._passes:
+            each.advance(count)
         seen = self.n_seen
         if seen >= self._next_review:
             for each in self._passes:
@@ -233,6 +255,8 @@ class Estimation:
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_effective = self.n_segments, bands[-1].n_effective if bands else 0.0
         estimates = self._estimates(bands, final=final)
+        latest = self._recordings[-1]
+        events = latest.events
         diagnostics = SnapshotDiagnostics(
             synchronisation=synchronisation(
                 last.aligned.clocks,
@@ -245,26 +269,19 @@ class Estimation:
             ),
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
-        if final:
-            clipped, stood_still = self._clipped(), self._dead_for_a_while()
-            found, untested = diagnosis(
-                bands,
-                dims,
-                channels,
-                dimensions=estimates.dimensions,
-                faulty={*clipped, *stood_still},
-            )
-            diagnostics = replace(
-                diagnostics,
-                clipped=clipped,
-                stood_still=stood_still,
-                diagnosis=found,
-                untested=untested,
-            )
+        if final or self._diagnoses.is_due:
+            with self._diagnoses:
+                self._findings = self._diagnose(bands, estimates)
+        if self._findings.fits(frequency):
+            diagnostics = self._findings.added_to(diagnostics)
+        added = added_by_clocks(diagnostics.synchronisation, estimates.results)
         return Snapshot(
             frequency=frequency,
             csm=csm,
-            results=estimates.results,
+            results={
+                name: found if added is None else replace(found, low=found.low - added)
+                for name, found in estimates.results.items()
+            },
             refused=estimates.refused,
             channels=tuple(
                 ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
@@ -275,22 +292,41 @@ class Estimation:
             n_dropped=self.n_seen - n_segments,
             n_effective=n_effective,
             elapsed=sum(each.elapsed for each in self._passes),
-            time_left=time_left(
-                self.settings,
-                frequency,
-                estimates.results,
-                nyquist=first.welch.sampling_rate / 2,
-                taken=n_segments * first.welch.hop / first.welch.sampling_rate,
-            ),
             start_utc_ns=first.aligned.start_utc_ns,
-            sensors=tuple(SensorTotals.of(record) for record in self._recordings[-1].sensors),
+            sensors=tuple(SensorTotals.of(record, events) for record in latest.sensors),
             clocks=last.aligned.clocks,
             drift=last.drift(),
             closed=all(recording.closed for recording in self._recordings),
             left_out=self._left_out(),
             octaves=tuple(map(Octave.of, bands)) if self.settings.octaves else (),
             diagnostics=diagnostics,
+            no_segment=self._no_segment(),
+            quantisation_psd=(
+                quantisation_psd(frequency, channels, self._unit, self._counting_rates())
+                if final
+                else None
+            ),
         )
+
+    def _diagnose(self, bands: tuple[Band, ...], estimates: Estimates) -> Findings:
+        """Say what the averages show of the test itself: costly, and so not at every snapshot."""
+        clipped, stood_still = self._clipped(), self._dead_for_a_while()
+        found, untested = diagnosis(
+            bands,
+            self._passes[0].aligned.dims,
+            self._passes[0].aligned.channels,
+            dimensions=estimates.dimensions,
+            faulty={*clipped, *stood_still},
+        )
+        return Findings(clipped, stood_still, found, untested)
+
+    def _counting_rates(self) -> dict[str, float]:
+        """Return the rates of the sensors whose samples are whole numbers, in Hz."""
+        return {
+            record.name: record.sampling_rate
+            for record in self._recordings[-1].sensors
+            if record.n_samples and record.counts(0, 1).dtype.kind in "iu"
+        }
 
     def _estimates(self, bands: tuple[Band, ...], *, final: bool) -> Estimates:
         """Estimate; while following, the dimension is chosen anew when segments have grown."""
@@ -346,6 +382,19 @@ class Estimation:
             counts.update(each.left_out)
         counts[Reason.TRANSIENT] = self.n_seen - self.n_segments - counts.total()
         return {reason: counts[reason] for reason in Reason}
+
+    def _no_segment(self) -> NoSegment | None:
+        stretches = self._passes[-1].aligned.longest_stretches
+        if self.n_segments or self.n_seen < _SEGMENTS_MISSED or not stretches:
+            return None
+        left_out = self._left_out()
+        sensor = min(stretches, key=lambda name: stretches[name])
+        return NoSegment(
+            max(left_out, key=lambda reason: left_out[reason]),
+            self.settings.segment,
+            sensor,
+            stretches[sensor],
+        )
 
     def _why_nothing(self, snapshot: Snapshot) -> str:
         names = ", ".join(str(recording.path) for recording in self._recordings)

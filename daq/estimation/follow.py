@@ -22,6 +22,7 @@ from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording, control_address
+from daq.recording.storage import locking
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +60,10 @@ class Observer(Protocol):
         ...
 
     def progress(self, done: int, total: int) -> None:
-        """Take how many segments of the result are done, and of how many."""
+        """Take how many segments are done, and of how many.
+
+        Of the result, or of what had been recorded before where the recording still grows.
+        """
         ...
 
 
@@ -100,8 +104,9 @@ def follow(
         Those of the bench in the recording, if not given.
     observer : Observer
     recorder : Recorder, optional
-        The process that writes the recording. If not given, the recorder is asked over its control
-        channel whether it still runs, once no sample has come for `silence` seconds.
+        The process that writes the recording. If not given, it runs as long as it holds the lock
+        of the file. Without such locks (Windows) it is asked over its control channel, once no
+        sample has come for `silence` seconds.
     cancelled : threading.Event, optional
         Ends the following early once it is set.
     watch_sensors : bool
@@ -136,10 +141,20 @@ def follow(
         if sensors is not None:
             sensors.look()
         closed = recording.closed
+
+        def catch_up(done: int, total: int) -> None:
+            if cancelled.is_set():
+                raise _CancelledError
+            if estimation.n_seen == 0 or done < total:  # not of the one new segment
+                observer.progress(done, total)
+
         while not closed:
             with looks:
                 left_open = known.ended  # asked before: what it wrote last is seen below
-                estimation.update()
+                try:
+                    estimation.update(catch_up)
+                except _CancelledError:
+                    return None
                 closed = recording.closed
                 if closed:
                     break
@@ -220,7 +235,11 @@ class _Sensors:
 
 
 class _RemoteRecorder:
-    """A recorder that another process started: asked whether it runs when no sample comes."""
+    """A recorder that another process started.
+
+    It is gone when nobody holds the lock of the file. Where that cannot be seen, it is asked
+    whether it runs when no sample comes.
+    """
 
     def __init__(self, recording: Recording, cancelled: threading.Event, silence: float) -> None:
         self._recording, self._silence = recording, silence
@@ -229,6 +248,8 @@ class _RemoteRecorder:
 
     @property
     def ended(self) -> bool:
+        if locking.IS_SEEN:
+            return not locking.is_being_written(self._recording.path)
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()
         if n_samples != self._n_samples:

@@ -19,7 +19,7 @@ from estimator.spectra.welch import CrossSpectra, scale
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -96,14 +96,37 @@ def up_to(band: Band, usable: float) -> Band:
 
 def in_units(band: Band, channels: Channels, unit: str) -> Band:
     """Return averages in ``unit**2/Hz``, the channels' responses taken out."""
-    frequency = band.frequencies
+    response = responses(band.frequencies, channels, unit)
+    return band if np.all(response == 1) else replace(band, csm=scale(band.csm, response))
+
+
+def responses(frequency: FloatArray, channels: Channels, unit: str) -> ComplexArray:
+    """Return what a channel's samples, in its own unit, make of one `unit`.
+
+    Shape (n_freqs, n_channels).
+    """
     response = np.ones((len(frequency), len(channels)), dtype=np.complex128)
     for column, (_, channel) in enumerate(channels):
         with np.errstate(divide="ignore", invalid="ignore"):
             response[:, column] = 1 / conversion(channel.unit, unit, frequency)
         if channel.response is not None:
             response[:, column] *= channel.response.at(frequency)
-    return band if np.all(response == 1) else replace(band, csm=scale(band.csm, response))
+    return response
+
+
+def quantisation_psd(
+    frequency: FloatArray, channels: Channels, unit: str, rates: Mapping[str, float]
+) -> FloatArray:
+    """Return the noise of counting in whole numbers, shape (n_freqs, n_channels), in unit**2/Hz.
+
+    One count is off by at most half, evenly: a variance of 1/12, spread up to half the rate.
+    `rates` are those of sensors that count in whole numbers, in Hz; NaN for the others.
+    """
+    steps = np.array([1 / abs(channel.sensitivity) for _, channel in channels])
+    rate = np.array([rates.get(sensor, np.nan) for sensor, _ in channels])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        psd = steps**2 / (6 * rate) / np.abs(responses(frequency, channels, unit)) ** 2
+    return np.where(np.isfinite(psd), psd, np.nan)
 
 
 def known_gains(settings: Settings, channels: Channels) -> FloatArray:
@@ -183,33 +206,6 @@ def noise_estimates(
             else:
                 results[method] = _joined(parts)
     return Estimates(results, refused, dimensions)
-
-
-def time_left(
-    settings: Settings,
-    frequency: FloatArray,
-    results: dict[str, SelfNoise],
-    *,
-    nyquist: float,
-    taken: float,
-) -> float | None:
-    """Return how many seconds more reach the wanted c.o.v. in the wanted band.
-
-    ``taken`` is what the averages so far took, in seconds; None where nothing can be said.
-    """
-    target = settings.target_cov
-    if target is None or not results:
-        return None
-    band = settings.band or (0.0, 0.9 * nyquist)
-    inside = (frequency >= band[0]) & (frequency <= band[1])
-    inside[0] = False
-    cov = next(iter(results.values())).cov[inside]
-    cov = cov[:, np.isfinite(cov).any(axis=0)]  # a dead channel never gets there
-    if not cov.size:
-        return None
-    reached = float(np.nanmax(np.nanmedian(cov, axis=0)))
-    # c.o.v. ~ 1 / √n, and averages come at a steady pace.
-    return taken * max(0.0, (reached / target) ** 2 - 1)
 
 
 def _dimensions(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]) -> Dimensions:

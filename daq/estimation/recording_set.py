@@ -36,7 +36,7 @@ def open_another(
     if not isinstance(path, (str, Path)):
         return path
     path = Path(path)
-    for other in others:  # two readers of a file in one process disturb each other
+    for other in others:
         if other.path.resolve() == path.resolve():
             raise _twice(path, other)
     recording = Recording.open(path)

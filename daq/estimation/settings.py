@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
-from daq.bench.estimate_settings import EstimateSettings
+from daq.bench.durations import parse_duration
+from daq.bench.estimate_settings import EstimateSettings, misfits
+from daq.errors import WrongSettingError
+from estimator.errors import EstimatorError
+from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from datetime import datetime
+    from collections.abc import Callable, Mapping, Sequence
 
-    from daq.bench.model import Bench
+    from daq.bench.model import Bench, Sensor
+    from daq.recording.interface import ReadableSensor
+
+_LONG_WINDOW = 4096  # samples, in which every window with a parameter that has one is possible
+_NEEDED = {"dimension": "maximum-likelihood", "gains": "two-channel"}
+"""Options that are for one method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,3 +50,98 @@ class Settings(EstimateSettings):
         return cls(
             **{each.name: getattr(bench.estimate, each.name) for each in fields(EstimateSettings)}
         )
+
+
+class ConflictingOptionError(WrongSettingError):
+    """An option does not fit the others, or the sensors; `option` is the name of its field."""
+
+    def __init__(self, message: str, option: str) -> None:
+        super().__init__(message)
+        self.option = option
+
+
+def with_changes(
+    settings: Settings, changes: Mapping[str, object], *, called: Callable[[str], str]
+) -> Settings:
+    """Return settings with options replaced.
+
+    A dimension or gains without a method ask for the method that takes them.
+
+    Parameters
+    ----------
+    settings : Settings
+    changes : mapping of str to object
+        Checked values by field of `EstimateSettings`; None where an option is not given.
+    called : callable
+        Returns what a user calls an option.
+
+    Raises
+    ------
+    ConflictingOptionError
+        If what was asked for does not go together.
+    """
+    given = {name: value for name, value in changes.items() if value is not None}
+    settings = replace(settings, **given)  # type: ignore[arg-type]  # of several types
+    try:
+        get_window(settings.window, _LONG_WINDOW)
+    except EstimatorError as error:
+        raise ConflictingOptionError(str(error), "window") from None
+    for name, needed in _NEEDED.items():
+        if name not in given or {needed, "all"} & set(settings.methods):
+            continue
+        if "methods" in given:
+            raise ConflictingOptionError(
+                f"{called(name)} is for the {needed} method, not for {', '.join(settings.methods)}",
+                name,
+            )
+        settings = replace(settings, methods=(needed,))
+    return settings
+
+
+def check_fit(
+    settings: Settings,
+    sensors: Sequence[Sensor | ReadableSensor],
+    *,
+    called: Callable[[str], str],
+) -> None:
+    """Refuse options that do not fit the sensors.
+
+    Parameters
+    ----------
+    settings : Settings
+    sensors : sequence of sensors
+    called : callable
+        Returns what a user calls an option.
+
+    Raises
+    ------
+    ConflictingOptionError
+        With what would fit.
+    """
+    if not any(not channel.auxiliary for sensor in sensors for channel in sensor.channels):
+        return  # that is refused with the file's name
+    for misfit in misfits(settings, sensors):
+        raise ConflictingOptionError(
+            f"{called(misfit.name)} {misfit.value}: {misfit.expected}", misfit.name
+        )
+
+
+def instant(text: str, created: datetime) -> datetime:
+    """Return a UTC time, or a time after the start of the recording, as an instant.
+
+    Raises
+    ------
+    ValueError
+        With what was expected.
+    """
+    try:
+        return created + timedelta(seconds=parse_duration(text, zero=True))
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(
+            f"{text!r}: expected UTC as in 2026-11-21T03:00:00, or a time after the start as in 2h"
+        ) from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

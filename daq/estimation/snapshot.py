@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.recording.sensor_state import STATE_AFTER
 from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
+    from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
     from daq.timing.clock_model import ClockState
     from estimator.diagnostics.advice import Advice
@@ -27,6 +29,10 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
+
+
+MOST_ADDED = 4.0
+"""What clocks add goes with the square of what is left between them: twice its rms is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +60,23 @@ class SensorTotals:
     n_missing: int
     last_seen: float
     """UTC of the last committed block, in seconds since 1970; NaN before the first."""
+    is_lost: bool = False
+    """Whether the sensor has sent nothing, or was lost after its last block."""
+    n_damaged: int = 0
+    """Number of its blocks whose checksum is wrong; the estimate leaves them out as gaps."""
 
     @classmethod
-    def of(cls, record: ReadableSensor) -> SensorTotals:
+    def of(cls, record: ReadableSensor, events: Iterable[Event] = ()) -> SensorTotals:
         """Return the totals of a sensor of a recording."""
         last = record.blocks[-1:]["utc_ns"]
+        last_ns = int(record.blocks[-1:]["monotonic_ns"][0]) if len(last) else -1
+        states = [
+            STATE_AFTER[event.kind]
+            for event in events
+            if event.sensor == record.name
+            and event.kind in STATE_AFTER
+            and event.received.monotonic_ns > last_ns
+        ]
         return cls(
             name=record.name,
             sampling_rate=record.sampling_rate,
@@ -66,6 +84,8 @@ class SensorTotals:
             n_gaps=len(record.gaps),
             n_missing=int(record.gaps["missing"].sum()),
             last_seen=float(last[0]) * 1e-9 if len(last) else float("nan"),
+            n_damaged=record.n_damaged,
+            is_lost=not len(last) or (bool(states) and states[-1].is_lost),
         )
 
 
@@ -112,6 +132,18 @@ class Synchronisation:
     noise_bias: FloatArray | None = None
 
 
+def added_by_clocks(
+    synchronisation: Synchronisation, results: Mapping[str, SelfNoise]
+) -> FloatArray | None:
+    """Return `Snapshot.added_by_clocks`."""
+    share = synchronisation.noise_bias
+    if share is None or not results:
+        return None
+    psd = np.abs(next(iter(results.values())).noise_psd)
+    added = MOST_ADDED * share * psd
+    return np.where(np.isfinite(added), np.clip(added, 0.0, psd), 0.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrequencyDiagnosis:
     """The diagnosis at every frequency of a snapshot.
@@ -137,7 +169,7 @@ class FrequencyDiagnosis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """What the averages of a finished estimate show of the test.
+    """What the averages show of the test.
 
     Attributes
     ----------
@@ -172,12 +204,13 @@ class SnapshotDiagnostics:
     dimensions : tuple of BandDimension
         Where the dimension of the motion was chosen by band; rising.
     clipped : mapping of int to float
-        Share of samples at the end of the range, by column of the channel; of a finished estimate,
-        and without channels that have none.
+        Share of samples at the end of the range, by column of the channel; without channels that
+        have none.
     stood_still : mapping of int to float
         Seconds for which a channel had a constant count though it has a signal otherwise; likewise.
     diagnosis : Diagnosis or None
-        Of a finished estimate; None where there is too little to diagnose.
+        None where there is too little to diagnose. While a recording grows it may be that of some
+        segments before: it takes too long to be made for every snapshot.
     untested : Untested or None
         Why the model of one common motion was tested in no band; None where it was.
     """
@@ -191,8 +224,30 @@ class SnapshotDiagnostics:
 
     @property
     def advice(self) -> tuple[Advice, ...]:
-        """Advice on the test; none before it is finished."""
+        """Advice on the test; none before it is diagnosed."""
         return () if self.diagnosis is None else self.diagnosis.advice
+
+
+@dataclass(frozen=True, slots=True)
+class NoSegment:
+    """Why no segment counts, though several would be complete.
+
+    Attributes
+    ----------
+    reason : Reason
+        Why most of them were left out.
+    segment : float
+        Their length in seconds.
+    sensor : str
+        The sensor with the most gaps.
+    longest : float
+        Its longest stretch without a gap, in seconds.
+    """
+
+    reason: Reason
+    segment: float
+    sensor: str
+    longest: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,8 +274,6 @@ class Snapshot:
         Independent averages the segments are worth; with octaves those of the highest.
     elapsed : float
         Seconds from the start to the end of what was looked at.
-    time_left : float or None
-        Seconds until the target c.o.v. is reached; None where there is no target or no estimate.
     start_utc_ns : int
         UTC of the first grid sample.
     sensors, clocks : tuple
@@ -234,6 +287,11 @@ class Snapshot:
     octaves : tuple of Octave
         Rising; empty where all frequencies rest on the same segments.
     diagnostics : SnapshotDiagnostics
+    no_segment : NoSegment or None
+        None where a segment counts, or too few would be complete.
+    quantisation_psd : float64, shape (n_freqs, n_channels), or None
+        Noise of counting in whole numbers, in unit**2/Hz; NaN for channels that do not. Of a
+        finished estimate.
     """
 
     frequency: FloatArray
@@ -247,7 +305,6 @@ class Snapshot:
     n_dropped: int
     n_effective: float
     elapsed: float
-    time_left: float | None
     start_utc_ns: int
     sensors: tuple[SensorTotals, ...]
     clocks: tuple[ClockState, ...]
@@ -256,11 +313,22 @@ class Snapshot:
     left_out: Mapping[Reason, int] = field(default_factory=dict)
     octaves: tuple[Octave, ...] = ()
     diagnostics: SnapshotDiagnostics = field(default_factory=SnapshotDiagnostics)
+    no_segment: NoSegment | None = None
+    quantisation_psd: FloatArray | None = None
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the sensors whose channels are estimated, in the order of `dims`."""
         return tuple(dict.fromkeys(label.sensor for label in self.channels))
+
+    @property
+    def added_by_clocks(self) -> FloatArray | None:
+        """What the clocks may have added to the noise PSD at most, shape (n_freqs, n_channels).
+
+        In unit**2/Hz: no more than the noise itself, 0 where it is not known; None before there is
+        an estimate.
+        """
+        return added_by_clocks(self.diagnostics.synchronisation, self.results)
 
     @property
     def data_psd(self) -> FloatArray:

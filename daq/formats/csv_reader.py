@@ -15,22 +15,32 @@
 
 from __future__ import annotations
 
+import codecs
 import re
+import warnings
 from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.errors import ImportFormatError
-from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches
+from daq.formats.foreign_sensor import (
+    MAX_CHANNELS,
+    NS_PER_S,
+    ForeignSensor,
+    Stretch,
+    finite_stretches,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+    from typing import TextIO
 
     from numpy.typing import NDArray
 
 _COLUMN = re.compile(r"^(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?$")
+_HEAD = 1 << 16
 _SNAP = 0.1  # of a sample: a rate that misses a round number by less in all is that number
 
 
@@ -72,10 +82,32 @@ def read_delimited(path: Path, sampling_rate: float | None = None) -> tuple[Fore
     return tuple(sensors)
 
 
+def _open(path: Path) -> TextIO:
+    """Open a text in the encoding that it has: UTF-8, UTF-16 with a mark, or Windows' 1252."""
+    with path.open("rb") as raw:
+        head = raw.read(_HEAD)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif b"\0" in head:
+        raise ImportFormatError(f"{path}: not a text; expected a CSV file")
+    else:
+        try:
+            codecs.getincrementaldecoder("utf-8")().decode(head)  # may end within a character
+            encoding = "utf-8-sig"
+        except UnicodeDecodeError:
+            encoding = "cp1252"
+    return path.open(encoding=encoding, errors="replace")
+
+
 def _header(path: Path) -> tuple[str, str]:
-    with path.open(encoding="utf-8-sig") as lines:
+    with _open(path) as lines:
         header = next((line for line in lines if line.strip() and line[0] != "#"), "")
     delimiter = max(",;\t", key=header.count)
+    if header.count(delimiter) > MAX_CHANNELS * 4:
+        raise ImportFormatError(
+            f"{path}: {header.count(delimiter) + 1} columns; expected one a channel, at most"
+            f" {MAX_CHANNELS} of each sensor. Are rows and columns exchanged?"
+        )
     cells = [cell.strip() for cell in header.split(delimiter)]
     if not header or any(not cell or _is_number(cell) for cell in cells):
         raise ImportFormatError(
@@ -108,7 +140,8 @@ def _cells(
     if time_column is not None:
         converters[time_column] = time_of
     skipped = 0
-    with path.open(encoding="utf-8-sig") as lines:
+    with _open(path) as lines, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that there are no rows: said below
         for line in lines:
             skipped += 1
             if line.strip() and line[0] != "#":

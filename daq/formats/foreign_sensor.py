@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.model import check_name
+from daq.errors import ImportFormatError
+
 if TYPE_CHECKING:
     from daq.protocols.block import CountsArray
 
 NS_PER_S = 1_000_000_000
+MAX_CHANNELS = 1000
+MIN_RATE, MAX_RATE = 1e-6, 1e7
+"""In Hz."""
+FIRST_DATE_NS = 10**17
+"""Times before March 1973 are those of files without a date."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +57,51 @@ class ForeignSensor:
     source: str
     units: tuple[str, ...] = ()
 
+    def check(self) -> None:
+        """Refuse what no recording can hold.
+
+        Raises
+        ------
+        ImportFormatError
+            Naming file, sensor, and what was expected.
+        """
+        where = f"{self.source}: sensor {self.name[:80]!r}"
+        if len(self.channels) > MAX_CHANNELS:
+            raise ImportFormatError(
+                f"{where}: {len(self.channels)} channels; expected at most {MAX_CHANNELS}. Are rows"
+                " and columns exchanged?"
+            )
+        repeated = {name for name in self.channels if self.channels.count(name) > 1}
+        if repeated:
+            raise ImportFormatError(
+                f"{where}: several channels are named {min(repeated)!r}; expected different names"
+            )
+        if not (math.isfinite(self.sampling_rate) and MIN_RATE <= self.sampling_rate <= MAX_RATE):
+            raise ImportFormatError(
+                f"{where}: a sampling rate of {self.sampling_rate:g} Hz; expected {MIN_RATE:g} to"
+                f" {MAX_RATE:g} Hz"
+            )
+        for what, name in (("sensor", self.name), *(("channel", n) for n in self.channels)):
+            try:
+                check_name(name)
+            except ValueError as error:
+                raise ImportFormatError(
+                    f"{where}: {what} name {name[:80]!r}: {error}; rename it in the file"
+                ) from None
+
     def first_sample(self, stretch: Stretch) -> int:
         """Index of a stretch's first sample on the grid that begins with the first stretch."""
         elapsed_ns = stretch.start_utc_ns - self.stretches[0].start_utc_ns
         return round(elapsed_ns * self.sampling_rate / NS_PER_S)
+
+    def dated_spans_ns(self) -> list[tuple[int, int]]:
+        """Return UTC of the first and last sample of each stretch; nothing if there is no date."""
+        ns_per_sample = NS_PER_S / self.sampling_rate
+        return [
+            (s.start_utc_ns, s.start_utc_ns + round((s.n_samples - 1) * ns_per_sample))
+            for s in self.stretches
+            if self.stretches[0].start_utc_ns >= FIRST_DATE_NS
+        ]
 
 
 def finite_stretches(

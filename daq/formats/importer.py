@@ -15,7 +15,7 @@ import numpy as np
 
 from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
-from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.model import Bench, Channel, Sensor, check_name
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.csv_reader import read_delimited
 from daq.formats.foreign_sensor import NS_PER_S
@@ -86,6 +86,8 @@ def import_files(
         `estimate` does not fit the sensors.
     """
     found = _by_name(_read(sources, sampling_rate))
+    for sensor in found.values():
+        sensor.check()
     if bench is not None:
         found = _ordered(found, bench)
     responses = None
@@ -174,7 +176,7 @@ def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
     if responses is not None:
         for number, name in enumerate(foreign.channels):
-            known = responses.of(foreign.name, name)
+            known = responses.of(foreign.name, name, foreign.dated_spans_ns())
             channels[number] = channels[number].model_copy(
                 update={
                     "sensitivity": known.sensitivity,
@@ -212,7 +214,7 @@ def _bench(
 ) -> Bench:
     if bench is None:
         rate = min(sensor.sampling_rate for sensor in sensors)
-        bench = Bench(name=out.stem[:64] or "import", sampling_rate=rate, sensors=sensors)
+        bench = Bench(name=_bench_name(out), sampling_rate=rate, sensors=sensors)
     changes: dict[str, object] = {"sensors": sensors}
     if estimate is not None:
         misfit = next(misfits(estimate, sensors), None)
@@ -220,6 +222,14 @@ def _bench(
             raise WrongSettingError(f"{misfit.name} {misfit.value}: {misfit.expected}")
         changes["estimate"] = estimate
     return parse(dump(bench.model_copy(update=changes)), str(out))
+
+
+def _bench_name(out: Path) -> str:
+    """Return the name of a recording as the name of its bench, or another if it cannot be one."""
+    try:
+        return check_name(out.stem)
+    except ValueError:
+        return "import"
 
 
 def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:

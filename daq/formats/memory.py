@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Channel
     from daq.formats.foreign_sensor import ForeignSensor
+    from daq.protocols.block import Event
 
 
 class BlocksInMemory:
@@ -53,6 +54,7 @@ class SensorInMemory:
     """
 
     polled = False
+    n_damaged = 0
 
     def __init__(self, foreign: ForeignSensor, channels: tuple[Channel, ...]) -> None:
         self.name = self.clock = foreign.name
@@ -90,6 +92,12 @@ class SensorInMemory:
             return self._parts[0][:0]
         return found[0] if len(found) == 1 else np.concatenate(found)
 
+    def intact_counts(
+        self, first_row: int, last_row: int
+    ) -> tuple[NDArray[Any], list[tuple[int, int]]]:
+        """Return samples as they were given: none is damaged."""
+        return self.counts(first_row, last_row), []
+
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Refuse: no sample has an instant of its own."""
         raise RecordingError(
@@ -109,6 +117,7 @@ class RecordingInMemory:
 
     closed = True
     bench = None
+    events: tuple[Event, ...] = ()
 
     def __init__(self, sensors: Sequence[SensorInMemory], name: str) -> None:
         self.sensors = tuple(sensors)

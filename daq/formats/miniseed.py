@@ -1,4 +1,4 @@
-"""miniSEED, and any other waveform format ObsPy reads.
+"""miniSEED, and other waveform formats that ObsPy reads.
 
 A sensor is ``network.station.location``, its channels are the channel codes in alphabetical order.
 Samples exist where all channels of a sensor have them; the rest is a gap.
@@ -6,8 +6,10 @@ Samples exist where all channels of a sensor have them; the rest is a gap.
 
 from __future__ import annotations
 
+import glob
 import warnings
 from functools import reduce
+from importlib.metadata import entry_points
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -22,8 +24,15 @@ if TYPE_CHECKING:
 
 _SAME_INSTANT = 0.1  # of a sample: channels of one sensor may differ by this much
 
+FORMATS = (
+    *("MSEED", "SAC", "GSE2", "GSE1", "SLIST", "TSPAIR", "SEGY", "SEG2", "WAV", "KNET"),
+    *("KINEMETRICS_EVT", "REFTEK130", "AH", "GCF"),
+)
+"""Waveform formats that are read, by ObsPy's names, in the order in which they are tried."""
+
 Interval: TypeAlias = tuple[int, int]
 Trace: TypeAlias = Any  # ObsPy has no types
+Stream: TypeAlias = Any
 
 
 def load_obspy() -> Any:  # noqa: ANN401 - ObsPy has no types
@@ -46,6 +55,25 @@ def load_obspy() -> Any:  # noqa: ANN401 - ObsPy has no types
     return obspy
 
 
+def waveform_format(path: Path) -> str:
+    """Return ObsPy's name for the format of a file.
+
+    ObsPy must not try all its formats: one of them is a pickle, which runs what it holds, and some
+    open other files that are named in the first.
+
+    Raises
+    ------
+    ImportFormatError
+        If it is none of `FORMATS`.
+    """
+    for name in FORMATS:
+        for found in entry_points(group=f"obspy.plugin.waveform.{name}", name="isFormat"):
+            if found.load()(str(path)):
+                return name
+    known = ", ".join(FORMATS)
+    raise ImportFormatError(f"unknown format; expected one of {known}, not compressed")
+
+
 def read_waveforms(paths: Sequence[Path]) -> tuple[ForeignSensor, ...]:
     """Read the sensors of miniSEED files (or of others that ObsPy knows), together.
 
@@ -62,9 +90,22 @@ def read_waveforms(paths: Sequence[Path]) -> tuple[ForeignSensor, ...]:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                stream += obspy.read(str(path))
+                stream += obspy.read(
+                    glob.escape(str(path)), format=waveform_format(path), check_compression=False
+                )
         except Exception as error:
             raise ImportFormatError(f"{path}: ObsPy cannot read it: {error}") from error
+    return sensors_of(stream, ", ".join(path.name for path in paths))
+
+
+def sensors_of(stream: Stream, source: str) -> tuple[ForeignSensor, ...]:
+    """Return the sensors of a stream, which is changed.
+
+    Raises
+    ------
+    ImportFormatError
+        As `read_waveforms`.
+    """
     stream.merge(method=-1)  # joins what continues; drops repetitions
     of_sensor: dict[str, dict[str, list[Trace]]] = {}
     for trace in stream:
@@ -74,7 +115,6 @@ def read_waveforms(paths: Sequence[Path]) -> tuple[ForeignSensor, ...]:
             if part
         )
         of_sensor.setdefault(name, {}).setdefault(trace.stats.channel, []).append(trace)
-    source = ", ".join(path.name for path in paths)
     return tuple(
         _sensor(name, dict(sorted(channels.items())), source)
         for name, channels in sorted(of_sensor.items())

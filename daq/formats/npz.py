@@ -12,6 +12,7 @@ starts at 1970-01-01T00:00:00Z. A row with NaN becomes a gap.
 
 from __future__ import annotations
 
+import math
 import zipfile
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_LARGE = 1 << 28
+_INFLATION = 100
+"""Archives larger than 256 MB that are packed more tightly than this hold no samples."""
 RESERVED = ("sampling_rate", "start_time")
 
 
@@ -38,13 +42,43 @@ def read_npz(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
         It is no such archive, or what it holds is not as described above.
     """
     try:
+        _refuse_bombs(path)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, zipfile.BadZipFile, AttributeError) as error:
+    except (ValueError, zipfile.BadZipFile, AttributeError, EOFError, MemoryError) as error:
         raise ImportFormatError(
             f"{path}: expected a NumPy archive (numpy.savez) of plain numbers; {error}"
         ) from error
     return _sensors(path, arrays, sampling_rate)
+
+
+def _refuse_bombs(path: Path) -> None:
+    """Refuse an archive that says more than it holds, before anything is allocated for it.
+
+    Raises
+    ------
+    ValueError
+        Naming the array.
+    """
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            size, packed = member.file_size, member.compress_size
+            if size > _LARGE and size > _INFLATION * packed:
+                raise ValueError(f"{member.filename}: {packed} bytes that become {size}")
+            with archive.open(member) as file:
+                if not member.filename.endswith(".npy"):
+                    continue
+                version = np.lib.format.read_magic(file)
+                read = (
+                    np.lib.format.read_array_header_1_0
+                    if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0
+                )
+                shape, _, dtype = read(file)
+                if not dtype.hasobject and math.prod(shape) * dtype.itemsize > size:
+                    raise ValueError(
+                        f"{member.filename}: an array of shape {shape} in {size} bytes"
+                    )
 
 
 def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
@@ -79,7 +113,7 @@ def _sensors(
 ) -> tuple[ForeignSensor, ...]:
     rate = float(_number(path, arrays["sampling_rate"])) if "sampling_rate" in arrays else None
     rate = rate or sampling_rate
-    if rate is None or not rate > 0:
+    if rate is None or not rate > 0 or not math.isfinite(rate):
         raise ImportFormatError(
             f"{path}: expected a positive sampling_rate in Hz in it, "
             f"found {rate}; add it, or give --sampling-rate"

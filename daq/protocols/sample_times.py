@@ -1,9 +1,11 @@
 """From the times a device writes beside its samples to sample indices, gaps and repetitions.
 
-Theory of operation ------------------- The counterpart of :mod:`daq.protocols.sample_counter` for
-devices that send a time and no counter. A time, in sample periods since the first, less the index
-it should belong to is the *offset* of the two: constant but for the slow drift of a clock, which is
-followed, and for how finely times are written. A time
+Theory of operation
+-------------------
+The counterpart of :mod:`daq.protocols.sample_counter` for devices that send a time and no counter.
+A time, in sample periods since the first, less the index it should belong to is the *offset* of the
+two: constant but for the slow drift of a clock, which is followed, and for how finely times are
+written. A time
 
 - that is half a period or more past where the next sample should be says that samples are missing:
   as many as fit. Where times are written to half a period or finer their number is exact. Where

@@ -3,7 +3,8 @@
 Theory of operation
 -------------------
 The recorder listens on an ephemeral port of the local host, and writes port and a random token into
-the attributes of the file: whoever can read the recording can stop it. A request is one line,
+the attributes of the file: whoever can read the recording can stop it, which is its owner alone
+unless its permissions are changed. A request is one line,
 ``token command text``. The answer is one line of JSON, with the key ``"error"`` if the recorder
 refuses.
 """
@@ -14,6 +15,7 @@ import asyncio
 import contextlib
 import hmac
 import json
+import re
 import secrets
 import socket
 from enum import StrEnum
@@ -27,6 +29,11 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
 HOST = "127.0.0.1"
+MAX_CONNECTIONS = 16
+"""Connections at a time; further ones are closed at once."""
+_TOKEN_BYTES = 16
+_TOKEN = re.compile(rf"[0-9a-f]{{{2 * _TOKEN_BYTES}}}")
+_MAX_PORT = 65535
 _MAX_LINE = 4096
 _IDLE_TIMEOUT = 10.0
 _FINAL_REPLY_TIMEOUT = 1.0
@@ -66,12 +73,15 @@ async def serve(
     (port, token)
         For the file's attributes.
     """
-    token = secrets.token_hex(16)
+    token = secrets.token_hex(_TOKEN_BYTES)
     conversations: set[asyncio.Task[None]] = set()
     silent: set[asyncio.Task[None]] = set()  # those that have sent nothing yet
 
     async def converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
+        if len(conversations) >= MAX_CONNECTIONS:
+            writer.transport.abort()
+            return
         if task is not None:
             conversations.add(task)
             silent.add(task)
@@ -145,6 +155,10 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     """
     control = recording if isinstance(recording, tuple) else _control_of(Path(recording))
     port, token = control
+    if not (0 < port <= _MAX_PORT and _TOKEN.fullmatch(token)):  # from a file of somebody else
+        raise NotConnectedError(
+            f"port {port}: the control address is not one of a recorder; nothing was sent to it"
+        )
     line = f"{token} {command} {' '.join(text.split())}"
     try:
         with socket.create_connection((HOST, port), timeout=_IDLE_TIMEOUT) as connection:

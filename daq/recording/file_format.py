@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 FORMAT = "huddle-recording"
 FORMAT_VERSION = 1
+LIBVER = ("v110", "v110")
+"""HDF5 file format of recordings."""
 
 NO_COUNTER = -1
 """``device_counter`` of a block without one."""

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench, Channel
-    from daq.protocols.block import HostTime
+    from daq.protocols.block import Event, HostTime
 
 
 class ReadableBlocks(Protocol):
@@ -64,6 +64,15 @@ class ReadableSensor(Protocol):
     def counts(self, first_row: int = 0, last_row: int | None = None) -> NDArray[Any]:
         """Return raw counts, shape (last_row - first_row, n_channels)."""
 
+    def intact_counts(
+        self, first_row: int, last_row: int
+    ) -> tuple[NDArray[Any], list[tuple[int, int]]]:
+        """Return raw counts, and which rows (first, last + 1) of them are damaged and zero."""
+
+    @property
+    def n_damaged(self) -> int:
+        """Number of damaged blocks that have been read."""
+
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Return the host monotonic time of each sample of a polled sensor, in ns."""
 
@@ -94,6 +103,10 @@ class ReadableRecording(Protocol):
     @property
     def sensors(self) -> tuple[ReadableSensor, ...]:
         """In the order of the bench."""
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What happened while recording."""
 
     def refresh(self) -> bool:
         """Read what has been committed since the last call; return whether there was anything."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,10 +13,11 @@ from daq.protocols.block import BlockFlag
 from daq.recording.sensor_state import STATE_AFTER, SensorState
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from daq.protocols.block import Event
-    from daq.recording.reader import Recording, SensorRecord
+    from daq.recording.reader import Recording
+    from daq.recording.sensor_record import SensorRecord
 
 SILENT_AFTER = 3.0
 """Seconds without samples after which a sensor is silent, while other sensors continue."""
@@ -71,7 +73,7 @@ class RecordingStatus:
     Attributes
     ----------
     elapsed : float
-        Seconds from its start to the latest block or event.
+        Seconds from its start to the latest block or event; to now where no sensor sends.
     started_utc_ns : int
     closed : bool
     sensors : tuple of SensorStatus
@@ -95,10 +97,13 @@ class RecordingMonitor:
     Parameters
     ----------
     recording : Recording
+    now : callable
+        Seconds of a clock that never goes back.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    def __init__(self, recording: Recording, *, now: Callable[[], float] = time.monotonic) -> None:
+        self._recording, self._now = recording, now
+        self._latest_ns, self._since = -1, now()
         self._blocks = {sensor.name: _BlockSummary(sensor) for sensor in recording.sensors}
         self._events: tuple[Event, ...] = ()
         self._latest: dict[str, tuple[Event, SensorState]] = {}
@@ -116,19 +121,35 @@ class RecordingMonitor:
             *(blocks.last_ns for blocks in self._blocks.values()),
             *(event.received.monotonic_ns for event in self._events[-1:]),
         )
-        elapsed = (latest_ns - start_ns) * _NS
+        sensors = tuple(
+            self._sensor(record, self._blocks[record.name], latest_ns)
+            for record in recording.sensors
+        )
+        gone_on = self._gone_on(latest_ns, sensors)
+        elapsed = (latest_ns - start_ns) * _NS + gone_on
         duration = None if recording.closed else recording.duration
         return RecordingStatus(
             elapsed=elapsed,
             started_utc_ns=recording.created_at.utc_ns,
             closed=recording.closed,
-            sensors=tuple(
-                self._sensor(record, self._blocks[record.name], latest_ns)
-                for record in recording.sensors
-            ),
+            sensors=tuple(replace(s, overdue_for=s.overdue_for + gone_on) for s in sensors)
+            if gone_on
+            else sensors,
             events=self._events,
             ends_in=None if duration is None else max(0.0, duration - elapsed),
         )
+
+    def _gone_on(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:
+        """Return seconds since the latest block or event where no sensor sends any more.
+
+        Otherwise time is that of the blocks, whatever the speed of the clock that stamps them.
+        """
+        if latest_ns != self._latest_ns:
+            self._latest_ns, self._since = latest_ns, self._now()
+        if self._recording.closed or not all(sensor.state.is_overdue for sensor in sensors):
+            return 0.0
+        bench = self._recording.bench
+        return (self._now() - self._since) * (1.0 if bench is None else bench.speed)
 
     def status_with_stuck_channels(self) -> RecordingStatus:
         """Return the current status; read the latest samples to find channels that are stuck."""

@@ -9,9 +9,9 @@ original, so that there is always one intact file under the name.
 from __future__ import annotations
 
 import contextlib
-import os
+import io
 import shutil
-import zlib
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,10 +23,13 @@ from daq.errors import RecordingError
 from daq.host_clock import SystemClock
 from daq.protocols.block import EventKind
 from daq.recording import file_format
-from daq.recording.locking import is_being_written
-from daq.recording.reader import Recording, SensorRecord
-from daq.recording.superblock import Superblock
-from daq.recording.writer import LIBVER, sync_directory
+from daq.recording.description import result_crc32, write_checksums
+from daq.recording.file_format import LIBVER
+from daq.recording.reader import Recording
+from daq.recording.storage.journal import JournalContents, journal_path, read_journal, rebuild
+from daq.recording.storage.locking import is_being_written
+from daq.recording.storage.names import create_private, sync_directory, sync_file
+from daq.recording.storage.superblock import Superblock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -34,8 +37,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.protocols.block import HostTime
+    from daq.recording.sensor_record import SensorRecord
 
-_ROWS_PER_READ = 1 << 18
+_ROWS_PER_READ = 1 << 17
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +74,12 @@ class Verification:
     being_written: bool
     sensors: tuple[SensorVerification, ...]
     n_events: int
+    damaged_tables: tuple[str, ...] = ()
 
     @property
     def intact(self) -> bool:
-        """Whether all committed blocks have their checksums."""
-        return not any(sensor.bad_blocks for sensor in self.sensors)
+        """Whether all committed blocks, gaps and events have their checksums."""
+        return not self.damaged_tables and not any(s.bad_blocks for s in self.sensors)
 
 
 def verify(path: str | Path) -> Verification:
@@ -87,39 +92,97 @@ def verify(path: str | Path) -> Verification:
     """
     path = Path(path)
     being_written = is_being_written(path) if path.is_file() else False
-    with Recording.open(path, isolated=True) as recording:
+    with Recording.open(path) as recording:
         sensors = tuple(_verify_sensor(sensor) for sensor in recording.sensors)
-        return Verification(path, recording.closed, being_written, sensors, len(recording.events))
+        return Verification(
+            path,
+            recording.closed,
+            being_written,
+            sensors,
+            len(recording.events),
+            recording.damaged_tables,
+        )
 
 
 def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
-    """Close a recording that a killed recorder left open; uncommitted rows are removed.
+    """Close a recording that a killed recorder, or a power cut, left open.
 
-    A closed recording is not changed.
+    It is built again from its journal, where there is one, with everything that was acknowledged.
+    Uncommitted rows are removed. A closed recording is not changed.
 
     Raises
     ------
     NotARecordingError
-        If the file is no recording.
+        If the file is no recording, or damaged and without a journal.
     RecordingError
         If a recorder is writing the file, or the copy cannot be written.
     """
     path = Path(path)
-    report = verify(path)
-    if report.closed:
-        return report
-    if report.being_written:
+    if path.is_file() and is_being_written(path):
         raise RecordingError(
             f"{path}: another program is writing it or has it open; stop that program first"
         )
+    journal = _own_journal(path)
+    if journal is None:
+        report = verify(path)
+        if not _is_left_open(path, report):
+            _remove_useless_journal(path)
+            return report
+    elif (whole := _whole(path, journal)) is not None:
+        journal_path(path).unlink()
+        return whole
     now = SystemClock().now() if now is None else now
-    with _replaced(path) as copy:
-        with copy.open("r+b") as raw:
-            raw.write(Superblock.of(path).cleared())
+    with _replaced(path, copied=journal is None) as copy:
+        if journal is None:
+            with copy.open("r+b") as raw:
+                raw.write(Superblock.of(path).cleared())
+        else:
+            rebuild(path, journal, copy)
+            report = verify(copy)
         with h5py.File(copy, "r+", libver=LIBVER) as file:
-            _cut_to_committed(file, report)
-            _add_last_events(file, report, now)
+            if not report.closed:
+                _cut_to_committed(file, report)
+                _add_last_events(file, report, now)
+            write_checksums(file)
+    if journal is not None:
+        journal_path(path).unlink(missing_ok=True)
+    _remove_useless_journal(path)
     return verify(path)
+
+
+def _is_left_open(path: Path, report: Verification | Recording) -> bool:
+    """Return whether a file was not closed, or not to the end."""
+    return not report.closed or Superblock.of(path).is_open
+
+
+def _remove_useless_journal(path: Path) -> None:
+    """Remove a journal that a power cut struck before anything was acknowledged."""
+    if read_journal(path) is None:
+        journal_path(path).unlink(missing_ok=True)
+
+
+def _own_journal(path: Path) -> JournalContents | None:
+    """Return the journal of a recording; None if there is none, or that of another recording."""
+    contents = read_journal(path)
+    if contents is None or not path.is_file():
+        return None
+    with h5py.File(io.BytesIO(contents.created), "r") as created:
+        run_id: str = created.attrs["run_id"]
+    with path.open("rb") as file:  # however damaged it is: its attributes were written once
+        return contents if run_id.encode() in file.read(len(contents.created)) else None
+
+
+def _whole(path: Path, journal: JournalContents) -> Verification | None:
+    """Return the report on a closed file that has all of its journal; None on any other."""
+    try:
+        report = verify(path)
+        is_whole = report.intact and not _is_left_open(path, report)
+    except RecordingError:
+        return None
+    if journal.counts is None:
+        return None
+    counts = [[s.n_samples, s.n_blocks, s.n_gaps] for s in report.sensors]
+    return report if is_whole and counts == journal.counts[:-1].tolist() else None
 
 
 def write_results(
@@ -143,9 +206,11 @@ def write_results(
         If a recorder is writing the file, or it cannot be written.
     """
     path = Path(path)
-    with Recording.open(path, isolated=True) as recording:
-        closed = recording.closed
-    if not closed:
+    left_open = journal_path(path).exists()
+    if not left_open:
+        with Recording.open(path) as recording:
+            left_open = _is_left_open(path, recording)
+    if left_open:
         repair(path)
     with _replaced(path) as copy, h5py.File(copy, "r+", libver=LIBVER) as file:
         if "results" in file:
@@ -155,31 +220,22 @@ def write_results(
             for name, values in arrays.items():
                 group.create_dataset(name, data=values)
             group.attrs.update(attributes)
+            stored = {name: group[name][...] for name in group}
+            group.attrs["crc32"] = result_crc32(stored, dict(group.attrs))
 
 
 def _verify_sensor(sensor: SensorRecord) -> SensorVerification:
-    blocks = sensor.blocks
-    bad = [number for number, row in enumerate(blocks) if not _is_intact(sensor, row)]
+    for first in range(0, sensor.n_samples, _ROWS_PER_READ):
+        sensor.intact_counts(first, min(first + _ROWS_PER_READ, sensor.n_samples))
+    first_rows = sensor.blocks["first_row"]
     return SensorVerification(
         name=sensor.name,
         n_samples=sensor.n_samples,
-        n_blocks=len(blocks),
+        n_blocks=len(first_rows),
         n_gaps=len(sensor.gaps),
-        bad_blocks=tuple(bad),
+        bad_blocks=tuple(np.flatnonzero(np.isin(first_rows, sensor.damaged_rows)).tolist()),
         n_uncommitted=sensor.n_written - sensor.n_samples,
     )
-
-
-def _is_intact(sensor: SensorRecord, row: NDArray[np.void]) -> bool:
-    crc32 = 0
-    first, end = int(row["first_row"]), int(row["first_row"] + row["n_samples"])
-    try:
-        for start in range(first, end, _ROWS_PER_READ):
-            counts = sensor.counts(start, min(start + _ROWS_PER_READ, end))
-            crc32 = zlib.crc32(np.ascontiguousarray(counts).data, crc32)
-    except (RecordingError, IndexError):
-        return False
-    return bool(file_format.block_crc32(row, crc32) == row["crc32"])
 
 
 def _cut_to_committed(file: h5py.File, report: Verification) -> None:
@@ -217,14 +273,16 @@ def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> No
 
 
 @contextlib.contextmanager
-def _replaced(path: Path) -> Iterator[Path]:
-    """Yield a copy to be changed; it replaces the original if no error occurs."""
-    copy = path.with_name(f".{path.name}.copy")
+def _replaced(path: Path, *, copied: bool = True) -> Iterator[Path]:
+    """Yield a copy to be changed, or an empty file; it replaces the original if no error occurs."""
+    copy = path.with_name(f".{path.name}.{uuid.uuid4().hex}.copy")
     try:
-        shutil.copyfile(path, copy)
+        create_private(copy)
+        if copied:
+            shutil.copyfile(path, copy)
         yield copy
-        with copy.open("r+b") as written:  # Windows syncs only what may be written
-            os.fsync(written)
+        shutil.copymode(path, copy)
+        sync_file(copy)
         copy.replace(path)
         sync_directory(path.parent)
     except RecordingError:

@@ -2,16 +2,20 @@
 
 Theory of operation
 -------------------
-All groups, datasets and attributes are made under a temporary name. Then the file is switched to
-SWMR (single writer, multiple readers) and renamed, so that an incomplete recording never has the
-final name. From then on rows are only appended. Samples are written in whole compressed chunks:
-partial chunks would be rewritten elsewhere and inflate the file. So a sample is buffered for up to
-the length of one chunk.
+All groups, datasets and attributes are made under a temporary name of its own. Then the file is
+switched to SWMR (single writer, multiple readers) and gets its name, which must be free: an
+incomplete recording never has the final name, and of two recorders with the same name one fails.
+From then on rows are only appended. Samples are written in whole compressed chunks: partial chunks
+would be rewritten elsewhere and inflate the file. So a sample is buffered for up to the length of
+one chunk.
 
-``commit`` flushes and fsyncs the appended rows, then writes their numbers to ``/committed``, fsyncs
-again, and only then acknowledges. ``/committed`` has a fixed size and place. If a crash interrupts
-its writing, some numbers are old and some new; each counts rows that are safe. Readers cut all
-datasets of a sensor to the shortest.
+``commit`` flushes and fsyncs the appended rows; appends what they are to the journal
+(:mod:`daq.recording.storage.journal`) and fsyncs that; writes their numbers to ``/committed``, for
+readers; and only then acknowledges. ``/committed`` has a fixed size and place. If a crash
+interrupts its writing, some numbers are old and some new; each counts rows that are safe. Readers
+cut all datasets of a sensor to the shortest.
+
+``close`` closes the file, fsyncs it, and then removes the journal.
 """
 
 from __future__ import annotations
@@ -22,18 +26,29 @@ import re
 import sys
 import uuid
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
 from daq.errors import RecordingError
 from daq.recording import file_format
-from daq.recording.chunk_writer import SensorRows, TableBuffer
-from daq.recording.locking import WriterLock, is_being_written
+from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
+from daq.recording.creation import make_datasets, write_attributes
+from daq.recording.description import write_checksums
+from daq.recording.storage.journal import Journal
+from daq.recording.storage.locking import WriterLock
+from daq.recording.storage.names import (
+    PRIVATE,
+    create_private,
+    publish,
+    remove_leftovers,
+    sync_directory,
+    sync_file,
+    taken,
+)
+from daq.recording.storage.retries import repeated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -42,8 +57,9 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime
     from daq.recording.file_format import SensorLayout
 
-LIBVER = ("v110", "v110")
-_MIN_CHUNK_ROWS = 64
+_BROKEN: list[RecordingWriter] = []
+"""Writers whose file HDF5 could not close. Their objects must not be freed: that fails, too, prints
+tracebacks, and may crash. The recorder ends without freeing anything."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +88,7 @@ class RecordingWriter:
     ) -> None:
         self.path = path
         self._hidden: Path | None = None
+        self._journal: Journal | None = None
         self._file = file
         self._lock = lock
         self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
@@ -121,29 +138,40 @@ class RecordingWriter:
         """
         path = Path(path)
         if path.exists():
-            raise RecordingError(f"{path}: exists already; expected a new file")
+            raise taken(path)
         renames = hidden or os.name != "nt"  # Windows renames no file that is open
-        temporary = path.with_name(f".{path.name}.new") if renames else path
-        if hidden and temporary.exists() and is_being_written(temporary):
-            raise RecordingError(f"{path}: another process is writing it; expected a new file")
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            # A small cache: chunks are written whole and not read again.
-            file = h5py.File(temporary, "w", libver=LIBVER, rdcc_nbytes=64 * 1024, locking=False)
+            remove_leftovers(path)
+            temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.new") if renames else path
+            create_private(temporary)
+            lock, file, writer = WriterLock(temporary), None, None
             try:
-                _write_attributes(file, bench, created, control, attributes or {})
-                _make_datasets(file, sensors, chunk_seconds)
+                # A small cache: chunks are written whole and not read again.
+                file = h5py.File(
+                    temporary,
+                    "w",
+                    libver=file_format.LIBVER,
+                    rdcc_nbytes=64 * 1024,
+                    locking=False,
+                )
+                write_attributes(file, bench, created, control, attributes or {})
+                make_datasets(file, sensors, chunk_seconds)
                 file.swmr_mode = True
-                writer = cls(path, file, sensors, WriterLock(temporary))
+                writer = cls(path, file, sensors, lock)
                 writer._sync()
                 if hidden:
                     writer._hidden = temporary
-                elif renames:
-                    temporary.rename(path)
+                else:
+                    if renames:
+                        publish(temporary, path)
+                    writer._journal = Journal(path, file, PRIVATE)
                 sync_directory(path.parent)
             except BaseException:
                 with contextlib.suppress(OSError, RuntimeError):
-                    file.close()
+                    if file is not None:
+                        file.close()
+                lock.release()
                 temporary.unlink(missing_ok=True)
                 raise
         return writer
@@ -200,11 +228,15 @@ class RecordingWriter:
                 for sensor in self._sensors.values():
                     sensor.finish()
             done = self._commit(closed=True)
-            if self._hidden is not None:
-                with _as_recording_error(self.path):
-                    self._file.close()
-                    _publish(self._hidden, self.path)
+            with self._guarded():
+                self._close_hdf5()
+                sync_file(self._hidden or self.path)
+                if self._hidden is not None:
+                    publish(self._hidden, self.path)
                 self._hidden = None
+                if self._journal is not None:
+                    self._journal.remove()
+                sync_directory(self.path.parent)
             return done
         finally:
             self.abandon()
@@ -217,10 +249,19 @@ class RecordingWriter:
             if self._hidden is not None:
                 self._hidden.unlink(missing_ok=True)
 
+    def _close_hdf5(self) -> None:
+        """Close the file; what HDF5 cannot free then is no matter for standard error."""
+        before = sys.unraisablehook
+        sys.unraisablehook = lambda _: None
+        self._file.close()
+        sys.unraisablehook = before  # not after an error: its objects are freed later
+
     def _close_file(self) -> None:
         try:
             with contextlib.suppress(OSError, RuntimeError):
-                self._file.close()
+                self._close_hdf5()
+            if self._journal is not None:
+                self._journal.close()
         finally:
             self._lock.release()
 
@@ -235,8 +276,15 @@ class RecordingWriter:
             self._events.write()
             counts[-1, : file_format.CLOSED + 1] = self._events.n_rows, closed
             self._sync()
+            self._check_place()
+            for sensor in self._sensors.values():
+                sensor.are_safe()
+            if self._journal is not None:
+                self._journal.commit(self._chunked(), self._new_rows(), counts)
             self._committed[...] = counts
-            self._sync()
+            if closed:
+                write_checksums(self._file)
+            repeated(self._file.flush)
         return Committed(
             {
                 name: SensorCounts(*map(int, row))
@@ -246,8 +294,37 @@ class RecordingWriter:
             closed,
         )
 
+    def _chunked(self) -> dict[str, tuple[h5py.Dataset, ...]]:
+        return {
+            name: (sensor.samples.dataset, sensor.instants.dataset)
+            for name, sensor in self._sensors.items()
+        }
+
+    def _new_rows(self) -> dict[str, tuple[bytes, ...]]:
+        rows = {
+            name: (sensor.blocks.written, sensor.gaps.written)
+            for name, sensor in self._sensors.items()
+        }
+        return {**rows, "": (self._events.written,)}
+
+    def _check_place(self) -> None:
+        """Check that the file still has its name: nobody would find what is written to it."""
+        place = self._hidden or self.path
+        written = os.fstat(self._file.id.get_vfd_handle())
+        try:
+            found = place.stat()
+        except FileNotFoundError:
+            found = None
+        if found is None or not os.path.samestat(found, written):
+            what = "removed or renamed" if found is None else "replaced by another file"
+            raise RecordingError(f"{place}: {what} while it was recorded; the recording ends here")
+
+    def _write_again(self) -> None:
+        for sensor in self._sensors.values():
+            sensor.write_again()
+
     def _sync(self) -> None:
-        self._file.flush()
+        repeated(self._file.flush, before=self._write_again)
         os.fsync(self._file.id.get_vfd_handle())
 
     @contextlib.contextmanager
@@ -260,6 +337,7 @@ class RecordingWriter:
                 yield
         except RecordingError:
             self._failed = True
+            _BROKEN.append(self)
             raise
 
 
@@ -276,108 +354,6 @@ def _as_recording_error(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: cannot be written: {reason}") from error
 
 
-def _publish(temporary: Path, path: Path) -> None:
-    """Give a closed file its name, which nobody must have taken."""
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise RecordingError(f"{path}: exists already; expected a new file") from None
-    except OSError:  # a file system without hard links
-        if path.exists():
-            raise RecordingError(f"{path}: exists already; expected a new file") from None
-        temporary.rename(path)
-    else:
-        temporary.unlink()
-    sync_directory(path.parent)
-
-
 def _field(text: str, n_bytes: int) -> bytes:
     """Return text as UTF-8 of at most ``n_bytes``, not cut within a character."""
     return text.encode()[:n_bytes].decode(errors="ignore").encode()
-
-
-def _write_attributes(
-    file: h5py.File,
-    bench: Bench | None,
-    created: HostTime,
-    control: tuple[int, str] | None,
-    attributes: dict[str, str | float],
-) -> None:
-    utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
-    try:
-        software = f"huddle {version('huddle-bench')}"
-    except PackageNotFoundError:
-        software = "huddle"
-    file.attrs.update(
-        {
-            "format": file_format.FORMAT,
-            "format_version": file_format.FORMAT_VERSION,
-            "run_id": uuid.uuid4().hex,
-            "created": utc.isoformat(timespec="microseconds"),
-            "created_utc_ns": created.utc_ns,
-            "created_monotonic_ns": created.monotonic_ns,
-            "software": software,
-            "bench": "" if bench is None else bench.text,
-            "operator": "" if bench is None else bench.operator,
-            "location": "" if bench is None else bench.location,
-        }
-        | attributes
-    )
-    if control is not None:
-        file.attrs["control_port"], file.attrs["control_token"] = control
-
-
-def _make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
-    groups = file.create_group("sensors")
-    for sensor in sensors:
-        group = groups.create_group(sensor.name)
-        for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
-            group.attrs[key] = getattr(sensor, key)
-        n_channels = len(sensor.channels)
-        # Reading a chunk takes at least 10 µs, so at low rates a chunk has two seconds.
-        min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))
-        n_rows = max(4, min_rows, round(sensor.sampling_rate * chunk_seconds))
-        filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
-        samples = group.create_dataset(
-            "samples",
-            shape=(0, n_channels),
-            maxshape=(None, n_channels),
-            chunks=(n_rows, n_channels),
-            dtype=sensor.dtype.newbyteorder("<"),
-            fletcher32=True,
-            **filters,
-        )
-        samples.attrs.update(file_format.channel_attributes(sensor.channels))
-        # Remains empty unless the sensor is polled.
-        instants = group.create_dataset(
-            "instants",
-            shape=(0,),
-            maxshape=(None,),
-            chunks=(n_rows,),
-            dtype="<i8",
-            fletcher32=True,
-            **filters,
-        )
-        instants.attrs["unit"] = "ns"
-        _make_table(group, "blocks", file_format.BLOCK_DTYPE, file_format.BLOCKS_PER_CHUNK)
-        _make_table(group, "gaps", file_format.GAP_DTYPE, file_format.GAPS_PER_CHUNK)
-    _make_table(file, "events", file_format.EVENT_DTYPE, file_format.EVENTS_PER_CHUNK)
-    committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
-    committed.attrs["sensors"] = [sensor.name for sensor in sensors]
-    committed.attrs["columns"] = ["rows", "blocks", "gaps"]
-    committed.attrs["last_row"] = ["events", "closed", "unused"]
-
-
-def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int) -> None:
-    group.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(n_rows,), dtype=dtype)
-
-
-def sync_directory(path: Path) -> None:
-    """Make the names in a directory survive a power loss (not possible on Windows)."""
-    if sys.platform == "win32":
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

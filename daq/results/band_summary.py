@@ -7,16 +7,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.self_noise.band_means import band_edges, band_means, bin_correlation
+from daq.estimation.noise_estimates import ALL_METHODS
+from estimator.self_noise.band_means import (
+    NORMAL_95,
+    BandMeans,
+    band_edges,
+    band_means,
+    bin_correlation,
+)
+from estimator.self_noise.quiet_sensor import quiet_sensor_noise
+from estimator.self_noise.result import Flag
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import BandMeans
     from estimator.self_noise.result import SelfNoise
     from estimator.types import FloatArray
 
+AT_BOUND = 0.05
+"""Share of frequencies at the bound of zero from which on their mean is not that of the noise."""
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
@@ -37,29 +47,97 @@ def band_of(settings: Settings, snapshot: Snapshot) -> tuple[float, float]:
 
 
 def channel_means(
-    noise: SelfNoise, frequency: FloatArray, settings: Settings, band: tuple[float, float]
+    noise: SelfNoise,
+    snapshot: Snapshot,
+    settings: Settings,
+    band: tuple[float, float],
+    *,
+    quantile: float = NORMAL_95,
 ) -> tuple[BandMeans, ...]:
-    """Return the mean noise of every channel in a band, each with its 95 % interval."""
+    """Return the mean noise of every channel in a band, each with its interval.
+
+    It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
+    given, its lower end lowered by what the clocks may have added. Where maximum likelihood stands
+    at its bound of zero at many frequencies, the mean is that of a noise constant over the band
+    (`estimator.self_noise.quiet_sensor`).
+    """
+    frequency = snapshot.frequency
     edges = band_edges(frequency, band)
     correlation, width = correlation_of(settings), np.gradient(frequency)
-    return tuple(
+    at_bound = (noise.flags & Flag.BOUNDARY) != 0
+    added = snapshot.added_by_clocks
+    means = [
         band_means(
-            noise.noise_psd[:, column], noise.cov[:, column], edges, correlation, weights=width
+            noise.noise_psd[:, column],
+            noise.cov[:, column],
+            edges,
+            correlation,
+            weights=width,
+            quantile=quantile,
+            deviation=deviation_at_bound(noise, column),
+            added=None if added is None else added[:, column],
         )
         for column in range(noise.noise_psd.shape[1])
-    )
+    ]
+    inside = slice(int(edges[0]), int(edges[1]))
+    often = at_bound[inside].mean(axis=0) > AT_BOUND
+    first = np.cumsum([0, *snapshot.dims])
+    for sensor, d in enumerate(snapshot.dims):
+        own = range(int(first[sensor]), int(first[sensor + 1]))
+        if d < max(snapshot.dims) or not any(often[column] for column in own):
+            continue
+        found = quiet_sensor_noise(
+            snapshot.csm[inside],
+            dims=snapshot.dims,
+            sensor=sensor,
+            n_effective=averages_at(snapshot, frequency[inside]),
+            correlation=correlation,
+            quantile=quantile,
+        )
+        for column, (mean, low, high) in zip(own, zip(*found, strict=True), strict=True):
+            if often[column] and np.isfinite((mean, low, high)).all():
+                extra = (
+                    0.0
+                    if added is None
+                    else float(np.average(added[inside, column], weights=width[inside]))
+                )
+                parts = (mean, (high - low) / (2 * quantile), low - extra, high)
+                means[column] = BandMeans(*(np.array([float(part)]) for part in parts))
+    return tuple(means)
 
 
-def reached_cov(snapshot: Snapshot, settings: Settings, method: str | None = None) -> float:
-    """Return the c.o.v. per frequency, median in the band, of the channel that is worst."""
-    noise = snapshot.results.get(method or next(iter(snapshot.results), ""))
-    if noise is None:
-        return math.nan
-    low, high = band_of(settings, snapshot)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    cov = noise.cov[inside]
-    usable = cov[:, np.isfinite(cov).any(axis=0)]
-    return float(np.nanmax(np.nanmedian(usable, axis=0))) if usable.size else math.nan
+def deviation_at_bound(noise: SelfNoise, column: int) -> FloatArray:
+    """Return the standard deviation of estimates that stand at zero; NaN for all others.
+
+    Their upper end is a factor above it: `estimator.likelihood.fisher.interval`.
+    """
+    at_bound = (noise.flags[:, column] & Flag.BOUNDARY) != 0
+    return np.where(at_bound, noise.high[:, column] / math.exp(NORMAL_95), np.nan)
+
+
+def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:
+    """Return the mean PSD of what each channel recorded in a band, shape (n_channels,)."""
+    inside = slice(*band_edges(snapshot.frequency, band))
+    width = np.gradient(snapshot.frequency)[inside]
+    return np.asarray(np.average(snapshot.data_psd[inside], axis=0, weights=width))
+
+
+def judged_method(snapshot: Snapshot, settings: Settings) -> str:
+    """Return the method by which limits, c.o.v. and clocks are judged.
+
+    It is the first of the settings, also where it gives no result: never one that is only shown.
+    """
+    wanted = next(iter(settings.methods), "all")
+    return wanted if wanted != "all" else next(iter(snapshot.results), ALL_METHODS[0])
+
+
+def averages_at(snapshot: Snapshot, frequency: FloatArray) -> FloatArray:
+    """Return the independent averages behind each frequency (Hz)."""
+    if not snapshot.octaves:
+        return np.full(frequency.shape, snapshot.n_effective)
+    edges = np.array([octave.low for octave in snapshot.octaves[1:]])
+    averages = np.array([octave.n_effective for octave in snapshot.octaves])
+    return np.asarray(averages[np.searchsorted(edges, frequency, side="right")])
 
 
 def highest_known(snapshot: Snapshot) -> float:

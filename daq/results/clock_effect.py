@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from daq.results.band_summary import band_of
+from daq.results.band_summary import band_of, judged_method
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from estimator.self_noise.band_means import FloatArray
@@ -24,16 +26,40 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
     Shape (n_channels,); NaN where it is not known (yet).
     """
     share = snapshot.diagnostics.synchronisation.noise_bias
-    if share is None or not snapshot.results:
+    found = snapshot.results.get(judged_method(snapshot, settings))
+    if share is None or found is None:
         return np.full(len(snapshot.channels), np.nan)
     low, high = band_of(settings, snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    noise = next(iter(snapshot.results.values())).noise_psd[inside]
+    noise = found.noise_psd[inside]
     known = np.isfinite(share[inside] * noise)
     added = np.where(known, share[inside] * np.abs(noise), 0.0)
     total = np.where(known, noise, 0.0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
+
+
+def added_in_bands(
+    snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64], column: int
+) -> FloatArray:
+    """Return what the clocks may have added to a channel's mean noise at most.
+
+    Shape (n_bands,), in unit²/Hz: no more than the noise itself, and 0 where it is not known.
+    """
+    found = snapshot.added_by_clocks
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if found is None or noise is None:
+        return np.zeros(len(edges) - 1)
+    share = snapshot.diagnostics.synchronisation.noise_bias
+    known = np.isfinite(noise.noise_psd[:, column])
+    if share is not None:
+        known &= np.isfinite(share[:, column])
+    width = np.where(known, np.gradient(snapshot.frequency), 0.0)
+    added = found[:, column] * width
+    first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
+    whole = np.add.reduceat(width[first:last], starts)
+    total = np.add.reduceat(added[first:last], starts)
+    return np.asarray(total / np.where(whole > 0, whole, 1.0))
 
 
 def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]:

@@ -1,9 +1,13 @@
-"""Noise masks of the bench file, and which channels do not stay below them.
+"""Noise masks of the bench file, and which channels are below them for certain.
 
-A mask is judged in bands a third of an octave wide, where single frequencies scatter less: a
-channel fails where even the lower end of the band mean's 95 % interval is above the mask. It meets
-the mask for certain where the upper end is below it everywhere. The intervals hold for all bands of
-a mask at once (Bonferroni): of channels that are just at it, one in forty fails by chance.
+A mask is judged in bands a third of an octave wide, where single frequencies scatter less. A
+channel passes where the whole interval of its band means is below the mask in every band, and fails
+where the whole interval of one band is above it. The intervals hold for all channels, masks and
+bands together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
+
+What the clocks may have added to the noise, and what the estimate may be off by where one common
+motion does not explain the averages, widens the interval. Of a channel that is clipped, or was dead
+for a while, the estimate is an upper bound.
 """
 
 from __future__ import annotations
@@ -16,73 +20,72 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import canonical, conversion
-from daq.results.band_summary import correlation_of, decibels
-from estimator.self_noise.band_means import band_means
+from daq.results.band_summary import (
+    averages_at,
+    correlation_of,
+    deviation_at_bound,
+    highest_known,
+    judged_method,
+)
+from daq.results.clock_effect import added_in_bands
+from daq.results.decision_time import Margins, predict
+from daq.results.partners import without_partners
+from daq.results.verdict import SHRINKS, LimitResult, Obstacle, TestVerdict, Verdict
+from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
+from estimator.diagnostics.kinds import Level
+from estimator.self_noise.band_means import band_means, decision_interval
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench, Limit
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from estimator.self_noise.band_means import BandMeans, FloatArray
+    from daq.results.verdict import Prediction
+    from estimator.self_noise.band_means import FloatArray
 
 BANDS_PER_OCTAVE = 3
+FEWEST_AVERAGES = 20.0
+"""Averages below which the far tails of the interval have not been verified by simulation."""
 
 
-@dataclass(frozen=True, slots=True)
-class LimitResult:
-    """One channel beside one mask, in the band where it does worst; PSD in unit²/Hz.
-
-    NaN throughout where the estimate says nothing at any frequency of the mask.
-    """
-
-    limit: str
-    sensor: str
-    channel: str
-    method: str
-    frequency: float
-    noise_psd: float
-    low: float
-    high: float
-    limit_psd: float
-
-    @property
-    def known(self) -> bool:
-        """Whether the estimate says anything at the frequencies of the mask."""
-        return math.isfinite(self.limit_psd)
-
-    @property
-    def met(self) -> bool:
-        """Whether the noise is not above the mask for certain."""
-        return not self.low > self.limit_psd
-
-    @property
-    def certain(self) -> bool:
-        """Whether the whole interval is on one side of the mask."""
-        return self.low > self.limit_psd or self.high <= self.limit_psd
-
-    @property
-    def margin_db(self) -> float:
-        """How far the noise is below the mask, in dB; NaN where it came out below zero."""
-        return decibels(self.limit_psd) - decibels(self.noise_psd)
-
-
-def exceeded(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[LimitResult]:
-    """Return every channel that does not meet a mask, judged by the first method that was asked."""
-    return [each for each in judged(bench, snapshot, settings) if not each.met]
-
-
-def judged(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[LimitResult]:
-    """Return every channel beside every mask that is for it, by the first method that was asked."""
-    if bench is None or not snapshot.results:
-        return []
-    return [
-        _judge(bench, limit, column, snapshot, settings)
+def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
+    """Return the verdict on all limits, by the method of the settings; None without limits."""
+    if bench is None or not bench.limits:
+        return None
+    method = judged_method(snapshot, settings)
+    pairs = [
+        (limit, column)
         for limit in bench.limits
         for column, label in enumerate(snapshot.channels)
         if concerns(limit, label)
     ]
+    edges = {limit.name: _edges(snapshot, limit) for limit in bench.limits}
+    n_bands = sum(max(0, edges[limit.name].size - 1) for limit, _ in pairs)
+    quantile = NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
+    found = [
+        _beside(
+            bench, limit, column, snapshot, settings, edges=edges[limit.name], quantile=quantile
+        )
+        for limit, column in pairs
+    ]
+    limits = tuple(each.result(method) for each in found)
+    general = _general_obstacles(snapshot)
+    of_channels = {each.obstacle for each in limits if each.obstacle is not None}
+    obstacles = tuple(each for each in Obstacle if each in general or each in of_channels)
+    verdicts = {each.verdict for each in limits}
+    if general or not limits:
+        verdict = Verdict.NOT_DECIDED
+    elif Verdict.FAIL in verdicts:
+        verdict, obstacles = Verdict.FAIL, tuple(o for o in obstacles if o not in SHRINKS)
+    else:
+        verdict = Verdict.NOT_DECIDED if Verdict.NOT_DECIDED in verdicts else Verdict.PASS
+    prediction = None
+    if verdict is Verdict.NOT_DECIDED and obstacles and set(obstacles) <= SHRINKS:
+        prediction = _prediction(found, snapshot, quantile)
+    return TestVerdict(verdict, limits, obstacles, prediction)
 
 
 def concerns(limit: Limit, label: ChannelLabel) -> bool:
@@ -104,41 +107,191 @@ def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatAr
     return np.asarray(mask)
 
 
-def _judge(
-    bench: Bench, limit: Limit, column: int, snapshot: Snapshot, settings: Settings
-) -> LimitResult:
-    label = snapshot.channels[column]
-    method, noise = next(iter(snapshot.results.items()))
+@dataclass(frozen=True, slots=True)
+class _Beside:
+    """One channel beside one mask in all bands of it; arrays of shape (n_bands,).
 
-    def verdict(*numbers: float) -> LimitResult:
-        return LimitResult(limit.name, label.sensor, label.channel, method, *numbers)
+    `surely_low` and `surely_high` are the ends of the interval with all that widens it; `low` and
+    `high` those by the scatter of the estimate alone. NaN in bands without an estimate.
+    """
 
-    edges = _edges(snapshot.frequency, limit)
+    limit: Limit
+    label: ChannelLabel
+    centre: FloatArray
+    mask: FloatArray
+    mean: FloatArray
+    spread: FloatArray
+    low: FloatArray
+    high: FloatArray
+    added: FloatArray
+    error: FloatArray
+    averages: FloatArray
+    is_alone: NDArray[np.bool_]
+    is_faulty: bool
+
+    @property
+    def surely_low(self) -> FloatArray:
+        low = (self.low - self.added) * np.where(self.low > self.added, 1 - self.error, 1.0)
+        return np.full_like(low, -math.inf) if self.is_faulty else low
+
+    @property
+    def surely_high(self) -> FloatArray:
+        return np.asarray(self.high * np.where(self.high > 0, 1 + self.error, 1.0))
+
+    def result(self, method: str) -> LimitResult:
+        """Return the verdict, with the numbers of the band where the channel does worst."""
+
+        def in_band(band: int | None, verdict: Verdict, obstacle: Obstacle | None) -> LimitResult:
+            def number(values: FloatArray) -> float:
+                return math.nan if band is None else float(values[band])
+
+            return LimitResult(
+                limit=self.limit.name,
+                sensor=self.label.sensor,
+                channel=self.label.channel,
+                method=method,
+                frequency=number(self.centre),
+                noise_psd=number(self.mean),
+                low=number(self.surely_low),
+                high=number(self.surely_high),
+                limit_psd=number(self.mask),
+                verdict=verdict,
+                obstacle=obstacle,
+            )
+
+        known = np.isfinite(self.mean)
+        if not known.any():
+            why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM
+            return in_band(None, Verdict.NOT_DECIDED, why)
+        trusted = known & (self.averages >= FEWEST_AVERAGES) & ~self.is_alone
+        above = np.where(trusted, self.surely_low / self.mask, -math.inf)
+        if above.max() > 1:
+            return in_band(int(above.argmax()), Verdict.FAIL, None)
+        highest = np.where(known, self.surely_high / self.mask, -math.inf)
+        worst = int(highest.argmax())
+        if trusted.all() and highest.max() <= 1:
+            return in_band(worst, Verdict.PASS, None)
+        return in_band(worst, Verdict.NOT_DECIDED, self._obstacle(known, trusted))
+
+    def _obstacle(self, known: NDArray[np.bool_], trusted: NDArray[np.bool_]) -> Obstacle:
+        """Return what keeps the limit from being decided."""
+        would_fail = bool((self.low > self.mask).any())  # by scatter alone
+        would_pass = bool((self.high <= self.mask).all())
+        by_clocks = not bool((self.low - self.added > self.mask).any())
+        reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
+        reasons = (
+            (Obstacle.NO_ESTIMATE, not known.all()),
+            (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
+            (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
+            (Obstacle.FAULTY_CHANNEL, reads_high),
+            (Obstacle.CLOCKS, would_fail and by_clocks),
+            (Obstacle.MODEL_MISFIT, would_fail or would_pass),
+        )
+        return next((reason for reason, holds in reasons if holds), Obstacle.SPANS_LIMIT)
+
+    def margins(self) -> Margins:
+        """Return the margins for a prediction; where the mean is not positive, from its spread."""
+        positive = self.mean > 0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            in_log = np.log(self.mask / self.mean)
+            in_linear = (self.mask - self.mean) / self.spread
+        return Margins(
+            margin=np.where(positive, in_log, in_linear),
+            cov=np.where(positive, self.spread / np.abs(self.mean), 1.0),
+            clocks=np.log1p(self.added / self.mask),
+            can_fail=np.full(self.mean.shape, not self.is_faulty),
+        )
+
+
+def _beside(
+    bench: Bench,
+    limit: Limit,
+    column: int,
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    edges: NDArray[np.int64],
+    quantile: float,
+) -> _Beside:
+    label, frequency = snapshot.channels[column], snapshot.frequency
+    noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
-        return verdict(*[math.nan] * 5)
-    centre = np.sqrt(snapshot.frequency[edges[:-1]] * snapshot.frequency[edges[1:] - 1])
-    mask = mask_psd(bench, limit, label, centre)
-    means = band_means(
-        noise.noise_psd[:, column],
-        noise.cov[:, column],
-        edges,
-        correlation_of(settings),
-        weights=np.gradient(snapshot.frequency),
-        quantile=NormalDist().inv_cdf(1 - 0.025 / (edges.size - 1)),
+        centre = mask = added = np.empty(0)
+    else:
+        centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
+        mask = mask_psd(bench, limit, label, centre)
+        added = added_in_bands(snapshot, settings, edges, column)
+    averages = averages_at(snapshot, centre)
+    mean = spread = low = high = np.full(centre.shape, np.nan)
+    if noise is not None and centre.size:
+        means = band_means(
+            noise.noise_psd[:, column],
+            noise.cov[:, column],
+            edges,
+            correlation_of(settings),
+            weights=np.gradient(frequency),
+            deviation=deviation_at_bound(noise, column),
+        )
+        mean, spread = means.mean, means.spread
+        low, high = decision_interval(means, quantile, averages)
+    diagnostics = snapshot.diagnostics
+    return _Beside(
+        limit=limit,
+        label=label,
+        centre=centre,
+        mask=mask,
+        mean=mean,
+        spread=spread,
+        low=low,
+        high=high,
+        added=added,
+        error=_errors(snapshot, centre),
+        averages=averages,
+        is_alone=np.array(
+            [column in without_partners(snapshot, (f, f)) for f in centre.tolist()], dtype=bool
+        ),
+        is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
     )
-    worst = _worst(means, mask)
-    if worst is None:
-        return verdict(*[math.nan] * 5)
-    values = (centre, means.mean, means.low, means.high, mask)
-    return verdict(*(float(value[worst]) for value in values))
 
 
-def _worst(means: BandMeans, mask: FloatArray) -> int | None:
-    """Return the band furthest above the mask for certain, or else the one that comes closest."""
-    above = means.low / mask
-    if not np.isfinite(above).any():
-        return None
-    return int(np.nanargmax(above if np.nanmax(above) > 1 else means.high / mask))
+def _errors(snapshot: Snapshot, centre: FloatArray) -> FloatArray:
+    """Return what the estimate may be off by in each band, as a share of the noise."""
+    error = np.zeros(centre.shape)
+    for advice in snapshot.diagnostics.advice:
+        if advice.band is None or advice.level is Level.NOTE:
+            continue
+        here = (centre >= advice.band[0]) & (centre <= advice.band[1])
+        if isinstance(advice, ModelMisfit):
+            error = np.where(here, np.maximum(error, advice.error), error)
+        elif isinstance(advice, TooFewDimensions):
+            error = np.where(here, np.inf, error)
+    return error
+
+
+def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
+    """Return what keeps the whole test from a decision."""
+    found = set()
+    if snapshot.sensors and all(sensor.is_lost for sensor in snapshot.sensors):
+        found.add(Obstacle.SENSORS_LOST)
+    if snapshot.n_segments == 0:
+        found.add(Obstacle.NO_SEGMENTS)
+    return found
+
+
+def _prediction(found: Sequence[_Beside], snapshot: Snapshot, quantile: float) -> Prediction | None:
+    parts = [each.margins() for each in found]
+    return predict(
+        Margins(
+            margin=np.concatenate([part.margin for part in parts]),
+            cov=np.concatenate([part.cov for part in parts]),
+            clocks=np.concatenate([part.clocks for part in parts]),
+            can_fail=np.concatenate([part.can_fail for part in parts]),
+        ),
+        quantile=quantile,
+        elapsed=snapshot.elapsed,
+        averages=min(float(each.averages.min()) for each in found),
+        least=FEWEST_AVERAGES,
+    )
 
 
 def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
@@ -149,8 +302,12 @@ def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
     return None
 
 
-def _edges(frequency: FloatArray, limit: Limit) -> NDArray[np.int64]:
-    """Return edges of third-octave bands within a mask's frequencies, each with a bin or more."""
+def _edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
+    """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
+
+    Bands above the frequency from which on nothing is known are left out.
+    """
+    frequency = snapshot.frequency
     low = max(limit.frequency[0], float(frequency[1]))
     high = min(limit.frequency[-1], float(frequency[-2]))
     if high <= low:
@@ -158,4 +315,6 @@ def _edges(frequency: FloatArray, limit: Limit) -> NDArray[np.int64]:
     n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
     edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
     edges[-1] += 1
-    return np.unique(edges).astype(np.int64)
+    edges = np.unique(edges).astype(np.int64)
+    known = highest_known(snapshot)
+    return edges[: 1 + np.count_nonzero(frequency[edges[:-1]] <= known)] if known else edges

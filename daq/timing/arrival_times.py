@@ -210,9 +210,8 @@ class ArrivalTimes:
 
         Those are indices of samples, and seconds from the origin by which they were taken.
         """
-        for number, (first, end) in enumerate(self._bounds()):
-            index = self._index[self._epoch == number].astype(np.float64)
-            late = self._late[self._epoch == number]
+        for mine, (first, end) in zip(self._rows(self._epoch), self._bounds(), strict=True):
+            index, late = self._index[mine].astype(np.float64), self._late[mine]
             yield first, end, index, index / self.sampling_rate + late
 
     def rate(self) -> tuple[float, float]:
@@ -249,11 +248,15 @@ class ArrivalTimes:
         """First sample of each epoch, and the one after its last."""
         return list(itertools.pairwise([*self._epoch_starts, self._end_sample]))
 
+    def _rows(self, epoch: IntArray) -> list[slice]:
+        """Return the rows of every epoch, given each row's, which rise."""
+        bounds = np.searchsorted(epoch, np.arange(len(self._epoch_starts) + 1)).tolist()
+        return list(itertools.starmap(slice, itertools.pairwise(bounds)))
+
     def _stated(self, sensor: str) -> Clock:
         """Follow the device's own statements; at the nominal rate, if they agree with it."""
         epochs = []
-        for number, (first, end) in enumerate(self._bounds()):
-            mine = self._epoch == number
+        for mine, (first, end) in zip(self._rows(self._epoch), self._bounds(), strict=True):
             index, late = self._index[mine].astype(float), self._late[mine]
             if np.ptp(late) < _UTC_TOLERANCE:
                 index = np.array([first, max(end, first + 1)], dtype=float)
@@ -275,19 +278,16 @@ class ArrivalTimes:
         if self._line is not None:
             return self._line
         slopes, weights = [0.0], [0.0]
-        for number in range(len(self._epoch_starts)):
-            mine = self._epoch == number
-            if np.count_nonzero(mine) > 1:
+        every = self._rows(self._epoch)
+        for mine in every:
+            if mine.stop - mine.start > 1:
                 index, late = self._index[mine].astype(float), self._late[mine]
                 slopes.append(supporting_line(index, late)[1])
                 weights.append(float(index[-1] - index[0]) ** 2)
         total = sum(weights)
         slope = float(np.dot(slopes, weights) / total) if total else 0.0
         late = self._late - slope * self._index
-        self._line = (
-            slope,
-            [float(late[self._epoch == number].min()) for number in range(len(self._epoch_starts))],
-        )
+        self._line = slope, [float(late[mine].min()) for mine in every]
         return self._line
 
     def _too_early(self, index: IntArray, late: FloatArray) -> BoolArray:
@@ -375,13 +375,13 @@ class ArrivalTimes:
             return self._filtered(sensor, slope, anchors, None)
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs = []
-        for number, (first, end) in enumerate(self._bounds()):
-            mine = np.flatnonzero(epoch == number)
+        every = zip(self._rows(epoch), self._bounds(), anchors, strict=True)
+        for mine, (first, end), anchor in every:
             nodes, late = index[mine], curve[mine]
             # Straight on at both ends, at the rate the filter has there.
             low, high = min(float(first), nodes[0]) - 1.0, max(float(end), nodes[-1]) + 1.0
             nodes = np.concatenate([[low], nodes, [high]])
-            ends = smoothed.rate[mine[[0, -1]]] / self.sampling_rate
+            ends = smoothed.rate[mine][[0, -1]] / self.sampling_rate
             late = np.concatenate(
                 [
                     [late[0] - ends[0] * (nodes[1] - low)],
@@ -389,7 +389,7 @@ class ArrivalTimes:
                     [late[-1] + ends[1] * (high - nodes[-2])],
                 ]
             )
-            seconds = nodes / self.sampling_rate + late + slope * nodes + anchors[number]
+            seconds = nodes / self.sampling_rate + late + slope * nodes + anchor
             increasing = np.concatenate([[True], np.diff(nodes) > 0])
             epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
         drift = slope * self.sampling_rate + float(smoothed.rate.mean())

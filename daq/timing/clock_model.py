@@ -1,15 +1,18 @@
 """When the samples of a sensor were taken: its clock, and what is known about it.
 
 A stretch of samples between restarts of the device's clock is an :class:`Epoch`; within one, the
-sample index counts without error. Clocks come from block arrival times
+sample index counts without error. A polled sensor has one epoch, however many gaps it has, since
+the time of every sample is known. Clocks come from block arrival times
 (:mod:`daq.timing.arrival_times`), from the instant of every sample where a sensor is polled, or are
 the timeline itself where all sensors share one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from bisect import bisect_right
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 _NEVER = 1 << 62  # a sample index beyond all others
 
@@ -146,6 +150,15 @@ class Clock:
 
     epochs: tuple[Epoch, ...]
     state: ClockState
+    _spans: list[FloatArray] = field(default_factory=list, init=False, repr=False)
+
+    @property
+    def spans(self) -> FloatArray:
+        """Times of the first and the last sample of every epoch, found once, shape (2, n)."""
+        if not self._spans:
+            spans = [(epoch.start, epoch.end) for epoch in self.epochs]
+            self._spans.append(np.array(spans).T)
+        return self._spans[0]
 
     @property
     def start(self) -> float:
@@ -164,15 +177,22 @@ class Clock:
 
     def at(self, index: FloatArray) -> FloatArray:
         """Return the time in seconds of (fractional) sample indices."""
+        if len(self.epochs) == 1:
+            return self.epochs[0].at(index)
         starts = [epoch.first_sample for epoch in self.epochs[1:]]
         return self._by_epoch(np.searchsorted(starts, index, side="right"), index, Epoch.at)
 
     def position(self, seconds: FloatArray) -> FloatArray:
         """Return the (fractional) sample index at times in seconds."""
-        starts = [epoch.start for epoch in self.epochs[1:]]
-        return self._by_epoch(
-            np.searchsorted(starts, seconds, side="right"), seconds, Epoch.position
-        )
+        if len(self.epochs) == 1:
+            return self.epochs[0].position(seconds)
+        which = np.searchsorted(self.spans[0, 1:], seconds, side="right")
+        return self._by_epoch(which, seconds, Epoch.position)
+
+    def between(self, begin: float, end: float) -> tuple[Epoch, ...]:
+        """Return the epochs that have samples between two times in seconds."""
+        starts, ends = self.spans
+        return tuple(self.epochs[n] for n in np.flatnonzero((starts <= end) & (ends >= begin)))
 
     def extended(self, end_sample: int) -> Clock:
         """Return the same clock for a recording that has grown to `end_sample`."""
@@ -199,12 +219,16 @@ class Clock:
         """
         ends = [*(epoch.first_sample for epoch in self.epochs[1:]), _NEVER]
         starts = [-_NEVER, *ends[:-1]]
-        epochs = tuple(
-            Epoch(max(first, start - n), min(end, stop - n), epoch.index - n, epoch.seconds)
-            for first, end, n in stretches
-            for epoch, start, stop in zip(self.epochs, starts, ends, strict=True)
-            if max(first, start - n) < min(end, stop - n)
-        )
+        found = []
+        for first, end, n in stretches:
+            for number in range(bisect_right(ends, first + n), len(ends)):
+                epoch, start, stop = self.epochs[number], starts[number] - n, ends[number] - n
+                if start >= end:
+                    break
+                if max(first, start) < min(end, stop):
+                    index = epoch.index - n
+                    found.append(Epoch(max(first, start), min(end, stop), index, epoch.seconds))
+        epochs = tuple(found)
         state = replace(
             self.state.shared_by(sensor),
             offset=epochs[0].start,
@@ -220,9 +244,10 @@ class Clock:
         evaluate: Callable[[Epoch, FloatArray], FloatArray],
     ) -> FloatArray:
         out = np.empty(len(values))
-        for number in np.unique(which):
-            mine = which == number
-            out[mine] = evaluate(self.epochs[number], values[mine])
+        order = np.argsort(which, kind="stable")
+        numbers, begins = np.unique(which[order], return_index=True)
+        for number, rows in zip(numbers, np.split(order, begins[1:]), strict=True):
+            out[rows] = evaluate(self.epochs[number], values[rows])
         return out
 
 
@@ -231,7 +256,8 @@ def from_instants(
     seconds: FloatArray,
     *,
     sampling_rate: float,
-    runs: Sequence[tuple[int, int, int]],
+    first_samples: IntArray,
+    first_rows: IntArray,
 ) -> Clock:
     """Return the clock of a polled sensor, for which every sample has its instant.
 
@@ -242,15 +268,21 @@ def from_instants(
         From the recording's origin, in the order of the file's rows.
     sampling_rate : float
         Nominal, in Hz.
-    runs : sequence of (first_sample, first_row, n_samples)
-        Contiguous stretches; each becomes an epoch.
+    first_samples, first_rows : int64, shape (n_stretches,)
+        Sample index and row at which each contiguous stretch begins. A gap between stretches does
+        not end an epoch: time is straight across it. Only time that goes back does.
     """
-    epochs = []
-    for first, row, n_samples in runs:
-        index = np.arange(first, first + n_samples, dtype=float)
-        epochs.append(Epoch(first, first + n_samples, index, seconds[row : row + n_samples]))
-    covered = sum(epoch.end - epoch.start for epoch in epochs)
-    intervals = len(seconds) - len(runs)
+    rows = np.append(first_rows, len(seconds))
+    index = np.arange(len(seconds), dtype=float)
+    index += np.repeat(first_samples - first_rows, np.diff(rows))
+    goes_back = seconds[first_rows[1:]] <= seconds[first_rows[1:] - 1]
+    cuts = [0, *first_rows[1:][goes_back].tolist(), len(seconds)]
+    epochs = [
+        Epoch(int(index[low]), int(index[high - 1]) + 1, index[low:high], seconds[low:high])
+        for low, high in pairwise(cuts)
+    ]
+    covered = float((seconds[rows[1:] - 1] - seconds[first_rows]).sum())
+    intervals = len(seconds) - len(first_rows)
     ppm = (intervals / covered / sampling_rate - 1) * 1e6 if covered > 0 else float("nan")
     state = ClockState(
         sensor=sensor,

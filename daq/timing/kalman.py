@@ -20,7 +20,7 @@ Arrivals alone do not tell a clock that wanders from a host whose shortest laten
 clock is smoothed once more, with the likeliest walk that oscillators have at a steady temperature.
 By how much both differ is part of what is stated.
 
-Why a filter, and not a line or pieces of lines: docs/decisions/0020-clock-model.md.
+Why a filter, and not a line or pieces of lines: docs/decisions/0006-clock-model.md.
 """
 
 from __future__ import annotations

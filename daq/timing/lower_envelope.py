@@ -29,13 +29,15 @@ def levelled(index: IntArray, late: FloatArray, epoch: IntArray, *, second: floa
     `second` is in samples.
     """
     late = late.copy()
-    for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(epoch)) + 1):
+    begins = np.flatnonzero(np.diff(epoch, prepend=-1))
+    ends = np.append(begins[1:], len(index))
+    for first in np.flatnonzero(index[ends - 1] - index[begins] > _LEVEL * second):
+        rows = np.arange(begins[first], ends[first])
         half = len(rows) // 2
-        if np.ptp(index[rows]) > _LEVEL * second:
-            rise = late[rows[half:]] - late[rows[: len(rows) - half]]
-            slope = float(np.median(rise / (index[rows[half:]] - index[rows[: len(rows) - half]])))
-            if abs(slope * second) > _STEEP:
-                late[rows] -= slope * index[rows]
+        rise = late[rows[half:]] - late[rows[: len(rows) - half]]
+        slope = float(np.median(rise / (index[rows[half:]] - index[rows[: len(rows) - half]])))
+        if abs(slope * second) > _STEEP:
+            late[rows] -= slope * index[rows]
     return late
 
 

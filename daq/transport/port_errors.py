@@ -24,13 +24,13 @@ _REASONS = {
 
 
 def why(error: BaseException) -> str:
-    """Say why a port failed, and what to do about it."""
+    """Return why a port failed, and what to do."""
     if isinstance(error, socket.gaierror):
-        return f"no such host ({error.strerror})"
+        return f"unknown host ({error.strerror})"
     number = getattr(error, "errno", None)
     if number in {errno.ENOENT, errno.ENODEV}:
         present = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
-        return f"there is no such port; serial ports here: {present}"
+        return f"port does not exist; serial ports of this computer: {present}"
     if number in _REASONS:
         return _REASONS[number]
     return str(error) or type(error).__name__

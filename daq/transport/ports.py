@@ -1,4 +1,4 @@
-"""Ports as byte streams: serial devices, pseudo-terminals, TCP, and anything else pyserial opens.
+"""Ports as byte streams: serial devices, pseudo-terminals, TCP, and RFC 2217.
 
 Theory of operation
 -------------------
@@ -21,7 +21,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from daq.errors import NotConnectedError
-from daq.transport.address import host_and_port
+from daq.transport.address import check_serial, host_and_port
 from daq.transport.byte_stream import ByteStream
 from daq.transport.port_errors import why
 from daq.transport.serial_tcp import open_serial, open_tcp
@@ -47,9 +47,9 @@ async def open_port(
     Parameters
     ----------
     port
-        Device path, ``COMn``, ``socket://host:port``, ``rfc2217://host:port`` or another pyserial
-        URL. Serial ports are opened 8 data bits, exclusively; on FTDI adapters the latency timer
-        (16 ms as delivered) is set to its least.
+        Device path, ``COMn``, ``socket://host:port``, ``rfc2217://host:port`` or
+        ``hwgrep://pattern``. Serial ports are opened 8 data bits, exclusively; on FTDI adapters
+        the latency timer (16 ms as delivered) is set to its least.
     label
         Begins every error message; names sensor and port.
     parity, stop_bits
@@ -66,6 +66,7 @@ async def open_port(
             host, number = host_and_port(port)
             wire = await open_tcp(host, number, stream)
         else:
+            check_serial(port)
             wire = await open_serial(
                 port, stream, clock, baud_rate=baud_rate, parity=parity, stop_bits=stop_bits
             )

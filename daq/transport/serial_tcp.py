@@ -17,6 +17,7 @@ import serial
 from daq.transport.port_errors import why
 
 if sys.platform != "win32":
+    import fcntl
     import termios
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ class _DescriptorWire:
         self._descriptor: int = port.fileno()
         self._stream = stream
         self._loop = asyncio.get_running_loop()
+        self._exclude_others(termios.TIOCEXCL)
         self.expect(1)  # pyserial leaves 0, with which nothing there would read as a hang-up
         self.resume()
 
@@ -148,7 +150,13 @@ class _DescriptorWire:
 
     async def close(self) -> None:
         self.pause()
+        self._exclude_others(termios.TIOCNXCL)
         self._port.close()
+
+    def _exclude_others(self, request: int) -> None:
+        """Let the kernel refuse others: the lock that pyserial takes is heeded by few programs."""
+        with contextlib.suppress(OSError):  # gone
+            fcntl.ioctl(self._descriptor, request)
 
 
 def _settle(future: asyncio.Future[None]) -> None:

@@ -1,1 +1,1 @@
-"""What the averages say about the test itself: bands, orientation, advice."""
+"""Diagnosis of a test from its averages: bands, orientation, advice."""

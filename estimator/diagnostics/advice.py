@@ -14,7 +14,7 @@ from estimator.diagnostics.kinds import AdviceKind, Level
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """One thing to know about the test; each kind is a class of its own.
+    """A finding about a test; each kind is a class of its own.
 
     Attributes
     ----------
@@ -67,6 +67,26 @@ class Copies(Advice):
     kind: ClassVar[AdviceKind] = AdviceKind.COPIES
     channels: tuple[tuple[int, int], ...]
     share_of_frequencies: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoSharedMotion(Advice):
+    """The one of `sensors` records none of the motion that others share.
+
+    Attributes
+    ----------
+    partners : tuple of int
+        The sensors that share it.
+    share : float
+        Of the motion, that the sensor has in common with any of these at most; 0 for none.
+    share_of_partners : float
+        The same of two partners, at least.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NO_SHARED_MOTION
+    partners: tuple[int, ...]
+    share: float
+    share_of_partners: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

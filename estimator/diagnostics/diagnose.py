@@ -1,8 +1,7 @@
-"""What the averages say about the test itself.
+"""Diagnosis of a test from its averages.
 
-Coherences, conditioning, the dimension and strength of the motion, whether one motion explains all
-sensors, the orientation of the sensors, and the recommendations of the paper's section 5 where they
-apply.
+Coherence, conditioning, dimension and strength of the motion, the test of one common motion,
+orientation of the sensors, and the recommendations of section 5 of the paper.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from estimator.diagnostics.relative_response import (
     relative_response,
 )
 from estimator.diagnostics.rules import advise
+from estimator.diagnostics.shared_motion import shared_motion
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.chi_square import critical_value
@@ -30,6 +30,7 @@ from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import ModelTest, model_test, p_values, pool
 from estimator.likelihood.maximum_likelihood import standard_error
+from estimator.self_noise.band_means import median_of_columns
 from estimator.self_noise.coherency import (
     check_averages,
     check_dims,
@@ -41,15 +42,17 @@ from estimator.self_noise.live_channels import Presence, presence
 
 if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
-    from estimator.types import ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
+LOST = 0.5
+"""Share of the frequencies of a band at which the noise of a channel is lost in its scatter."""
 DIMENSION_LEVEL = 0.01
 """Of the test that further dimensions have no coherence, all pairs of sensors together."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """The test as its own averages see it.
+    """The diagnosis of a test.
 
     Attributes
     ----------
@@ -108,7 +111,7 @@ def diagnose(
 ) -> Diagnostics:
     """Diagnose a huddle test.
 
-    Channels that are dead, or copies of earlier ones, are named and left aside.
+    Dead channels, and copies of earlier ones, are reported and excluded.
 
     Parameters
     ----------
@@ -163,10 +166,11 @@ def diagnose(
     model, untested = _test(
         fit if q == d else _fit(matrix, there, q, n_effective), there, n_effective, len(csm)
     )
-    snr = np.full((len(csm), sum(dims)), np.nan)
+    snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     if isinstance(fit, Maximum):
-        known = standard_error(fit, n_effective=n_effective) < fit.psi
-        snr = there.spread(np.where(known, 1 / fit.psi - 1, np.nan), sum(dims))
+        error = standard_error(fit, n_effective=n_effective)
+        snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
+        lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
     canonical = CanonicalCoherence(matrix)
     dimension = _dimension(canonical, matrix, there.dims, n_effective)
     number = bands(frequency)
@@ -174,11 +178,14 @@ def diagnose(
         BandDiagnosis(
             low=float(frequency[inside][0]),
             high=float(frequency[inside][-1]),
-            coherence=float(_median(_least(coherence[inside]))),
-            condition=float(_median(-_least(-condition[inside]))),
-            dimension=float(_median(dimension[inside])),
-            snr=_median(snr[inside]),
+            coherence=float(median_of_columns(_least(coherence[inside]))),
+            condition=float(median_of_columns(-_least(-condition[inside]))),
+            dimension=float(median_of_columns(dimension[inside])),
+            snr=median_of_columns(snr[inside]),
+            noise_lost=lost[inside].mean(axis=0) > LOST,
             test=pool(model, inside, neighbours=neighbours),
+            shared=_shared(canonical, there, len(dims), inside=inside, n_effective=n_effective),
+            n_frequencies=int(inside.sum()),
         )
         for inside in (number == b for b in np.unique(number))
     )
@@ -208,19 +215,26 @@ def diagnose(
     )
 
 
+def _shared(
+    canonical: CanonicalCoherence,
+    there: Presence,
+    n_sensors: int,
+    *,
+    inside: BoolArray,
+    n_effective: float,
+) -> FloatArray:
+    """Share of the motion that each two sensors have in common; NaN for those without signal."""
+    shared = np.full((n_sensors, n_sensors), np.nan)
+    if len(there.sensors):
+        found = shared_motion(canonical, there.dims, inside, n_effective)
+        shared[np.ix_(there.sensors, there.sensors)] = found
+    return shared
+
+
 def _least(values: FloatArray) -> FloatArray:
     """Least of the numbers of each row, shape (n_freqs,); NaN where there is none."""
     least = np.where(np.isnan(values), np.inf, values).min(axis=1)
     return np.where(np.isnan(values).all(axis=1), np.nan, least)
-
-
-def _median(values: FloatArray) -> FloatArray:
-    """Median of the numbers of each column, along the first axis; NaN where there is none."""
-    ordered = np.sort(values, axis=0)  # NaN last
-    count = np.sum(~np.isnan(ordered), axis=0)
-    middle = (np.maximum(count - 1, 0) // 2, count // 2)
-    low, high = (np.take_along_axis(ordered, np.asarray(at)[None], axis=0)[0] for at in middle)
-    return np.asarray((low + high) / 2)
 
 
 def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
@@ -232,7 +246,7 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
 
 
 def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | Untested:
-    """Fit motion of q dimensions, or say why that cannot be done."""
+    """Fit motion of q dimensions, or return why that is not possible."""
     if len(there.sensors) < 3:
         return Untested.TOO_FEW_SENSORS
     if n_effective <= matrix.shape[1]:
@@ -303,6 +317,7 @@ def _responses(
     coherence: CanonicalCoherence,
 ) -> tuple[RelativeResponse, ...]:
     found = []
+    checked = coherency(csm, there.dims) if len(there.whole) > 1 else None
     for first, second in combinations(range(len(there.sensors)), 2):
         pair = there.sensors[first], there.sensors[second]
         if not set(pair) <= set(there.whole):  # a like channel's motion might be missing
@@ -316,6 +331,7 @@ def _responses(
                 second=second,
                 vertical=vertical,
                 coherence=coherence,
+                checked=checked,
             )
         except InsufficientDataError:  # nothing to compare them by
             continue

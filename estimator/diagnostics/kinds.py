@@ -1,4 +1,4 @@
-"""The words of a diagnosis: kinds of advice, how bad they are, why a test was not made."""
+"""Enumerations of a diagnosis: kinds of advice, levels, reasons why a test was not made."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ import enum
 
 
 class Level(enum.StrEnum):
-    """How bad it is."""
+    """Severity of advice."""
 
     PROBLEM = "problem"
-    """The estimate is wrong, or there is none."""
+    """The estimate is wrong or missing."""
     WARNING = "warning"
-    """The estimate may be wrong, or is less certain than it could be."""
+    """The estimate may be wrong, or is less certain than possible."""
     NOTE = "note"
-    """Good to know."""
+    """The estimate is valid."""
 
 
 class AdviceKind(enum.StrEnum):
-    """What advice is about."""
+    """Subject of advice."""
 
     NO_SIGNAL = "no-signal"
     """Channels have no power, or a constant count."""
     COPIES = "copies"
     """Channels repeat others sample for sample."""
+    NO_SHARED_MOTION = "no-shared-motion"
+    """A sensor records none of the motion that others share."""
     TOO_FEW_SENSORS = "too-few-sensors"
     """Fewer than three sensors have a signal of their own."""
     MISSING_CHANNELS = "missing-channels"
@@ -42,9 +44,9 @@ class AdviceKind(enum.StrEnum):
     MOTION_LEFT_IN = "motion-left-in"
     """The averages are too few to remove weak motion from the estimate."""
     SWAPPED_CHANNELS = "swapped-channels"
-    """Two channels of a sensor have traded places."""
+    """Two channels of a sensor are swapped."""
     ROTATED = "rotated"
-    """Two sensors do not point the same way."""
+    """Two sensors point in different directions."""
     NOT_ORTHOGONAL = "not-orthogonal"
     """Channels of a sensor are not at right angles."""
     REVERSED_POLARITY = "reversed-polarity"
@@ -59,13 +61,13 @@ class Untested(enum.StrEnum):
     """Why the model of one common motion has not been tested."""
 
     UNFINISHED = "unfinished"
-    """The estimate still grows: it is tested when the recording has ended."""
+    """The recording has just begun; the test follows with the first segments."""
     NO_SEGMENTS = "no-segments"
     """There are no averages."""
     TOO_FEW_SENSORS = "too-few-sensors"
     """Fewer than three sensors have a signal of their own."""
     TOO_FEW_AVERAGES = "too-few-averages"
-    """The test takes more averages than channels."""
+    """The test needs more averages than channels."""
     TOO_FEW_CHANNELS = "too-few-channels"
     """The model has as many parameters as the matrix: it explains any averages."""
     SINGULAR = "singular"

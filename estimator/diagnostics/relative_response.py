@@ -16,10 +16,11 @@ from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.self_noise.coherency import check_dims, check_frequency, coherency
 
 if TYPE_CHECKING:
+    from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 LEAST_COHERENCE = 0.5
-"""Below it a frequency says nothing of the response, and its phase could mislead the delay."""
+"""Frequencies with a lower coherence are not used: their phase could mislead the delay."""
 _STEPS = 4  # of least squares from the coarse delay
 _PARTS = 8  # of the band, for the scatter of the angles
 
@@ -183,6 +184,7 @@ def relative_response(
     band: tuple[float, float] | None = None,
     vertical: int | None = None,
     coherence: CanonicalCoherence | None = None,
+    checked: Coherency | None = None,
 ) -> RelativeResponse:
     """Rotation, gains, non-orthogonality and delay of one sensor against another.
 
@@ -205,6 +207,8 @@ def relative_response(
         three nothing is known.
     coherence : CanonicalCoherence, optional
         Of the same matrix, where several pairs of sensors are compared.
+    checked : Coherency, optional
+        Of the same matrix, likewise.
 
     Returns
     -------
@@ -232,7 +236,7 @@ def relative_response(
     """
     check_dims(dims)
     csm = np.asarray(csm, dtype=np.complex128)
-    given = coherency(csm, dims)
+    given = coherency(csm, dims) if checked is None else checked
     frequency = check_frequency(frequency, len(csm))
     if first == second or not {first, second} <= set(range(len(dims))):
         raise EstimatorError(

@@ -1,4 +1,4 @@
-"""When each kind of advice applies: section 5 of the paper, and what the model test adds to it.
+"""Conditions for each kind of advice: section 5 of the paper, and the model test.
 
 A misfit of the model is graded by its possible effect on the noise estimate. The averages show a
 misfit of ``sqrt((statistic - 1) / (n - d))`` of the noise, where ``statistic`` is in units of its
@@ -7,7 +7,7 @@ the test sees the rest. Computed on true matrices, it is larger by up to `TYPICA
 that channels share, for noise of a sensor's own mount, and for one more dimension of motion. For
 waves that cross sensors 0.1 m apart it is larger by up to `CROSSING` times with four sensors or
 more, by up to `CROSSING_THREE` times with three triaxial sensors, and without bound with three
-sensors of fewer channels. See `docs/decisions/0035`.
+sensors of fewer channels. See `docs/decisions/0012`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from estimator.diagnostics.advice import (
     MotionAcross,
     MotionLeftIn,
     NearlySingular,
+    NoSharedMotion,
     NoSignal,
     TooFewDimensions,
     TooFewSensors,
@@ -33,6 +34,7 @@ from estimator.diagnostics.advice import (
 )
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.orientation import orientation
+from estimator.diagnostics.shared_motion import outsiders
 from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.self_noise.live_channels import presence
 from estimator.self_noise.result import Flag
@@ -84,8 +86,8 @@ def advise(
     tuple of Advice
     """
     alive = presence(given, dims).dims
-    found = [
-        *_absent(given, dims),
+    strangers = list(_strangers(bands, len(dims), n_effective))
+    others = [
         *(
             _too_few_dimensions(bands, n_factors)
             if n_factors < max(alive, default=0)
@@ -95,10 +97,55 @@ def advise(
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
         *_left_in(bands, max(dims), n_effective),
+    ]
+    found = [
+        *_absent(given, dims),
+        *strangers,
+        *(each for each in others if not any(_overlap(each, other) for other in strangers)),
         *(advice for response in responses for advice in orientation(response, dims, nyquist)),
     ]
     order = list(Level)
     return tuple(sorted(found, key=lambda advice: order.index(advice.level)))
+
+
+def _overlap(one: Advice, other: Advice) -> bool:
+    """Whether two pieces of advice are about the same frequencies, at some."""
+    if one.band is None or other.band is None:
+        return True
+    return one.band[0] <= other.band[1] and other.band[0] <= one.band[1]
+
+
+def _strangers(
+    bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
+) -> Iterator[Advice]:
+    """Sensors that record none of the motion that others share.
+
+    What else the averages show in these bands follows from that, and is not said.
+    """
+    of_bands = [dict(outsiders(band.shared, n_effective, band.n_frequencies)) for band in bands]
+    for sensor in range(n_sensors):
+        named = [sensor in found for found in of_bands]
+        for is_stranger, run in groupby(range(len(bands)), named.__getitem__):
+            here = list(run)
+            if is_stranger:
+                groups = [of_bands[n][sensor] for n in here]
+                yield _stranger(sensor, [bands[n] for n in here], groups)
+
+
+def _stranger(
+    sensor: int, run: list[BandDiagnosis], groups: list[tuple[int, ...]]
+) -> NoSharedMotion:
+    partners = max(groups, key=len)
+    weights = [band.n_frequencies for band in run]
+    shared = np.average([band.shared for band in run], axis=0, weights=weights)
+    return NoSharedMotion(
+        level=Level.PROBLEM,
+        sensors=(sensor,),
+        band=_span(run),
+        partners=partners,
+        share=max(0.0, *(float(shared[sensor, j]) for j in partners)),
+        share_of_partners=min(float(shared[j, k]) for j in partners for k in partners if j < k),
+    )
 
 
 def _runs(
@@ -115,8 +162,9 @@ def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
 
 
 def _is_weak(band: BandDiagnosis) -> bool:
+    """Whether the motion is weaker than the noise in every channel, the quietest included."""
     known = band.snr[~np.isnan(band.snr)]
-    return len(known) > 0 and bool(known.max() < 1)
+    return len(known) > 0 and bool(known.max() < 1) and not band.noise_lost.any()
 
 
 def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
@@ -262,7 +310,7 @@ def left_in(d: int, n_effective: float) -> float:
     float
         The largest over the SNR s of ``ρ (1 − g)^(n / d)``, with ``ρ = s / (1 + 2 s)`` what two
         like sensors do not predict and ``g = (s / (1 + s))²`` their coherence: exact for d = 1
-        (`docs/decisions/0033`), and for d = 2 and 3 no less than was measured there.
+        (`docs/decisions/0010`), and for d = 2 and 3 no less than was measured there.
     """
     s = np.geomspace(1e-4, 10, 501)
     return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())

@@ -1,7 +1,7 @@
-"""How many dimensions the common motion has, band by band: the fewest that the model test accepts.
+"""Dimension of the common motion by band: the smallest that the model test accepts.
 
-Fewer than a sensor has channels where the motion lacks a dimension; more where the sensors do
-not quite feel one motion, and there are enough of them: its rotation and its gradients are
+It is smaller than the number of channels of a sensor if the motion lacks a dimension. It is larger
+if the sensors do not measure one motion exactly and are numerous enough: rotation and gradients are
 then further factors of the same model.
 """
 
@@ -41,7 +41,7 @@ MOST_BINS = 64
 
 @dataclass(frozen=True, slots=True)
 class BandDimension:
-    """The dimension chosen for one band, and what it costs.
+    """The dimension chosen for one band, and its cost in precision.
 
     Attributes
     ----------

@@ -133,15 +133,14 @@ def max_factors(n_channels: int | IntArray) -> IntArray:
 
 
 def check_factors(n_factors: int | IntArray, n_channels: int) -> None:
-    """Raise unless so many factors can be told from the noise of so many channels."""
+    """Raise unless so many channels determine so many factors."""
     factors, most = np.asarray(n_factors), max_factors(n_channels)
     if factors.dtype.kind not in "iu":
         raise EstimatorError(f"{n_factors} factors of motion: expected a whole number")
     wrong = factors[(factors < 0) | (factors > most)]
     if wrong.size:
         raise InsufficientDataError(
-            f"{wrong[0]} factors of motion cannot be told from the noise of {n_channels} "
-            f"channels: at most {most} can"
+            f"{wrong[0]} factors of motion: expected at most {most} for {n_channels} channels"
         )
 
 

@@ -1,12 +1,12 @@
-"""As many dimensions of motion as the averages can tell from scatter, frequency by frequency.
+"""The dimensions of motion that the averages resolve, frequency by frequency.
 
-Factors that the averages cannot find are fitted to scatter, and what is fitted is missing from the
-noise: without motion 17 to 30 % at n = 20, 6 to 15 % still at n = 1080. A model without these
-factors has no such bias. So the weakest factor counts only where it improves the fit by more than
-scatter would, then the next. Motion left out with it stays in the noise: `docs/decisions/0033`.
+Factors that the averages do not resolve are fitted to scatter, which removes noise: without motion
+17 to 30 % at n = 20, and 6 to 15 % at n = 1080. A model without these factors has no such bias. So
+the weakest factor counts only if it improves the fit by more than scatter would; then the next is
+tested. Motion of an excluded factor counts as noise: `docs/decisions/0010`.
 
-That is for motion that several sensors could feel. What one channel alone feels looks like its
-noise: `alone` finds the channels of which nothing else can be said (`docs/decisions/0034`).
+This concerns motion that several sensors measure. Motion that one channel alone measures looks like
+its noise: `alone` finds these channels (`docs/decisions/0011`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CAPTURED = 0.15
 def resolved(
     csm: ComplexArray, maximum: Maximum, *, n_effective: float
 ) -> Iterator[tuple[IntArray, Maximum]]:
-    """Leave out the factors that cannot be told from scatter, the weakest first.
+    """Exclude the factors that the averages do not resolve, the weakest first.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def resolved(
 def alone(
     csm: ComplexArray, absent: BoolArray, *, dims: tuple[int, ...], n_effective: float
 ) -> BoolArray:
-    """Say which channels' noise might as well be motion that no other sensor feels.
+    """Find channels whose noise could equally be motion that no other sensor measures.
 
     Only the sensor with most channels can have such: as many as it has more than any other. They
     are those that the other sensors predict least. All of such a channel is taken for motion, and

@@ -1,4 +1,4 @@
-"""What the averages can tell about the noise: Fisher information, bounds, small-sample bias.
+"""Information of the averages on the noise: Fisher information, bounds, small-sample bias.
 
 In channels whitened by their own noise the model is ``I + A A*``. With P the projector on what
 the motion leaves free (the eigenvectors of the p - q smallest eigenvalues) the information on
@@ -170,7 +170,7 @@ def interval(
 
 
 def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) -> FloatArray:
-    """Eigenvalues of the motion, freed from what the scatter of the noise added to them.
+    """Eigenvalues of the motion, corrected for the scatter of the noise.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Does one common motion explain the averages? Likelihood ratio test, per frequency and pooled.
+"""Likelihood ratio test of one common motion, per frequency and pooled.
 
-The alternative is any covariance at all. What makes the test speak: sensors that feel different
-motion, tilt, noise common to two channels (a cable, a digitizer), a bad clock.
+The alternative is any covariance matrix. The test fails if sensors measure different motion,
+and for tilt, noise common to two channels (a cable, a digitizer), and clock errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray
 
 REJECT = 0.01
-"""Chance that a good test is said to fail."""
+"""Probability of a false alarm in a sound test."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Maximum likelihood self-noise: every channel of every sensor at once, and how sure it is."""
+"""Maximum likelihood self-noise from all channels of all sensors, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 BEYOND = 2
-"""Factors above those asked for that the error allows for, where these are more than usual."""
+"""Additional factors that the standard error allows for, with more factors than usual."""
 
 
 def maximum_likelihood(
@@ -33,7 +33,7 @@ def maximum_likelihood(
     n_factors: int | IntArray | None = None,
     noise_spread: float = NOISE_SPREAD,
 ) -> SelfNoise:
-    """Self-noise PSD of every channel of three or more collocated sensors, from all of them.
+    """Self-noise PSD of every channel of three or more collocated sensors.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def maximum_likelihood(
     Factors that cannot be told from scatter, which no expansion corrects, are left out first
     (`estimator.likelihood.factor_selection`); the fits with and without then differ by something
     that is added to the standard error. No estimate whatever is unbiased where the averages cannot
-    find the motion: `docs/decisions/0033-small-samples.md`, with what is left.
+    find the motion: `docs/decisions/0010-small-samples.md`, with what is left.
     """
     check_dims(dims)
     given = coherency(csm, dims)
@@ -154,7 +154,7 @@ def maximum_likelihood(
 def _usual(
     matrix: ComplexArray, q: int, *, n_effective: float, correct: bool
 ) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
-    """Fit q factors or, corrected, as many of them as can be told from scatter.
+    """Fit q factors or, corrected, those that the averages resolve.
 
     Yields frequencies, their fit and the standard error of psi; to that where factors are left
     out, the difference this makes.
@@ -198,7 +198,7 @@ def _expecting(
 
 
 def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]:
-    """Put a channel of independent unit noise where one is dead or repeats an earlier one.
+    """Replace dead and copied channels by independent unit noise.
 
     Such a channel takes no part in the motion, and the likelihood of the others is what it would
     be without it.

@@ -1,13 +1,12 @@
-"""A weak expectation of the noise, for motion of more dimensions than a sensor has channels.
+"""A weak prior of the noise, for motion of more dimensions than a sensor has channels.
 
-With gradients of the motion among the factors, sensors that point the same way see three
-problems of N channels and three factors (the motion of one direction and its two gradients) that
-do not mix. For five sensors the information on their noise then has rank three: its mean is
-known, how it divides among them is not, and maximum likelihood arbitrarily runs to zero in one or
-other channel. So like channels (of one number in their sensors) are expected to have like noise,
-or noise in the ratios seen at the nearest frequencies that need no more dimensions than usual,
-within a factor ``exp(spread)``. Where the averages say more than that, the expectation is
-forgotten: a spread of 0.5 counts as much as four averages.
+With gradients of the motion among the factors, parallel sensors give three separate problems of N
+channels and three factors (the motion of one direction and its two gradients). For five sensors the
+information on their noise then has rank three: its mean is determined, its division among the
+sensors is not, and maximum likelihood arbitrarily goes to zero in one channel. So like channels (of
+one number in their sensors) are expected to have like noise, or noise in the ratios seen at the
+nearest frequencies that need no more dimensions than usual, within a factor ``exp(spread)``.
+Averages with more information outweigh the prior: a spread of 0.5 has the weight of four averages.
 """
 
 from __future__ import annotations

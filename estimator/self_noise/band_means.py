@@ -29,6 +29,8 @@ N_LAGS = 8
 NORMAL_95 = 1.959963984540054
 CERTAIN = 4.0
 """Standard deviations above zero from which a mean has a log-normal interval."""
+LEAKY = 0.4
+"""C.o.v. above which a mean scatters by motion that leaks in, and not like a PSD."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,8 @@ def band_means(
     *,
     weights: FloatArray | None = None,
     quantile: float = NORMAL_95,
+    deviation: FloatArray | None = None,
+    added: FloatArray | None = None,
 ) -> BandMeans:
     """Average a noise spectrum over bands of bins.
 
@@ -90,6 +94,10 @@ def band_means(
         Of the bins in the average: their widths, where these differ.
     quantile : float
         Standard deviations to either end of the interval: 95 % unless given.
+    deviation : float64, shape (n_freqs,), optional
+        Standard deviation where `cov` is NaN: of estimates of zero. NaN where nothing can be said.
+    added : float64, shape (n_freqs,), optional
+        What else may be in the estimate at most, and is no noise: lowers the lower end.
 
     Returns
     -------
@@ -99,6 +107,8 @@ def band_means(
     first, last = int(edges[0]), int(edges[-1])
     starts = edges[:-1] - first
     psd, sigma = noise_psd[first:last], (np.abs(noise_psd) * cov)[first:last]
+    if deviation is not None:
+        sigma = np.where(np.isnan(sigma), deviation[first:last], sigma)
     known = np.isfinite(psd) & np.isfinite(sigma)
     share = np.ones(psd.size) if weights is None else weights[first:last]
     share = np.where(known, share, 0.0)
@@ -118,7 +128,80 @@ def band_means(
         factor = np.exp(np.where(certain, quantile * spread / mean, 0.0))
         low = np.where(certain, mean / factor, mean - quantile * spread)
         high = np.where(certain, mean * factor, mean + quantile * spread)
+        if added is not None:
+            low -= np.add.reduceat(np.where(known, added[first:last], 0.0) * share, starts) / whole
     return BandMeans(mean, spread, low, high)
+
+
+def decision_interval(
+    means: BandMeans, quantile: float, averages: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return an interval that holds far into the tails, for decisions on many bands at once.
+
+    Parameters
+    ----------
+    means : BandMeans
+    quantile : float
+        Standard deviations to either end.
+    averages : float64, shape (n_bands,)
+        Independent averages behind each band.
+
+    Returns
+    -------
+    low, high : float64, shape (n_bands,)
+        The ends of `interval_of_cov` where the mean is positive; symmetric elsewhere.
+    """
+    mean, spread = means.mean, means.spread
+    with np.errstate(invalid="ignore", divide="ignore"):
+        low, high = interval_of_cov(np.abs(spread / mean), quantile, averages)
+        below, above = mean - quantile * spread, mean + quantile * spread
+    return np.where(mean > 0, mean * low, below), np.where(mean > 0, mean * high, above)
+
+
+def interval_of_cov(
+    cov: FloatArray, quantile: float, averages: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the interval of a positive mean, as multiples of the mean.
+
+    Parameters
+    ----------
+    cov : float64, shape (n,)
+        Of the mean.
+    quantile : float
+        Standard deviations to either end, z.
+    averages : float64, shape (n,)
+        Independent averages behind each mean.
+
+    Returns
+    -------
+    low, high : float64, shape (n,)
+        The lower end is log-normal for a small c.o.v. and symmetric for a large one, with the
+        quantile of Student's t for n averages, ``z + (z**3 + z) / (4 n)``: the c.o.v. is itself
+        estimated. The upper end is at least that of a chi-square with the same c.o.v. c,
+        ``1 / (1 - c**2 / 9 - z c / 3)**3`` (Wilson and Hilferty): a mean of few averages is below
+        the truth more often than a log-normal one.
+    """
+    student = quantile + (quantile**3 + quantile) / (4 * np.maximum(averages, 1.0))
+    like_psd = np.minimum(cov, LEAKY)
+    root = 1 - like_psd**2 / 9 - quantile * like_psd / 3
+    with np.errstate(invalid="ignore", divide="ignore"):
+        chi_square = np.where(root > 0, 1 / root**3, np.inf)
+        low = np.where(cov * CERTAIN < 1, np.exp(-student * cov), 1 - student * cov)
+        return low, np.maximum(chi_square, 1 + quantile * cov)
+
+
+def median_of_columns(values: FloatArray) -> FloatArray:
+    """Return the median of the numbers of each column, along the first axis; NaN where none is.
+
+    As ``np.nanmedian`` does, which goes column by column.
+    """
+    if not len(values):
+        return np.full(values.shape[1:], np.nan)
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.sum(~np.isnan(ordered), axis=0)
+    middle = (np.maximum(count - 1, 0) // 2, count // 2)
+    low, high = (np.take_along_axis(ordered, np.asarray(at)[None], axis=0)[0] for at in middle)
+    return np.asarray((low + high) / 2)
 
 
 def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.int64]:

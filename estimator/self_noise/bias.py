@@ -1,7 +1,7 @@
-"""What misalignment and spatial incoherence do to the estimates: the theory of the paper.
+"""Bias of the estimates by misalignment and spatial incoherence: the theory of the paper.
 
 Everything follows from the motion's part of the cross-spectral matrix, ``c[p, q]``: the cross-PSD
-of what channels p and q have of the motion. `motion_csm` makes it from the channels' directions
+of the motion in channels p and q. `motion_csm` makes it from the channels' directions
 and the motion; `incoherent_motion` from one motion felt less than perfectly alike.
 
 References
@@ -150,8 +150,9 @@ def three_sensor_bias(
     Returns
     -------
     float64, shape (..., p)
-        Diagonal of Eq. (30), real part (the mean with j and k swapped), and mean over all pairs
-        of other sensors.
+        Diagonal of Eq. (30), real part (the mean with j and k swapped), and plain mean over all
+        pairs of other sensors. `estimator.self_noise.three_sensor` weighs pairs that scatter
+        more, as incoherent ones do, less.
 
     Raises
     ------

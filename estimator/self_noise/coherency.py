@@ -57,7 +57,7 @@ class Coherency:
         copies = self.duplicates & np.tri(p, k=-1, dtype=np.bool_)
         return np.asarray(((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2))
 
-    def block(self, some: slice) -> Coherency:
+    def block(self, some: slice | IntArray) -> Coherency:
         """Return the same for some frequencies only."""
         return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])
 

@@ -1,7 +1,6 @@
-"""Which channels and sensors take part in a test: not those that are dead or copies of others.
+"""Channels and sensors that take part in a test: not dead ones, and not copies of others.
 
-Their absence is the bench's fault, not the motion's: what is left is judged as if they had never
-been there.
+The other channels are estimated as if those did not exist.
 """
 
 from __future__ import annotations

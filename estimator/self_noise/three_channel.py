@@ -48,7 +48,8 @@ def three_channel(
 
     Notes
     -----
-    The real part of Eq. (6) of Zhu, Au and Wang; the mean over all pairs of other channels.
+    The real part of Eq. (6) of Zhu, Au and Wang; the plain mean over all pairs of other
+    channels, also where some sensors are poor, as the method is published.
     Biased when the channels do not point the same way: see `estimator.self_noise.bias`.
     """
     check_dims(dims)
@@ -65,7 +66,11 @@ def three_channel(
     flags = given.flags | Flag.NO_COUNTERPART
     for part in compared:
         result = estimate(
-            given.part(part), dims=(1,) * len(part), n_effective=n_effective, correct=correct
+            given.part(part),
+            dims=(1,) * len(part),
+            n_effective=n_effective,
+            correct=correct,
+            weighted=False,
         )
         values[:, :, part] = result.noise_psd, result.cov, result.low, result.high
         flags[:, part] = result.flags

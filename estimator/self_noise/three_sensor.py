@@ -1,4 +1,4 @@
-"""The three-sensor method: self-noise whatever way the sensors point.
+"""The three-sensor method: self-noise of sensors in any orientation.
 
 For a target sensor i and two others j, k the noise of channel r of sensor i is, by (25) and (26),
 the real part of ``E[u conj(v)]`` of two residuals,
@@ -8,16 +8,17 @@ the real part of ``E[u conj(v)]`` of two residuals,
 
 what is left of the channel when the motion is taken off by sensor j, and by sensor k. The same two
 rows, ``u = a X`` and ``v = b X``, are its differential: ``M = (b^H a + a^H b) / 2``.
-With more than three sensors the estimate is the mean over all pairs (j, k), and so is M.
+With more than three sensors the estimate is a weighted mean over all pairs (j, k), and so is M:
+pairs of poor sensors weigh less (`estimator.self_noise.pair_weights`).
 
 Only j and k need as many channels as the motion has dimensions; the target may have fewer.
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ from estimator.self_noise.coherency import (
     from_parts,
     inverse,
 )
+from estimator.self_noise.pair_weights import PairWeights, log_variance, predictors
 from estimator.self_noise.result import Flag
 from estimator.self_noise.uncertainty import moments, score_interval
 from estimator.spectra.welch import THREADS
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 
 
 FREQUENCIES = 128  # worked on at a time: what the processor's cache holds
+ELEMENTS = 150_000  # of predictors, where more than one pair of sensors is weighted
 
 
 def three_sensor(
@@ -75,7 +78,8 @@ def three_sensor(
 
     Notes
     -----
-    Eq. (26) of [1]_, averaged over all pairs of other sensors.
+    Eq. (26) of [1]_; the mean over all pairs of other sensors, weighted by the inverse of their
+    variance at neighbouring frequencies. With fewer than eight neighbours pairs weigh the same.
 
     References
     ----------
@@ -83,24 +87,68 @@ def three_sensor(
        orientations".
     """
     check_dims(dims)
-    return estimate(coherency(csm, dims), dims=dims, n_effective=n_effective, correct=correct)
+    given = coherency(csm, dims)
+    return estimate(given, dims=dims, n_effective=n_effective, correct=correct, weighted=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """Channels whose motion is inferred from sensors of d channels.
+
+    Attributes
+    ----------
+    d : int
+    rows : int64, shape (n_rows,)
+        Channels to estimate.
+    target : int64, shape (n_rows,)
+        Sensor of each row.
+    columns : int64, shape (m, d)
+        Channels of the sensors they are compared with.
+    others : bool, shape (n_rows, m)
+        Whether that is another sensor.
+    """
+
+    d: int
+    rows: IntArray
+    target: IntArray
+    columns: IntArray
+    others: BoolArray
+
+    @property
+    def several_pairs(self) -> bool:
+        """Whether any channel can be compared with more than one pair."""
+        return bool(self.others.sum(axis=1).max() > 2)
 
 
 def estimate(
-    given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool
+    given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool, weighted: bool
 ) -> SelfNoise:
-    """Do what `three_sensor` does, from a matrix that has been checked and normalised."""
-    blocks = [
-        given.block(slice(low, low + FREQUENCIES)) for low in range(0, len(given.psd), FREQUENCIES)
-    ]
-    of_block = functools.partial(_estimate, dims=dims, n_effective=n_effective, correct=correct)
+    """Do what `three_sensor` does, from a matrix that has been checked and normalised.
+
+    Without `weighted` all pairs of other sensors weigh the same.
+    """
+    groups = _groups(dims)
+    for group in groups:
+        check_averages(n_effective, group.d)
+    weights = [_weights(given, group) if weighted else None for group in groups]
+    size = min(_at_a_time(group) for group in groups)
+    blocks = range(0, len(given.psd), size)
+
+    def of_block(low: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+        block = given.block(slice(low, low + size))
+        parts = [
+            _mean_of_pairs(block, group, weight, low)
+            for group, weight in zip(groups, weights, strict=True)
+        ]
+        return _estimate(block, dims, groups, parts, n_effective=n_effective, correct=correct)
+
     if len(blocks) == 1:
-        found = [of_block(given)]
+        found = [of_block(0)]
     else:  # each thread its share at once: one by one they would wait for one another
-        size = -(-len(blocks) // THREADS)
-        shares = [blocks[first : first + size] for first in range(0, len(blocks), size)]
+        share = -(-len(blocks) // THREADS)
+        shares = [blocks[first : first + share] for first in range(0, len(blocks), share)]
         with ThreadPoolExecutor(THREADS) as pool:
-            of_shares = pool.map(lambda share: [of_block(block) for block in share], shares)
+            of_shares = pool.map(lambda part: [of_block(low) for low in part], shares)
             found = list(itertools.chain.from_iterable(of_shares))
     noise, deviation, low, high, flags = (
         np.concatenate(parts) for parts in zip(*found, strict=True)
@@ -108,37 +156,68 @@ def estimate(
     return from_parts("three-sensor", given, (noise, deviation, low, high), flags)
 
 
-def _estimate(
-    given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
-    """Noise, its deviation and interval, all in parts of the channel's PSD; flags."""
-    noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
-    flags = given.flags.copy()
+def _groups(dims: tuple[int, ...]) -> list[_Group]:
     first = np.cumsum([0, *dims])
     shared = [_shared(dims, i) for i in range(len(dims))]
+    groups = []
     for d in sorted(set(shared)):
-        check_averages(n_effective, d)
         targets = [i for i, n in enumerate(shared) if n == d]
         others = [j for j, n in enumerate(dims) if n >= d]
         rows = np.concatenate([first[i] + np.arange(min(d, dims[i])) for i in targets])
         target = np.repeat(targets, [min(d, dims[i]) for i in targets])
-        for i in targets:
-            flags[:, first[i] + d : first[i + 1]] |= Flag.NO_COUNTERPART
         columns = np.add.outer(first[others], np.arange(d))
-        part, traces, n_pairs = _mean_of_pairs(
-            given, rows, columns, target=target, others=np.not_equal.outer(target, others)
-        )
+        groups.append(_Group(d, rows, target, columns, np.not_equal.outer(target, others)))
+    return groups
+
+
+def _weights(given: Coherency, group: _Group) -> PairWeights | None:
+    """Return the weights of pairs; None where no channel has more than one pair."""
+    if not group.several_pairs:
+        return None
+
+    def variances(some: IntArray) -> FloatArray:
+        of = _spectra(given.block(some), group)
+        predictor = predictors(of.towards, of.inverses, len(group.columns))
+        return log_variance(predictor, of.between, of.towards, of.power, of.pairs)
+
+    return PairWeights(len(given.psd), variances, chunk=_at_a_time(group))
+
+
+def _at_a_time(group: _Group) -> int:
+    """Return how many frequencies are worked on at a time."""
+    if not group.several_pairs:
+        return FREQUENCIES
+    m, d = group.columns.shape
+    return int(np.clip(ELEMENTS // (len(group.rows) * m * m * d), 1, FREQUENCIES))
+
+
+def _estimate(
+    given: Coherency,
+    dims: tuple[int, ...],
+    groups: list[_Group],
+    parts: list[tuple[FloatArray, FloatArray, BoolArray]],
+    *,
+    n_effective: float,
+    correct: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Noise, its deviation and interval, all in parts of the channel's PSD; flags."""
+    noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
+    flags = given.flags.copy()
+    covered = np.zeros(sum(dims), dtype=np.bool_)
+    for group, (part, traces, possible) in zip(groups, parts, strict=True):
+        d, rows = group.d, group.rows
+        covered[rows] = True
         unknown = np.zeros(flags.shape, dtype=np.bool_)
-        unknown[:, rows] = n_pairs == 0
+        unknown[:, rows] = ~possible
         flags[unknown] |= Flag.SINGULAR
         gain, averages = (
             (1 / (1 - d / n_effective), n_effective - d) if correct else (1, n_effective)
         )
-        part *= gain
-        traces *= gain ** np.arange(2, 5)[:, None, None]
-        noise[:, rows] = part
-        deviation[:, rows] = np.sqrt(np.maximum(traces[0], 0) / averages)
-        low[:, rows], high[:, rows] = score_interval(part, traces, averages=averages)
+        noise[:, rows] = part * gain
+        scaled = traces * gain ** np.arange(2, 5)[:, None, None]
+        deviation[:, rows] = np.sqrt(np.maximum(scaled[0], 0) / averages)
+        low[:, rows], high[:, rows] = score_interval(part * gain, scaled, averages=averages)
+    flags[:, ~covered] |= Flag.NO_COUNTERPART
     return noise, deviation, low, high, flags
 
 
@@ -147,55 +226,102 @@ def _shared(dims: tuple[int, ...], i: int) -> int:
     return sorted((n for j, n in enumerate(dims) if j != i), reverse=True)[1]
 
 
+@dataclass(frozen=True, slots=True)
+class _Spectra:
+    """What the estimates of a group's channels are made of.
+
+    Attributes
+    ----------
+    power : float64, shape (n_freqs, n_rows)
+        PSD of every row.
+    between : complex128, shape (n_freqs, m * d, m * d)
+        Cross-spectra among the sensors that rows are compared with.
+    towards : complex128, shape (n_freqs, n_rows, m * d)
+        Cross-spectra of the rows with these.
+    inverses : complex128, shape (n_freqs, m * d, m * d)
+        ``inv(S_jk)`` in the rows of k and the columns of j; zero for pairs that cannot be used.
+    paired : float64, shape (n_freqs, m, m)
+        One where a pair can be used.
+    usable : bool, shape (n_freqs or 1, n_rows, m)
+        Whether a sensor can be used for a row.
+    """
+
+    power: FloatArray
+    between: ComplexArray
+    towards: ComplexArray
+    inverses: ComplexArray
+    paired: FloatArray
+    usable: BoolArray
+
+    @property
+    def pairs(self) -> BoolArray:
+        """Pairs j < k that can be used for a row, shape (n_freqs, n_rows, n_pairs)."""
+        j, k = np.triu_indices(self.paired.shape[1], 1)
+        both = self.usable[:, :, j] & self.usable[:, :, k]
+        return np.asarray(both & (self.paired[:, None, j, k] > 0))
+
+
+def _spectra(given: Coherency, group: _Group) -> _Spectra:
+    S, (m, d), columns, rows = given.matrix, group.columns.shape, group.columns.ravel(), group.rows
+    between, towards = (  # as fancy indices leave them, frequencies would run fastest
+        np.ascontiguousarray(S[:, channels[:, None], columns]) for channels in (columns, rows)
+    )
+    inverses, paired = _inverses(given, between, columns, m)
+    usable = group.others[None]
+    if given.duplicates.any():  # a copy of one of the target's channels spoils that sensor for it
+        copies = given.duplicates[:, rows[:, None], columns].reshape(len(S), len(rows), m, d)
+        usable = usable & ~((group.target[:, None] == group.target) @ copies.any(axis=3))
+    power = np.einsum("fpp->fp", S).real[:, rows]
+    return _Spectra(power, between, towards, inverses, paired, usable)
+
+
 def _mean_of_pairs(
-    given: Coherency, rows: IntArray, columns: IntArray, *, target: IntArray, others: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean of (26) over all pairs of other sensors, the moments of that mean, and how many pairs.
+    given: Coherency, group: _Group, weights: PairWeights | None, first: int
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Mean of (26) over all pairs of other sensors, the moments of that mean, and where it is one.
 
     Parameters
     ----------
     given : Coherency
-    rows : int64, shape (n_rows,)
-        Channels to estimate.
-    columns : int64, shape (m, d)
-        Channels of the sensors they are compared with.
-    target : int64, shape (n_rows,)
-        Sensor of each row.
-    others : bool, shape (n_rows, m)
-        Whether that is another sensor.
+    group : _Group
+    weights : PairWeights, optional
+        All pairs weigh the same without.
+    first : int
+        Number of the first frequency of `given` in the matrix that `weights` are of.
 
     Returns
     -------
     noise : float64, shape (n_freqs, n_rows)
     traces : float64, shape (3, n_freqs, n_rows)
         `estimator.self_noise.uncertainty.moments` of the noise.
-    n_pairs : float64, shape (n_freqs, n_rows)
-        Pairs, counted both ways, that can be used; zero where nothing can be said.
+    possible : bool, shape (n_freqs, n_rows)
+        False where no pair can be used, and nothing can be said.
     """
-    S, (m, d), columns = given.matrix, columns.shape, columns.ravel()
-    between, towards = (  # as fancy indices leave them, frequencies would run fastest
-        np.ascontiguousarray(S[:, channels[:, None], columns]) for channels in (columns, rows)
-    )
-    inverses, pairs = _inverses(given, between, columns, m)
-    usable = others[None]
-    if given.duplicates.any():  # a copy of one of the target's channels spoils that sensor for it
-        copies = given.duplicates[:, rows[:, None], columns].reshape(len(S), len(rows), m, d)
-        usable = usable & ~((target[:, None] == target) @ copies.any(axis=3))
-    partners = usable * (usable @ pairs)  # (n_freqs, n_rows, m)
-    n_pairs = partners.sum(axis=2)
-    weight = 1 / np.maximum(n_pairs, 1)
-    # The mean of P = S_ik inv(S_jk) over k, at the columns of j.
-    motion = (towards * np.repeat(usable, d, axis=2)) @ inverses
-    motion *= np.repeat(usable / np.maximum(partners, 1), d, axis=2)
-    own = np.einsum("frkc->frk", (motion * towards.conj()).reshape(len(S), len(rows), m, d))
-    power = np.einsum("fpp->fp", S).real[:, rows]
-    noise = power - weight * np.einsum("frj,frj->fr", partners, own.real)
+    of = _spectra(given, group)
+    (m, d), (n_freqs, n_rows) = group.columns.shape, of.power.shape
+    omega = weights.at(first, of.pairs) if weights is not None else None
+    # P = S_ik inv(S_jk), its mean over k, at the columns of j.
+    if omega is None:
+        partners = of.usable * (of.usable @ of.paired)  # (n_freqs, n_rows, m)
+        weight = 1 / np.maximum(partners.sum(axis=2), 1)
+        share = weight[:, :, None] * partners
+        motion = (of.towards * np.repeat(of.usable, d, axis=2)) @ of.inverses
+        motion *= np.repeat(of.usable / np.maximum(partners, 1), d, axis=2)
+        omega = (of.usable * weight[:, :, None])[:, :, :, None] * of.paired[:, None]
+        omega *= of.usable[:, :, None, :]
+    else:
+        share = omega.sum(axis=2)
+        part = omega / np.where(share > 0, share, 1.0)[:, :, None]
+        motion = np.einsum(
+            "frkj,fkrjc->frjc", part, predictors(of.towards, of.inverses, m)
+        ).reshape(of.towards.shape)
+    own = np.einsum("frkc->frk", (motion * of.towards.conj()).reshape(n_freqs, n_rows, m, d))
+    noise = of.power - np.einsum("frj,frj->fr", share, own.real)
     # One residual a sensor: those of sensor j paired with different k differ by their sampling
     # error only, and their mean is taken. M = W^H omega W, with W the rows of these residuals and
     # omega half of each pair's weight; so tr((M S)^k) = tr((omega G)^k), G = W S W^H.
-    omega = (usable * weight[:, :, None])[:, :, :, None] * pairs[:, None]
-    omega *= usable[:, :, None, :]
-    return noise, moments(_residuals(between, motion, own, power), omega), n_pairs
+    traces = moments(_residuals(of.between, motion, own, of.power), omega)
+    return noise, traces, np.asarray(share.any(axis=2))
 
 
 def _inverses(
@@ -207,7 +333,7 @@ def _inverses(
     -------
     inverses : complex128, shape (n_freqs, m * d, m * d)
         ``inv(S_jk)`` in the rows of k and the columns of j.
-    pairs : float64, shape (n_freqs, m, m)
+    paired : float64, shape (n_freqs, m, m)
         One where a pair can be used.
     """
     n_freqs, d = len(between), len(columns) // m
@@ -226,9 +352,9 @@ def _inverses(
     inverses = np.zeros((n_freqs, m, d, m, d), dtype=np.complex128)
     inverses[:, k, :, j] = inverted
     inverses[:, j, :, k] = inverted.conj().swapaxes(2, 3)
-    pairs = np.zeros((n_freqs, m, m))
-    pairs[:, j, k] = pairs[:, k, j] = regular.T
-    return inverses.reshape(between.shape), pairs
+    paired = np.zeros((n_freqs, m, m))
+    paired[:, j, k] = paired[:, k, j] = regular.T
+    return inverses.reshape(between.shape), paired
 
 
 def _residuals(

@@ -24,7 +24,7 @@ def two_channel(
     correct: bool = True,  # noqa: ARG001 - linear in the matrix: there is no bias to remove
     response: ComplexArray | None = None,
 ) -> SelfNoise:
-    """Self-noise PSD from two or more channels that point the same way and whose gains are known.
+    """Self-noise PSD from two or more parallel channels with known gains.
 
     Channel r of a sensor is compared with channels r of all other sensors, and nothing else.
 

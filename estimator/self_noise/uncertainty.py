@@ -1,4 +1,4 @@
-"""How sure a self-noise estimate is.
+"""Uncertainty of a self-noise estimate.
 
 An estimate that scales with the cross-spectral matrix S is, to first order, a linear function
 ``tr(M S)`` of it, with a Hermitian differential M. For a complex Wishart matrix of n averages its
@@ -7,8 +7,8 @@ cumulants are those of ``tr(M S)`` with M fixed: variance ``t2 / n`` and third c
 
 An interval needs the variance at *other* values of the noise than the one found. Along the least
 favourable direction, ``S + delta S M S / t2``, in which the noise changes by delta and the data can
-tell least, it is ``(t2 + 2 (t3 / t2) delta + (t4 / t2**2) delta**2) / n``: the square of the noise
-for a mere PSD, and constant where leaking motion swamps it.
+tell least, the variance is ``(t2 + 2 (t3 / t2) delta + (t4 / t2**2) delta**2) / n``: the square of
+the noise for a PSD, and constant where leaking motion dominates.
 """
 
 from __future__ import annotations

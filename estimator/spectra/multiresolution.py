@@ -4,11 +4,10 @@ The samples pass down a ladder of stages, each at half the sampling rate of the 
 stages cut segments of the same number of samples, so that each is twice as long in time, and has
 half as many averages, as the one above. Of its spectrum a stage contributes the octave from 0.2 to
 0.4 of its rate; the top stage goes up to half, the bottom one down to 0. The filter between stages
-lets nothing through that would fold into what is used; what it does to the octave itself is divided
-out.
+prevents aliasing into the octave that is used; its response in that octave is divided out.
 
-Segments that something disturbed are judged stage by stage, each by those before it of its own
-length: a knock that costs the highest octave a second may be nothing to the lowest.
+Disturbed segments are excluded stage by stage, each compared with earlier segments of its length: a
+knock may disturb the highest octave and not the lowest.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class Band:
 
 
 class MultiResolution:
-    """Cross-spectra of samples that come in order, octave by octave.
+    """Cross-spectra of consecutive samples, octave by octave.
 
     Parameters
     ----------
@@ -95,7 +94,7 @@ class MultiResolution:
         ]
 
     def add(self, samples: FloatArray, complete: BoolArray | None = None) -> None:
-        """Take the next samples.
+        """Add the next samples.
 
         Parameters
         ----------

@@ -1,17 +1,19 @@
-"""Spectra from those segments that nothing has disturbed.
+"""Spectra from undisturbed segments.
 
-A segment is left out when samples of it are missing, when it is clipped, or when the power of any
-channel in any octave lies far from what it was in the segments accepted before, or its largest step
-from one sample to the next does (a spike that the window all but hides still stands far above noise
-that is far below the motion), or when a channel stands still in part of it for far longer than it
-used to: one that was dead for a moment lacks too little power to show by that, while one whose
-noise is below a count, or that has always been dead, stands still all the time.
-The decision on a segment looks at earlier ones only, so that it is the same while the recording
-grows and afterwards.
+A segment is excluded if
 
-The first segments have none before them: a start-up set is held back and judged by its own median.
-Should the level change for good, so that a whole start-up set in a row is left out, judging starts
-afresh with the segments that follow.
+- samples are missing, or it is clipped;
+- the power of a channel in an octave differs much from that of the segments accepted before;
+- its largest step between samples does (a spike that the window attenuates can still exceed noise
+  that is far below the motion);
+- a channel is constant in part of it for much longer than before (a channel that is briefly dead
+  loses little power).
+
+The decision on a segment uses earlier segments only, so it is the same live and offline.
+
+The first segments have no predecessors: a start-up set is held back and compared with its own
+median. If a whole start-up set in a row is excluded, the level has changed, and a new start-up set
+begins.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ class Reason(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RejectionSettings:
-    """When to leave a segment out.
+    """When to exclude a segment.
 
     Attributes
     ----------

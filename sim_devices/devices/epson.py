@@ -1,18 +1,18 @@
 """A simulated Epson M-A352 or M-A370: registers in, bursts out.
 
-What the real device does and this one too: two register windows (with the trap that ``80 xx 0D`` is
-a burst request in one and a register write in the other), the modes and their state bits, rates,
+Simulated functions: two register windows (with the trap that ``80 xx 0D`` is a burst request in
+one and a register write in the other), the modes and their state bits, rates,
 filters, burst fields, tilt, UART_AUTO and bursts on request, no answers to reads while streaming,
 software reset, flash backup, factory defaults, AUTO_START, busy and not-ready bits that last, COUNT
 wrapping, each burst sent when its last bit would have left the UART, sampling by an external
 trigger, and, on an M-A370, in step with 1PPS. An M-A370 has neither reduced noise nor temperature
-stabilisation, and lacks three filters: it ignores their bits and codes, which is assumed.
+stabilisation, and lacks three filters: it ignores their bits and codes (assumed).
 
-Connected to the EXT pin is what the bench file's ``external`` says: a generator of triggers at the
-sampling rate that is never off, or the seconds of UTC. With neither, a device that is told to wait
-for triggers takes no sample, and one that is told to follow the seconds samples by its own clock.
+The setting ``external`` defines the EXT pin: a trigger generator at the sampling rate, or the
+seconds of UTC. Without it, a device that waits for triggers takes no sample, and one that follows
+the seconds samples by its own clock.
 
-What it does not do: the filters' attenuation and delay, and sleep, which nothing but a reset ends.
+Not simulated: attenuation and delay of the filters, and sleep, which only a reset ends.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FULL_SCALE = 15 * commands.COUNTS_PER_G
 RESET_TIME, FLASH_TIME, FILTER_TIME, TEST_TIME = 0.97, 0.31, 0.005, 0.2
 """How long the device is not ready or busy, s."""
 TRIGGER, PPS = 0x40, 0x80
-"""Bits of MSC_CTRL: samples are taken when a trigger comes, or in step with 1PPS (M-A370)."""
+"""Bits of MSC_CTRL: samples at triggers, or in step with 1PPS (M-A370)."""
 _NOT_ON_A370 = {commands.FILTERS[name] for name in commands.NOT_ON_A370}
 AHEAD = 1.0
 """How much is simulated at a time, s of world time."""

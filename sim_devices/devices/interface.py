@@ -1,10 +1,10 @@
-"""The seam between a simulated device and the wire it is served on.
+"""Interface between a simulated device and the line it is served on.
 
-A family module (``sim_devices/<family>.py``) offers ``create(spec, source) -> list[Line]``: the
-device's wire ends, all sans-IO and speaking world time in seconds. :mod:`sim_devices.server.serve`
-puts each on a pseudo-terminal or a port, calls it when bytes come and when time passes, and writes
-what it returns. Bytes are returned in units as the device sends them (a frame, a packet, a
-datagram), so that a fault can strike exactly one.
+A family module (``sim_devices/devices/<family>.py``) has ``create(spec, source) -> list[Line]``. An
+endpoint is sans-IO and uses world time in seconds. :mod:`sim_devices.server.serve` puts each on a
+pseudo-terminal or a port, calls it for received bytes and at due times, and writes what it returns.
+Bytes are returned in units of the device (a frame, a packet, a datagram), so that a fault can
+strike exactly one.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ NEVER = math.inf
 
 
 class Endpoint(Protocol):
-    """One end of a wire: bytes in, bytes out; ``now`` is world time in seconds."""
+    """One end of a line: bytes in, bytes out; ``now`` is world time in seconds."""
 
     def connected(self, now: float) -> Sequence[bytes]:
         """Somebody opened the line."""
         ...
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer what came."""
+        """Return the answer to received bytes."""
         ...
 
     def due(self, now: float) -> Sequence[bytes]:
@@ -62,7 +62,7 @@ class Faulty(Protocol):
     """An endpoint whose device can suffer faults of its own."""
 
     def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
-        """Suffer "reset" or "overflow"; return what it sends of it at once."""
+        """Perform the fault "reset" or "overflow"; return the bytes that it sends immediately."""
         ...
 
 
@@ -166,7 +166,7 @@ class Source:
         return self._world.sample_times(sensor, first_sample, n)
 
     def is_silent(self, sensor: str, now: float) -> bool:
-        """Whether the fault script has this one of several on a line off at world time ``now``."""
+        """Whether a fault switches this unit of a shared line off at world time ``now``."""
         return self._faults is not None and self._faults.is_silent(sensor, now)
 
     def first_sample_after(self, sensor: str, now: float) -> int:

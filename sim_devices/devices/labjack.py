@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -89,12 +90,18 @@ class LabJack:
         self._ends_with = device.settings.get("ends_with")
         self._ends_after = int(device.settings.get("ends_after", 0))
         self._memory: dict[int, int] = {}
-        self._flash = reg.encode_calibrations(reg.nominal_calibrations())
+        self._is_t8 = "T8" in device.model.upper()
+        self._flash_begins = reg.T8_CALIBRATION_ADDRESS if self._is_t8 else reg.CALIBRATION_ADDRESS
+        self._flash = (
+            reg.encode_t8_calibrations(_t8_calibrations())
+            if self._is_t8
+            else reg.encode_calibrations(reg.nominal_calibrations())
+        )
         serial = device.serial_number or str(
             470_000_000 + zlib.crc32(device.sensors[0].encode()) % 10**6
         )
         self._store(reg.SERIAL_NUMBER, struct.pack(">I", int(serial)))
-        product = 8.0 if "T8" in device.model.upper() else 7.0
+        product = 8.0 if self._is_t8 else 7.0
         for address, value in {
             reg.PRODUCT_ID: product,
             reg.FIRMWARE_VERSION: 1.0292,
@@ -105,6 +112,9 @@ class LabJack:
         for address, value in _WORDS.items():
             self._store(address, struct.pack(">I", value))
         self._store(reg.LAST_ERROR_DETAIL, bytes(2))
+        self._rate_now = reg.actual_t8_scan_rate if self._is_t8 else reg.actual_scan_rate
+        if self._is_t8:
+            self._store(reg.STREAM_SCANRATE_HZ_ACTUAL, bytes(4))
         for k in range(128):
             self._store(reg.STREAM_SCANLIST + 2 * k, bytes(4))
         for n in range(14):
@@ -172,7 +182,7 @@ class LabJack:
         if address == reg.STREAM_DATA_CR:
             return self._read_stream(n_registers, now)
         if address == reg.FLASH_READ:
-            start = self._value(reg.FLASH_READ_POINTER) - reg.CALIBRATION_ADDRESS
+            start = self._value(reg.FLASH_READ_POINTER) - self._flash_begins
             values = self._flash[max(0, start) : max(0, start) + 2 * n_registers]
             return values.ljust(2 * n_registers, b"\xff")
         if address < 28:
@@ -194,7 +204,9 @@ class LabJack:
         if address in self._inputs:
             row = samples.counts(samples.first_after(now), 1) + CENTER
             counts = int(whole(row, 0, 65535)[0, self._inputs[address]])
-        calibration = reg.decode_calibrations(self._flash)[0]
+        calibration = (
+            reg.nominal_t8_calibrations() if self._is_t8 else reg.decode_calibrations(self._flash)
+        )[0]
         return struct.pack(">f", float(calibration.volts(counts)))
 
     def _write(self, address: int, values: bytes, now: float) -> None:
@@ -210,7 +222,8 @@ class LabJack:
             wanted = self._real(address)
             if not 0.01 <= wanted <= MAX_SAMPLE_RATE:
                 raise RefusedError(3, 2608)
-            self._store(address, struct.pack(">f", reg.actual_scan_rate(wanted)))
+            if not self._is_t8:
+                self._store(address, struct.pack(">f", reg.actual_scan_rate(wanted)))
 
     # --- stream ------------------------------------------------------------------------------
 
@@ -234,7 +247,7 @@ class LabJack:
         if not 1 <= n_columns <= 128 or self.stream is not None:
             raise RefusedError(4, 2605)
         addresses = [self._value(reg.STREAM_SCANLIST + 2 * k) for k in range(n_columns)]
-        rate = reg.actual_scan_rate(self._real(reg.STREAM_SCANRATE_HZ))
+        rate = self._rate_now(self._real(reg.STREAM_SCANRATE_HZ))
         overlap = rate * n_columns > MAX_SAMPLE_RATE
         as_is = overlap or rate == self._source.sampling_rate
         source = self._source if as_is else self._source.at_rate(rate)
@@ -262,6 +275,8 @@ class LabJack:
         self.stream = None if self._value(reg.STREAM_TRIGGER_INDEX) else stream
         self.stream_started += 1
         self._store(reg.STREAM_ENABLE, struct.pack(">I", 1))
+        if self._is_t8:
+            self._store(reg.STREAM_SCANRATE_HZ_ACTUAL, struct.pack(">f", rate))
         started = int(columns.timer(np.array([stream.first]))[0])
         self._store(reg.STREAM_START_TIME_STAMP, started.to_bytes(4, "big"))
 
@@ -393,6 +408,16 @@ class StreamPort:
         if stream is None or not self._labjack.targets & reg.TARGET_ETHERNET:
             return self._looked + self.LOOK_INTERVAL
         return max(self._looked, stream.next_full())
+
+
+def _t8_calibrations() -> list[reg.Calibration]:
+    """Return the calibrations of a T8 whose inputs are each off by a little."""
+    nominal = reg.nominal_t8_calibrations()
+    per_input = len(reg.T8_RANGES)
+    return [
+        replace(one, positive_slope=one.positive_slope * (1 + 1e-4 * (k // per_input)))
+        for k, one in enumerate(nominal)
+    ]
 
 
 def create(device: DeviceSpec, source: Source) -> list[Line]:

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING
 from daq.protocols.text.format import (
     LILY,
     RASPBERRY_SHAKE,
+    SINCE_START,
     TextFormat,
     encode_fields,
+    encode_row,
     encode_time,
 )
 from sim_devices.devices.interface import NEVER, Line
@@ -42,7 +44,7 @@ def format_of(device: DeviceSpec) -> TextFormat:
     format_ = replace(PRESETS[settings.get("preset", "none")], **given)
     (sensor,) = device.sensors
     names = tuple(c.name for c in device.channels[sensor] if not c.auxiliary)
-    if format_.layout == "channel":
+    if format_.layout != "row":
         return replace(format_, channel_names=tuple(settings.get("channel_names") or names))
     return format_ if format_.columns else replace(format_, columns=tuple(range(len(names))))
 
@@ -109,12 +111,18 @@ class TextDevice:
         return self._samples.time(self._next + self._n_rows - 1) if self._sends else NEVER
 
     def _time(self, index: int) -> str:
-        utc_ns = self._utc_ns + round(self._samples.time(index) * _NS)
-        return encode_time(utc_ns, self._format)
+        since_start = self._format.time_format in SINCE_START
+        start_ns = 0 if since_start else self._utc_ns
+        return encode_time(start_ns + round(self._samples.time(index) * _NS), self._format)
 
     def _written(self, values: Sequence[float]) -> list[str]:
+        if self._format.hexadecimal_bits is not None:
+            n_bits = self._format.hexadecimal_bits
+            return [f"{int(v) % (1 << n_bits):0{n_bits // 4}X}" for v in values]
         if self._format.whole:
             return [str(int(value)) for value in values]
+        if self._format.decimal_comma:
+            return [f"{value:.9g}".replace(".", ",") for value in values]
         return [f"{value:.9g}" for value in values]
 
     def _packets(self) -> list[bytes]:
@@ -134,7 +142,9 @@ class TextDevice:
         counts = self._samples.counts(self._next, 1)
         if format_.whole:
             counts = whole(counts, -(1 << 31), (1 << 31) - 1).astype(float)
-        filled = dict(zip(format_.columns, self._written(counts[0].tolist()), strict=True))
+        filled: dict[int | str, str] = dict(
+            zip(format_.channel_keys, self._written(counts[0].tolist()), strict=True)
+        )
         if format_.tag:
             filled[0] = format_.tag
         if format_.time_column is not None:
@@ -143,8 +153,8 @@ class TextDevice:
             filled[format_.counter_column] = str(
                 (self._next - self._counted_from) % format_.counter_modulus
             )
-        fields_ = [filled.get(i, "0") for i in range(max(filled) + 1)]
-        return encode_fields([*fields_, *self._tail], format_)
+        filled |= dict(enumerate(self._tail, 1 + max(format_.columns, default=0)))
+        return encode_row(filled, format_)
 
 
 def create(device: DeviceSpec, source: Source) -> list[Line]:

@@ -118,7 +118,8 @@ class ForkServer:
             code = 0
             try:
                 clock = PacedClock(spec["clock"])
-                with asyncio.Runner(loop_factory=partial(PacedLoop, clock)) as runner:
+                factory = partial(PacedLoop, clock, only_answers=True)
+                with asyncio.Runner(loop_factory=factory) as runner:
                     runner.run(serve(spec, index, clock, announce=announce, lifeline=0))
             except BaseException as error:  # noqa: BLE001 -- nothing may return to the server's loop
                 code = 1

@@ -95,10 +95,11 @@ class DeviceServer:
             path = spec.get("clock") or f"{folder}/clock"
             clock = PacedClock(path) if "clock" in spec else PacedClock.create(path)
             epoch = {"clock": path, "epoch_ns": clock.now_ns() + HEAD_START_NS}
-            clock.close()
             file = Path(folder) / "spec.json"
             file.write_text(json.dumps({**epoch, **spec}), encoding="utf-8")
-            answer = self._ask({"serve": str(file)})
+            with clock.participate():  # it waits for the devices, however long they take to start
+                answer = self._ask({"serve": str(file)})
+            clock.close()
             if "error" in answer:
                 message = f"a simulated device did not start: {answer['error']}"
                 raise ServeError(message, is_usage_error=answer["is_usage_error"])

@@ -11,10 +11,11 @@ The paced clock is the system's monotonic clock, except that it stands still whi
 behind. Participants are event loops (:class:`PacedLoop`), in any number of processes. Each time
 that a loop has dealt with everything that was due, it writes down the instant until which the clock
 may run before the loop has looked again: ``SHORTEST`` later, or half as long as the loop has had
-nothing to do, but no more than ``LONGEST``. So what comes for a loop that the computer does not let
-run is delayed by little, measured by how often something comes. What the clock would be beyond the
-earliest of those instants is left out for good. Nothing else is agreed on: whoever reads the clock
-works out where it is, from a small file that all participants map.
+nothing to do, but no more than ``LONGEST``, nor than ``SHORTEST`` beyond its next timer. So what
+comes for a loop that the computer does not let run is delayed by little, measured by how often
+something comes. What the clock would be beyond the earliest of those instants is left out for good.
+Nothing else is agreed on: whoever reads the clock works out where it is, from a small file that all
+participants map.
 
 A participant that was killed no longer holds its lock, and is then no longer waited for.
 """
@@ -40,6 +41,8 @@ SHORTEST, LONGEST = 2_000_000, 40_000_000
 """How far the clock may run ahead of a participant, ns: less than any time limit of a driver."""
 LOOKS = 2
 """How often at least a participant that has nothing to do looks at the clock in that time."""
+LONGEST_PAUSE = 0.01
+"""Between two looks at a clock that stands still, s of the system's clock."""
 MOST_PARTICIPANTS = 1024
 _FREE = 2**63 - 1
 _LOOK_FOR_THE_DEAD = NS // 10
@@ -87,16 +90,23 @@ class PacedClock:
         """Return the time in ns; it never goes back."""
         table = self._table
         origin = table[_ORIGIN]
-        system = self._system_ns()
+        left_out = table[_LEFT_OUT]
+        while True:
+            system = self._system_ns()
+            before, left_out = left_out, table[_LEFT_OUT]
+            if before == left_out:
+                break  # else more was left out after ``system``: the time would go back
         elapsed = (system - origin) * table[_RATE] // 1_000_000
-        now = origin + elapsed - table[_LEFT_OUT]
+        now = origin + elapsed - left_out
         n_slots = table[_N_SLOTS]
         if not n_slots:
             return now
         earliest = min(table[_SLOTS : _SLOTS + n_slots])
         if now <= earliest:
             return now
-        table[_LEFT_OUT] += now - earliest
+        # Set, not added to: another process may have left out the same meanwhile. If it left out
+        # more, that is undone, and left out again at the next look.
+        table[_LEFT_OUT] = left_out + now - earliest
         if system > self._looked + _LOOK_FOR_THE_DEAD:
             self._looked = system
             self._forget_the_dead(earliest)
@@ -212,36 +222,54 @@ class _Selector(selectors.SelectSelector):
 
     participant: Participant | None = None
 
-    def __init__(self, clock: PacedClock) -> None:
+    def __init__(self, clock: PacedClock, *, only_answers: bool) -> None:
         super().__init__()
         self._clock = clock
-        self._busy = 0
-        """Instant at which there was something to do last."""
+        self._only_answers = only_answers
+        self._busy = clock.now_ns()
+        """Instant at which something came last, or a timer ended that an answer may follow."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Return what is ready, or nothing once ``timeout`` is over by the clock."""
         clock, rate = self._clock, self._clock.rate
-        now = self._busy = clock.now_ns()
+        now = clock.now_ns()
+        if not self._only_answers:
+            self._busy = now
         until = math.inf
         if timeout is not None:
-            until = now + timeout * NS if timeout > 0 else 0
+            until = now + timeout * NS if timeout > 0 else now
+        pause = 0.0
         while True:
             ahead = min(max(SHORTEST, (now - self._busy) // 2), LONGEST)
             if self.participant is not None:
-                self.participant.let_run_until(now + ahead)
+                latest = max(now, until) + SHORTEST
+                self.participant.let_run_until(int(min(now + ahead, latest)))
             seconds = max(0.0, min(until - now, ahead / LOOKS)) / NS / rate
-            ready: list[tuple[selectors.SelectorKey, int]] = super().select(seconds)
-            now = clock.now_ns()
+            ready: list[tuple[selectors.SelectorKey, int]] = super().select(max(seconds, pause))
+            before, now = now, clock.now_ns()
+            if ready:
+                self._busy = now
             if ready or now >= until:
                 return ready
+            # While somebody is behind, everybody else's looks would only take the computer's time.
+            pause = min(max(2 * pause, seconds), LONGEST_PAUSE) if now == before else 0.0
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
-    """An event loop that runs by a paced clock, and that the clock waits for while it runs."""
+    """An event loop that runs by a paced clock, and that the clock waits for while it runs.
 
-    def __init__(self, clock: PacedClock) -> None:
+    Parameters
+    ----------
+    clock : PacedClock
+        The clock.
+    only_answers : bool
+        Whether the loop never waits for an answer to what it sends, as a device: it need not look
+        at the clock between its timers.
+    """
+
+    def __init__(self, clock: PacedClock, *, only_answers: bool = False) -> None:
         self.clock = clock
-        self._turns = _Selector(clock)
+        self._turns = _Selector(clock, only_answers=only_answers)
         super().__init__(self._turns)
 
     def time(self) -> float:

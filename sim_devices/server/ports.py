@@ -1,8 +1,8 @@
 """Pseudo-terminals, TCP and UDP ports on which simulated devices are served.
 
-A line says when somebody opens it, hands over what comes, takes what is to be sent, and can hang
-up as a pulled cable does. Like a real cable it does not store: what is sent while nobody has the
-line open is lost, and so is what a reader leaves lying beyond ``MOST_WAITING``.
+A line reports when a reader opens it, passes on received bytes, accepts bytes to send, and can hang
+up like a pulled cable. Like a cable it stores nothing: bytes sent while no reader has the line open
+are lost, and so are bytes beyond ``MOST_WAITING`` that a reader does not fetch.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 MOST_WAITING = 1 << 20
 """Bytes waiting to be read at which further units are lost."""
 LOOK_INTERVAL = 0.02
-"""How often a pseudo-terminal nobody has open is looked at, s."""
+"""Interval of checks of a pseudo-terminal without a reader, s."""
 
 
 class Listener(Protocol):
-    """Who is told what happens on a line."""
+    """Receives the events of a line."""
 
     def connected(self) -> None:
         """Somebody opened the line."""
 
     def received(self, received: bytes) -> None:
-        """Bytes came."""
+        """Bytes were received."""
 
     def disconnected(self) -> None:
         """Nobody has the line open any more."""
@@ -56,7 +56,7 @@ class Wire(Protocol):
         """Send each unit, or lose it whole."""
 
     def hang_up(self) -> None:
-        """Close on whoever has the line open; nobody can open it until :meth:`restore`."""
+        """Hang up on the reader; the line cannot be opened until :meth:`restore`."""
 
     def restore(self) -> None:
         """Plug the cable in again."""
@@ -66,7 +66,7 @@ class Wire(Protocol):
 
 
 class PseudoTerminal:
-    """A serial port. Its address stays the same when it is hung up and comes back."""
+    """A serial port. Its address survives a hang-up."""
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
@@ -79,7 +79,7 @@ class PseudoTerminal:
         self._look: asyncio.TimerHandle | None = None
 
     async def open(self) -> None:
-        """Make the pseudo-terminal and look out for somebody to open it."""
+        """Make the pseudo-terminal and wait for a reader."""
         self._make()
 
     def _make(self) -> None:
@@ -154,7 +154,7 @@ class PseudoTerminal:
         self._destroy()
 
     def restore(self) -> None:
-        """Plug it in again: whoever had the port open must open it anew."""
+        """Plug the cable in again; a reader must open the port again."""
         self._make()
 
     def _destroy(self) -> None:
@@ -271,7 +271,7 @@ class UdpPort:
         self._listener.connected()
 
     def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit as a datagram; nobody need be there."""
+        """Send each unit as a datagram, with or without a receiver."""
         for unit in () if self._down else units:
             with contextlib.suppress(OSError):
                 self._socket.sendto(unit, self._to)
@@ -311,20 +311,20 @@ class UdpServer(asyncio.DatagramProtocol):
         self._listener.connected()
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Hand over what came."""
+        """Pass on a received datagram."""
         if self._down:
             return
         self._to = addr
         self._listener.received(data)
 
     def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit as a datagram; whoever asked need not be there any more."""
+        """Send each unit as a datagram to the last sender, which may be gone."""
         if self._transport is not None and self._to is not None:
             for unit in units:
                 self._transport.sendto(unit, self._to)
 
     def hang_up(self) -> None:
-        """Hear nobody, and forget who spoke last."""
+        """Ignore datagrams, and forget the last sender."""
         self._down, self._to = True, None
 
     def restore(self) -> None:

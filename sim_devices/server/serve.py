@@ -6,23 +6,23 @@ The specification is one JSON object::
      "epoch_ns": 123,              instant of that clock, in ns, at which world time is 0
      "speed": 1.0,                 world seconds that pass in one second of that clock
      "scenario": {...},            see sim_devices.world.scenario
-     "faults": [...],              what goes wrong, see sim_devices.faults
-     "fault_log": "FILE",          where each fault is noted when it strikes, a JSON object a line
-     "sent_log": "FILE",           and each unit that goes onto a line somebody has open, in hex
+     "faults": [...],              see sim_devices.faults
+     "fault_log": "FILE",          log of faults, one JSON object per line
+     "sent_log": "FILE",           log of units sent on an open line, in hexadecimal
      "devices": [
        {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
-        "driver": "epson",         whose protocol it speaks: a key of FAMILIES
+        "driver": "epson",         its protocol, a key of FAMILIES
         "port": "pty",             or "tcp", "udp"
         "number": 0,               of a TCP port, and of further ones those that the settings name;
                                    any that are free if it is 0
         "sampling_rate": 200.0,    Hz
         "settings": {...},         as the driver's settings in the bench file
-        "sensor_settings": {"A": {...}},      where its sensors' settings differ
-        "model": "", "serial_number": "",     what it says it is; the family's own if empty
+        "sensor_settings": {"A": {...}},      settings of single sensors
+        "model": "", "serial_number": "",     reported identity; default: of the family
         "channels": {"A": [{"name": "x", "sensitivity": 1710800.0, "auxiliary": false}, ...]}}]}
 
-Each device is served by a process of its own (:mod:`sim_devices.server.fork_server`), which
-announces when it can be connected to::
+A separate process serves each device (:mod:`sim_devices.server.fork_server`) and announces when it
+accepts connections::
 
     {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
 
@@ -69,6 +69,7 @@ FAMILIES = {
     "guralp": "sim_devices.devices.guralp:create",
     "fifo": "sim_devices.devices.fifo:create",
     "text": "sim_devices.devices.text:create",
+    "seedlink": "sim_devices.devices.seedlink:create",
 }
 """Driver name → ``module:function`` that makes its simulated device."""
 
@@ -80,7 +81,7 @@ Not between two answers: who asks is not held up.
 
 
 class Served:
-    """One endpoint on its wire: calls the one when the other says so, and when time has come.
+    """One endpoint on its line: calls the endpoint for received bytes and at due times.
 
     Sends are made at absolute instants of world time, so that lateness never adds up.
     """
@@ -115,7 +116,7 @@ class Served:
         self._schedule()
 
     def received(self, received: bytes) -> None:
-        """Bytes came."""
+        """Bytes were received."""
         self._last = 0.0
         self._send(self._endpoint.receive(received, self._clock.now()))
         self._schedule()
@@ -143,7 +144,7 @@ class Served:
                 self._tell_sent(self._clock.now(), unit)
 
     def _strike(self) -> None:
-        """Let go wrong what is due to, and repair what was to be repaired."""
+        """Start and end the faults that are due."""
         now = self._clock.now()
         if self._down and now >= self._faults.down_until:
             self._down = False

@@ -1,4 +1,4 @@
-"""World time: seconds since the specification's epoch, passing ``speed`` times as fast as ours."""
+"""World time: seconds since the specification's epoch, at ``speed`` times real time."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Stationary Gaussian series that can be entered anywhere, and are the same wherever they are made.
+"""Stationary Gaussian series with random access, the same in every process.
 
-White sources come in blocks, each from a counter-based generator whose counter is the block's
-index: block 10 million costs as much as block 0, and two processes agree on it without a word.
-A series is those sources through a matrix of finite impulse responses, convolved by
-overlap-save, so it is exactly stationary. Its PSD is the wanted one but for the resolution of
-the impulse response's length, half a block either way.
+White sources come in blocks, each from a counter-based generator whose counter is the index of the
+block: block 10 million costs as much as block 0, and two processes compute the same block. A series
+is the sources through a matrix of finite impulse responses, convolved by overlap-save, so it is
+exactly stationary. Its PSD is the target PSD at the resolution of the impulse response, half a
+block to either side.
 """
 
 from __future__ import annotations

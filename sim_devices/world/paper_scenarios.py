@@ -1,4 +1,4 @@
-"""The paper's studies, and a few scenes of our own, as scenarios with a name.
+"""Named scenarios: the studies of the paper, and some others.
 
 Levels are in (m/s²)²/Hz; the paper's numerical studies have noise of 1e-15 g²/Hz and motion that
 is white, 1.5 times as strong along y as along x.
@@ -24,7 +24,7 @@ STANDARD_GRAVITY = 9.80665
 NOISE = 1e-15 * STANDARD_GRAVITY**2
 SAMPLING_RATE = 200.0
 SPACING = 0.12
-"""Between sensors that stand as close as they can, in metres."""
+"""Smallest distance between sensors, in metres."""
 
 CASES: Mapping[str, tuple[str, tuple[str, str, str]]] = {
     "0": ("setup1", ("E", "C", "D")),
@@ -96,7 +96,7 @@ def biaxial(
 
 
 def fig4(*, theta: float = 10.0, snr: float = 100.0, ratio: float = 1.5) -> Scenario:
-    """Sensor i at 10°, j and k together `theta` further: (13) says how biased i is."""
+    """Sensor i at 10°, j and k together `theta` further: its bias is that of (13)."""
     return three_channels(turned=(10.0, 10.0 + theta, 10.0 + theta), snr=snr, ratio=ratio)
 
 

@@ -1,4 +1,4 @@
-"""Motion of a floor crossed by plane waves: coherent in one point, less and less so apart.
+"""Motion of a floor crossed by plane waves: coherence decreases with distance.
 
 Rayleigh waves (horizontal along their way, vertical a quarter period behind) and Love waves
 (horizontal across it) come from directions all around at one speed; shear and pressure waves
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def n_sources(waves: PlaneWaves) -> int:
-    """Waves in the field."""
+    """Return the number of waves in the field."""
     return 2 * waves.n_directions + 3
 
 
 def field(
     waves: PlaneWaves, position: tuple[float, float, float], frequency: FloatArray
 ) -> ComplexArray:
-    """Say what each wave does at one place, for a spectrum of one in each direction.
+    """Return the amplitude of each wave at one position, for a unit spectrum in each direction.
 
     Parameters
     ----------

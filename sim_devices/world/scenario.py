@@ -1,9 +1,9 @@
-"""What moves, and which sensors feel it: the table under `[simulation]` in a bench file.
+"""The simulated motion and sensors: the table `[simulation]` of a bench file.
 
-One scenario describes one common motion and every sensor's place in it. All processes that hold
-the same table simulate the same world: whatever they ask for is the same function of time.
+A scenario describes one common motion and all sensors in it. All processes with the same table
+simulate the same world: every quantity is the same function of time.
 
-Example, as it stands in a bench file (SI units, angles in degrees, spectra one-sided)::
+Example from a bench file (SI units, angles in degrees, spectra one-sided)::
 
     [simulation]
     seed = 7
@@ -23,7 +23,7 @@ Example, as it stands in a bench file (SI units, angles in degrees, spectra one-
     [simulation.sensors.B]
     rotation = 10.0                         # about z; or [about z, about y, about x]
     gain = [1.0, 1.01, 0.99]
-    delay = 0.0005                          # reads the motion of half a millisecond ago
+    delay = 0.0005                          # measures the motion half a millisecond late
     noise = {shape = "white", level = 1e-13}
     clock = {offset = 0.3, ppm = 15.0, wander = 0.05}
 
@@ -33,7 +33,7 @@ Example, as it stands in a bench file (SI units, angles in degrees, spectra one-
              {shape = "white", level = 2e-13}]
     seed = 3                                # of this sensor's noise and clock
 
-A field of plane waves in place of one common motion, so that sensors apart are not coherent::
+A field of plane waves instead of one common motion; sensors apart are not coherent::
 
     [simulation.motion]
     kind = "plane-waves"
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from sim_devices.world.spectrum import Spectrum
 
 ELSEWHERE = frozenset({"speed", "clock", "devices", "faults"})
-"""Keys of the `[simulation]` table that others read: they say nothing about the world."""
+"""Keys of the `[simulation]` table that other modules read."""
 
 
 class Scenario(Table):
@@ -79,14 +79,14 @@ class Scenario(Table):
         Parameters
         ----------
         table
-            The schema of this module. `speed`, `clock`, `devices` and `faults` are others' keys.
+            The schema of this module; `speed`, `clock`, `devices` and `faults` are ignored.
         sampling_rate
             Of the sensors that do not state their own, in Hz.
 
         Raises
         ------
         ScenarioError
-            Naming every key that is wrong, its value and what was expected.
+            With key, value and expectation of every error.
         """
         own: dict[str, Any] = {key: value for key, value in table.items() if key not in ELSEWHERE}
         motion = own.get("motion")
@@ -204,7 +204,7 @@ def _rotation(angles: float | tuple[float, float, float]) -> FloatArray:
 
 
 def _problems(error: ValidationError, table: Mapping[str, Any]) -> list[str]:
-    """Return everything that is wrong: key = value, and what was expected."""
+    """Return all errors: key = value, and the expectation."""
     expected: dict[str, list[str]] = {}
     for fault in error.errors(include_url=False):
         key = "simulation"

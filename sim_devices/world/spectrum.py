@@ -1,6 +1,6 @@
 """Shapes of one-sided power spectral densities, in (m/s²)²/Hz.
 
-Each shape is a frozen table, so that it can stand in a bench file as it is::
+Each shape is a frozen table, as in a bench file::
 
     {shape = "white", level = 1e-13}
     {shape = "mixed", level = 2e-14, low_corner = 20.0, high_corner = 30.0}
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Shape(BaseModel):
-    """What every shape has in common: its table is closed and cannot change."""
+    """Base of all shapes: a frozen table without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from typing import Self
 
 USABLE = 0.9
-"""The motion is whole up to this share of the lowest Nyquist frequency, and gone at it."""
+"""The motion is complete up to this share of the lowest Nyquist frequency, and zero above it."""
 
 
 class Table(BaseModel):
-    """What every table has in common: it is closed and cannot change."""
+    """Base of all tables: frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -61,7 +61,7 @@ class Response(Table):
 
 
 class SensorModel(Table):
-    """One sensor: how it stands, what it does to the motion, its own noise and clock.
+    """One sensor: orientation, gain, delay, response, noise and clock.
 
     Channel r reads ``gain[r] · direction[r] · motion(t − delay, position) + noise[r]`` in m/s².
     """
@@ -79,7 +79,7 @@ class SensorModel(Table):
 
 
 class CommonMotion(Table):
-    """One motion felt alike by all: independent components with these PSDs, then mixed.
+    """One motion for all sensors: independent components with these PSDs, then mixed.
 
     With `mixing` (a row for each direction of the world, a column for each spectrum) the
     directions become correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ.
@@ -92,7 +92,7 @@ class CommonMotion(Table):
 
     @property
     def n_dims(self) -> int:
-        """Directions the motion has."""
+        """Number of directions of the motion."""
         return len(self.spectra if self.mixing is None else self.mixing)
 
     @model_validator(mode="after")
@@ -124,7 +124,7 @@ class PlaneWaves(Table):
 
     @property
     def n_dims(self) -> int:
-        """Directions the motion has."""
+        """Number of directions of the motion."""
         return 3
 
 

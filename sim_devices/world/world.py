@@ -1,9 +1,8 @@
-"""A scenario come to life: what every sensor reads at any of its samples.
+"""The samples of every sensor of a scenario.
 
-The motion lives on a master grid of its own, fast enough to be interpolated at any instant with
-an error 120 dB down. Each sensor's direction, gain, delay, response and place are part of the
-filters its channels are made with; its clock says at which instants they are taken; its noise
-is made on its own samples.
+The motion is computed on a master grid, fast enough for interpolation at any instant with an error
+of −120 dB. Direction, gain, delay, response and position of a sensor are part of the filters of its
+channels. Its clock defines the instants of its samples. Its noise is computed at these samples.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ CHUNK = 4096  # instants interpolated at a time: their windows stay in the cache
 
 
 class Motion:
-    """Motion as one sensor's channels feel it: a function of time, the same in every process."""
+    """Motion at the channels of one sensor: a function of time, the same in every process."""
 
     def __init__(self, series: GaussianSeries, *, sampling_rate: float) -> None:
         self._series = series
@@ -55,7 +54,7 @@ class Motion:
 
 
 class World:
-    """The motion, clocks and noise of a scenario's sensors, made as they are asked for."""
+    """Motion, clocks and noise of the sensors of a scenario, computed on demand."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -84,7 +83,7 @@ class World:
         return self._clocks[sensor].times(first_sample, n)
 
     def motion(self, sensor: str) -> Motion:
-        """Motion as the sensor's channels feel it."""
+        """Return the motion at the channels of a sensor."""
         if sensor not in self._motions:
             rate = GRID_OVERSAMPLING * self._scenario.bandwidth / USABLE
             series = GaussianSeries(

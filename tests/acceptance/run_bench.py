@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
-import time
 from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -13,14 +12,12 @@ from typing import TYPE_CHECKING, Any
 from daq.drivers.bench_file import load
 from daq.python_process import python_command
 from tests.acceptance import fault_script
+from tests.waiting import limit
 from tui.simulation.devices import specification, with_faults
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-STARTING = 60.0
-"""How long the devices may take to be served, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +54,11 @@ def served(folder: Path, faults: list[dict[str, Any]], *, speed: float) -> Itera
         *("--speed", str(speed), "--out", str(out)),
     )
     try:
-        began = time.monotonic()
         said = devices.stderr.readline() if devices.stderr else ""
-        if "served" not in said or time.monotonic() - began > STARTING:
+        if "served" not in said:
             raise RuntimeError(f"huddle devices did not start: {said}")
         spec = specification(with_faults(load(bench), told), speed=speed)
         yield Served(out, log, spec)
     finally:
         devices.send_signal(signal.SIGINT)
-        devices.communicate(timeout=30)
+        devices.communicate(timeout=limit())

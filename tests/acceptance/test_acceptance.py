@@ -17,13 +17,13 @@ from daq.recording.control import ask
 from tests.acceptance import fault_script
 from tests.acceptance.run_bench import command, served
 from tests.acceptance.sample_accounting import Log, accounts
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals"),
-    pytest.mark.timeout(120),
 ]
 
 SPEED = 8.0
@@ -43,7 +43,7 @@ def test_every_sample_sent_is_recorded_and_every_gap_has_its_length(tmp_path: Pa
             with command("record", str(devices.bench), "--out", str(out)) as recorder:
                 if _all_struck(recorder, log):
                     ask(out, "stop")
-                _, said = recorder.communicate(timeout=30)
+                _, said = recorder.communicate(timeout=limit())
             if recorder.returncode == 0:
                 break
         else:

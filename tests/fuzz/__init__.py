@@ -1,1 +1,1 @@
-"""Coverage-guided fuzzing of every decoder; see ``docs/fuzzing.md``."""
+"""Coverage-guided fuzzing of every decoder; see ``docs/validation/fuzzing.md``."""

@@ -27,6 +27,9 @@ from daq.protocols.labjack.stream import Packet, StreamDecoder
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import FifoDecoder
 from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
+from daq.protocols.seedlink import packets as seedlink
+from daq.protocols.seedlink.decoder import SeedLinkDecoder, Selection
+from daq.protocols.seedlink.records import WaveRecord, encode_record
 from daq.protocols.text.decoder import TextDecoder
 from daq.protocols.text.format import RASPBERRY_SHAKE, TextFormat
 
@@ -248,6 +251,43 @@ def text_packets(fuzzed: bytes) -> None:
     _demand([*settled, *later], 8 * 25)
 
 
+def _seedlink(version: seedlink.Version, station: str, k: int) -> bytes:
+    start = (1_790_000_000 + k) * 10**9
+    counts = np.arange(100, dtype=np.int32) * 1000 + k
+    wave = WaveRecord("XX", station, "00", "HNZ", start, Fraction(100), counts)
+    (payload,) = encode_record(wave)
+    return seedlink.encode_packet(seedlink.Packet(k + 1, payload, f"XX_{station}"), version)
+
+
+def _seedlink_target(version: seedlink.Version) -> Callable[[bytes], None]:
+    def run(fuzzed: bytes) -> None:
+        """Packets of one station; after another connection those of a second one."""
+        stations = {"A": "A", "B": "B"}
+        decoder = SeedLinkDecoder(
+            {name: Selection("XX", one, (("*", "HNZ"),), 1) for name, one in stations.items()},
+            dict.fromkeys(stations, np.dtype(np.int32)),
+            hold=5.0,
+        )
+        decoder.begin(version)
+        for read, at in _reads(fuzzed):
+            try:
+                decoder.receive(read, at)
+            except RemoteProtocolError:
+                decoder.begin(version)
+        decoder.begin(version)
+        found = [
+            x
+            for k in range(20)
+            for x in decoder.receive(_seedlink(version, "B", k), _at(LATER + k))
+        ]
+        _demand([x for x in found if getattr(x, "sensor", "") == "B"], 20 * 100)
+
+    return run
+
+
+SEEDLINK: dict[seedlink.Version, bytes] = {
+    version: b"".join(_seedlink(version, "A", k) for k in range(4)) for version in (3, 4)
+}
 TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
     "epson_bursts": (epson_bursts, [b"\xff" + BURSTS, b"\x10" + BURSTS[5:], bytes(60)]),
     "epson_commands": (epson_commands, [b"\x02" + commands.read(commands.ID) * 3]),
@@ -265,6 +305,8 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
         text_datagrams,
         [b"\x13" + b"".join(b"{'EH%c', 10.%d, 1}  " % (c, k) for k in range(3) for c in b"ZNE")],
     ),
+    "seedlink_3": (_seedlink_target(3), [b"\xff" + SEEDLINK[3], b"\x28" + SEEDLINK[3][:700]]),
+    "seedlink_4": (_seedlink_target(4), [b"\xff" + SEEDLINK[4], b"\x28" + SEEDLINK[4][:700]]),
     "text_packets": (text_packets, [b"\xff{'EHZ', 1582315130.292, 14168, 14927, 7}"]),
 }
 """Name → what to run, and inputs to begin with."""

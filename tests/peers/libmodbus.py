@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import time
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+
+from tests.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,8 +61,5 @@ def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
         pytest.skip("socat (Debian: socat) is not installed")
     ends = (str(folder / "one"), str(folder / "other"))
     with running("socat", *(f"pty,raw,echo=0,link={end}" for end in ends)):
-        deadline = time.monotonic() + 5
-        while not all(Path(end).exists() for end in ends):
-            assert time.monotonic() < deadline, "socat made no pseudo-terminals"
-            time.sleep(0.01)
+        wait_until(lambda: all(Path(end).exists() for end in ends), "socat's pseudo-terminals")
         yield ends

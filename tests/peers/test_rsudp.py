@@ -15,6 +15,7 @@ import pytest
 from sim_devices.world.world import World
 from tests.devices import paced_clock, serving
 from tests.sim_devices.simulated_bench import device, scenario, spec
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +68,7 @@ def test_rsudp_reads_our_packets(tmp_path: Path) -> None:
     made = spec(table, speed=8.0, sampling_rate=RATE)
     with serving(made) as (one,), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.bind(("127.0.0.1", int(one.port.rpartition(":")[2])))
-        port.settimeout(10)
+        port.settimeout(limit())
         packets = [port.recv(4096) for _ in range(30)]
     began = paced_clock().utc_of(made["epoch_ns"])
     found = parsed_by_rsudp(packets, tmp_path)

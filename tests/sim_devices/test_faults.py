@@ -275,7 +275,7 @@ def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
     [
         (b"faults = 5", r"faults = 5: expected a list"),
         (b"faults = [5]", r"faults\[1\] = 5: "),
-        (b"[[fault]]\nat = 3.0", r"fault: there is no such key; expected \[\[faults\]\]"),
+        (b"[[fault]]\nat = 3.0", r"fault: unknown key; expected \[\[faults\]\]"),
         (b'[[faults]]\nkind = "dead"\nat = 1\nwhen = 3', r"faults\[1\]\.when = 3: .*expected kind"),
         (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = ["NOPE"]', r"'NOPE': .*expected A, B, C"),
         (b'[[faults]]\nkind = "drop"\nat = 1\nsensors = []', r"sensors = \[\]: "),

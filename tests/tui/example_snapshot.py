@@ -78,7 +78,6 @@ def made_snapshot(
         n_dropped=0,
         n_effective=n_effective,
         elapsed=n_effective * 1.0,
-        time_left=None if closed else 260.0,
         start_utc_ns=1_795_230_000_000_000_000,
         sensors=tuple(
             SensorTotals(name, RATE, n_samples, n_gaps, 7 * n_gaps, last_seen)
@@ -212,7 +211,6 @@ def empty_snapshot() -> Snapshot:
         n_segments=0,
         n_effective=0.0,
         elapsed=0.0,
-        time_left=None,
         sensors=tuple(replace(s, n_samples=0, last_seen=float("nan")) for s in full.sensors),
     )
 

@@ -1,4 +1,4 @@
-"""The Textual application: shows frozen snapshots, and tells a recorder to start, stop and mark."""
+"""The Textual application: shows frozen snapshots; starts, stops and marks recordings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,14 @@ from tui.application.messages import (
 )
 from tui.application.plot import PlainMonochrome
 from tui.application.result_text import details, result
-from tui.application.screens import MarkScreen, ResultScreen, StopScreen, TextScreen, help_text
+from tui.application.screens import (
+    MarkScreen,
+    ResultScreen,
+    StartScreen,
+    StopScreen,
+    TextScreen,
+    help_text,
+)
 from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
@@ -61,7 +68,7 @@ class HuddleApp(App[None]):
     path : Path, optional
         Recording to follow from the start.
     start : bool
-        Whether to start a recording at once.
+        Whether to start a recording when the application opens.
     """
 
     CSS_PATH = "huddle.tcss"
@@ -89,6 +96,7 @@ class HuddleApp(App[None]):
     choice: var[panels.Choice] = var(panels.Choice)
     note: var[str] = var("")
     trouble: var[str] = var("")
+    failure: var[str] = var("")
 
     def __init__(
         self, controls: Controls, *, path: Path | None = None, start: bool = False
@@ -119,7 +127,7 @@ class HuddleApp(App[None]):
             self._find_running()
 
     def on_unmount(self) -> None:
-        """Let go of the recording; whoever writes it goes on."""
+        """Stop following the recording; its recorder continues."""
         self._ended.set()
 
     def get_line_filters(self) -> Sequence[LineFilter]:
@@ -134,7 +142,7 @@ class HuddleApp(App[None]):
     @on(RecordingOpened)
     def _on_following(self, message: RecordingOpened) -> None:
         self._path = message.path
-        self._starting, self.trouble, self.note = False, "", ""
+        self._starting, self.trouble, self.failure, self.note = False, "", "", ""
         self.now = self.snapshot = None
         self._ended.set()
         self._ended = threading.Event()
@@ -160,14 +168,14 @@ class HuddleApp(App[None]):
 
     @on(Progress)
     def _on_progress(self, message: Progress) -> None:
-        self.note = f"the result is being computed: {message.done / message.total:.0%}"
+        what = "the result is being computed" if self._is_closed else "reading what was recorded"
+        self.note = f"{what}: {message.done / message.total:.0%}"
 
     @on(SnapshotReady)
     def _on_fresh(self, message: SnapshotReady) -> None:
         self._settings = message.settings
         before = self.snapshot
-        if message.snapshot.closed:
-            self.note = ""
+        self.note = ""
         if not self.choice.methods:
             names = tuple(name for name in message.settings.methods if name != "all")
             names = names or tuple(message.snapshot.results)
@@ -178,9 +186,11 @@ class HuddleApp(App[None]):
 
     @on(ErrorReported)
     def _on_trouble(self, message: ErrorReported) -> None:
-        self._starting, self.note = False, ""
+        starting, self._starting, self.note = self._starting, False, ""
         if message.ended:
             self.trouble = message.text
+        elif starting:
+            self.failure = message.text
         else:
             self.notify(message.text, title="Error", severity="error", timeout=30, markup=False)
 
@@ -199,11 +209,15 @@ class HuddleApp(App[None]):
         self._show()
 
     def watch_note(self) -> None:
-        """Say what goes on."""
+        """Show a notice in place of the progress."""
         self._show()
 
     def watch_trouble(self) -> None:
-        """Say what is wrong."""
+        """Show an error."""
+        self._show()
+
+    def watch_failure(self) -> None:
+        """Say why there is no recording."""
         self._show()
 
     def _show(self) -> None:
@@ -220,7 +234,9 @@ class HuddleApp(App[None]):
                 snapshot=self.snapshot,
                 settings=self._settings,
                 trouble=self.trouble,
+                failure=self.failure,
                 note=self.note,
+                bench=self._controls.bench,
             )
         )
         offered = self.recording, self._starting, self._has_result, self.snapshot is None
@@ -283,6 +299,10 @@ class HuddleApp(App[None]):
         self.push_screen(ResultScreen("result", self._result))
 
     @property
+    def _is_closed(self) -> bool:
+        return self.now is not None and self.now.closed
+
+    @property
     def _has_result(self) -> bool:
         return self.snapshot is not None and self.snapshot.closed
 
@@ -321,8 +341,19 @@ class HuddleApp(App[None]):
         return True
 
     def action_start(self) -> None:
-        """Start a recorder."""
-        self._starting = True
+        """Start a recorder; asked before where a test is shown."""
+        if self._path is None:
+            self._begin()
+            return
+
+        def start(really: bool | None) -> None:
+            if really:
+                self._begin()
+
+        self.push_screen(StartScreen(self._path.name), start)
+
+    def _begin(self) -> None:
+        self._starting, self.failure = True, ""
         self.note = "connecting to the sensors …"
         self._start()
 

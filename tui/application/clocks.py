@@ -1,4 +1,4 @@
-"""What the application says of clocks: one line, a table, and how they drift; no Textual here."""
+"""Clocks in the application: one line, a table, and their drift. Does not use Textual."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _FREE = {ClockSource.ARRIVAL_TIMES, ClockSource.DEVICE_UTC}
 
 
 def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
-    """Return one line on the clocks: rates, what is left between them, and whether it matters."""
+    """Return one line on the clocks: rates, residual, and effect on the noise."""
     clocks = snapshot.clocks
     free = [clock for clock in clocks if clock.source in _FREE]
     if settings.clocks == "nominal":
-        return Text("clocks: samples taken at face value", DOUBTFUL)
+        return Text("clocks: nominal rates", DOUBTFUL)
     if not clocks:
         return Text("clocks: not known yet", MUTED)
     if not free:
@@ -78,7 +78,7 @@ def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
 
 
 def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:
-    """Return a row per sensor: rate, wander, what is left, by what it is known, what it does."""
+    """Return a row per sensor: rate, wander, residual, source, effect on the noise."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
     table.add_column("clock", no_wrap=True)
     wide = width >= 76
@@ -153,7 +153,7 @@ def _ppm(value: float) -> str:
 
 
 def microseconds(seconds: float) -> str:
-    """Return a short time as people say it."""
+    """Return a short time in a readable unit."""
     if math.isnan(seconds):
         return "?"
     value, unit = (seconds * 1e6, "µs") if seconds < 1e-3 else (seconds * 1e3, "ms")

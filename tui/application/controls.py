@@ -1,4 +1,4 @@
-"""What the application can do about recorders; the seam its tests stand at."""
+"""Interface between the application and recorders."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Controls(Protocol):
 
     @property
     def settings(self) -> Settings | None:
-        """How to estimate; None for what the recording says."""
+        """Settings of the estimate; None for those of the recording."""
         ...
 
     @property
@@ -42,7 +42,7 @@ class Controls(Protocol):
         ...
 
     def start(self) -> Path:
-        """Start a recorder; returns its file once that is there. Blocks."""
+        """Start a recorder; return its file once it exists. Blocks."""
         ...
 
     def find_running(self) -> Path | None:

@@ -23,8 +23,8 @@ class Curve:
 
     ``level_db`` is 10 log10 of the mean PSD, NaN where the mean is not positive; ``negative`` says
     where it is known not to be. ``low_db`` and ``high_db`` bound the 95 % interval, NaN where a
-    bound is not positive, and throughout for a curve without one. ``marker`` stands on the curve
-    here and there, so that it is known without its colour; empty for none.
+    bound is not positive, and throughout for a curve without one. ``marker`` is drawn on the
+    curve at intervals, to identify it without colour; empty for none.
     """
 
     label: str
@@ -49,7 +49,7 @@ class Line:
 
 
 def decibels(psd: FloatArray) -> FloatArray:
-    """Return 10 log10 of what is positive, NaN elsewhere."""
+    """Return 10 log10 of positive values, NaN elsewhere."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(psd > 0, 10 * np.log10(psd), np.nan)
 
@@ -84,10 +84,11 @@ def noise_curve(
     style: str,
     band_style: str,
     marker: str,
+    added: FloatArray | None = None,
 ) -> Curve:
     """Return a self-noise estimate as a curve with the 95 % interval of each of its points."""
     edges = log_edges(frequency, n_points)
-    means = band_means(psd, cov, edges, correlation)
+    means = band_means(psd, cov, edges, correlation, added=added)
     return Curve(
         label=label,
         style=style,

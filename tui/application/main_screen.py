@@ -9,9 +9,11 @@ from rich.text import Text
 from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
+from daq.results.limits import judge
 from tui.application import clocks, panels
 from tui.application.plot import DriftPlot, PsdPlot
 from tui.output.formatting import clock_time
+from tui.output.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,9 +22,11 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.events import Resize
 
+    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
 
 TALL = 34  # rows from which there is room for remarks and air
@@ -31,23 +35,25 @@ MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What there is to show.
+    """The state of the screen.
 
     Attributes
     ----------
     name : str
         Of the bench.
     description : object
-        What rich can print in place of sensors and curves, as long as there are none.
+        Shown in place of sensors and curves until the first snapshot.
     choice : view.Choice
     path : Path or None
         The recording.
     now, snapshot, settings : Now, Snapshot and Settings, or None
         What is known of it.
     trouble : str
-        Why it is not followed any more.
+        Why the recording is no longer followed.
+    failure : str
+        Why no recording could be started, a line for each sensor.
     note : str
-        What goes on, in place of the progress.
+        Notice in place of the progress.
     """
 
     name: str
@@ -58,17 +64,20 @@ class Shown:
     snapshot: Snapshot | None = None
     settings: Settings | None = None
     trouble: str = ""
+    failure: str = ""
     note: str = ""
+    bench: Bench | None = None
 
 
 class Board(Vertical):
-    """Draws what it is shown; what has not changed is not drawn anew."""
+    """Draws a state; parts without a change are not drawn again."""
 
     def __init__(self) -> None:
         super().__init__()
         self._shown: Shown | None = None
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
+        self._judged: tuple[object, TestVerdict | None] = (None, None)
         self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
 
     def compose(self) -> ComposeResult:
@@ -108,12 +117,14 @@ class Board(Vertical):
         shown = self._shown
         if shown is None:
             return
-        self._write("#status", _status(shown, width=self.size.width))
+        status = _status(shown, self._verdict(shown), width=self.size.width)
+        self._write("#status", status)
         self._write_alerts(shown)
         now, snapshot, settings, choice = shown.now, shown.snapshot, shown.settings, shown.choice
         width = self.size.width - 2
         if now is None or snapshot is None or settings is None:
-            self._write("#table", shown.description, n_lines=-1)
+            table = shown.description if now is None else panels.state_table(now, shown.trouble)
+            self._write("#table", table, n_lines=-1)
             waiting = "s starts a recording · ? helps" if shown.path is None else "opening …"
             self._write("#progress", Text(shown.note or waiting, MUTED))
             return
@@ -121,13 +132,19 @@ class Board(Vertical):
             table = clocks.clock_table(snapshot, settings, chosen=_sensor(shown), width=width - 1)
         else:
             table = panels.sensor_table(
-                now, snapshot, settings, choice, means=self._noise(shown), width=width - 1
+                now,
+                snapshot,
+                settings,
+                choice,
+                means=self._noise(shown),
+                width=width - 1,
+                is_followed=not shown.trouble,
             )
         self._write("#table", table, n_lines=table.row_count + 1)
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
-        progress = panels.progress_line(now, snapshot, settings, choice, width=width)
+        progress = panels.progress_line(now, snapshot, settings, width=width)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
-        self._write("#advice", panels.advice(snapshot, choice))
+        self._write("#advice", panels.advice(snapshot, choice, self._verdict(shown)))
 
     def _noise(self, shown: Shown) -> tuple[BandMeans, ...]:
         """Return the channels' noise, computed once for each snapshot."""
@@ -139,8 +156,25 @@ class Board(Vertical):
             self._means = key, panels.noise_in_band(snapshot, settings, shown.choice)
         return self._means[1]
 
+    def _verdict(self, shown: Shown) -> TestVerdict | None:
+        """Return the verdict so far, computed once for each snapshot."""
+        snapshot, settings = shown.snapshot, shown.settings
+        if snapshot is None or settings is None:
+            return None
+        if self._judged[0] != id(snapshot):
+            self._judged = id(snapshot), judge(shown.bench, snapshot, settings)
+        return self._judged[1]
+
     def _write_alerts(self, shown: Shown) -> None:
         alerts = [] if shown.now is None else panels.alerts(shown.now, shown.settings)
+        if shown.snapshot is not None and not shown.trouble:
+            alerts += panels.findings(shown.snapshot, width=self.size.width - 10)
+        if shown.failure:
+            lines = shown.failure.splitlines()
+            alerts = [Text(f"▲ {line}", BAD) for line in lines[:5]]
+            self.set_class(True, "-alert")
+            self._write("#alert", Text("\n").join(alerts), n_lines=-1)
+            return
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1
@@ -170,7 +204,7 @@ class Board(Vertical):
             psd.show(panels.curves(snapshot, settings, choice, n_points=psd.n_points))
 
     def _write(self, selector: str, text: RenderableType, *, n_lines: int = 1) -> None:
-        """Write a part of the screen; it is laid out anew only where its height changes."""
+        """Write a part of the screen; its layout changes only with its height."""
         if self._written.get(selector) == (text, n_lines):
             return
         _, before = self._written.get(selector, ("", 1))
@@ -193,7 +227,7 @@ def _sensor(shown: Shown) -> str:
     return "" if shown.snapshot is None else shown.snapshot.channels[shown.choice.channel].sensor
 
 
-def _status(shown: Shown, *, width: int) -> Text:
+def _status(shown: Shown, verdict: TestVerdict | None, *, width: int) -> Text:
     now = shown.now
     line = Text()
     line.append("huddle ", "bold #4cc9f0")
@@ -208,6 +242,8 @@ def _status(shown: Shown, *, width: int) -> Text:
         line.append("● recording", BAD)
     if now is not None:
         line.append(f"  {clock_time(now.elapsed)}")
+    if verdict is not None:
+        line.append(f"  {WORDS[verdict.verdict]}", STYLES[verdict.verdict])
     if shown.path is not None and len(shown.path.name) <= width - line.cell_len - 4:
         line.append(f"  {shown.path.name}", MUTED)
     return line

@@ -1,4 +1,4 @@
-"""What the application's threads tell it."""
+"""Messages from the threads of the application."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class RecordingOpened(Message):
-    """A recording is there, and is followed from now on."""
+    """A recording was opened and is followed from now on."""
 
     path: Path
 
@@ -34,7 +34,7 @@ class StatusUpdated(Message):
 
 @dataclass
 class SnapshotReady(Message):
-    """A snapshot came, made with these settings."""
+    """A new snapshot, with its settings."""
 
     snapshot: Snapshot
     settings: Settings
@@ -50,7 +50,7 @@ class Progress(Message):
 
 @dataclass
 class ErrorReported(Message):
-    """Something failed; the text says what, and what to do."""
+    """An operation failed; the text has reason and remedy."""
 
     text: str
     ended: bool = False
@@ -58,19 +58,19 @@ class ErrorReported(Message):
 
 
 class Messenger:
-    """Makes messages of what the following thread sees, as long as that recording is followed.
+    """Posts the messages of the thread that follows a recording.
 
     Parameters
     ----------
     app : App
-        Is posted the messages.
+        Receives the messages.
     ended : threading.Event
-        Set when nobody wants to know any more.
+        Set when the recording is no longer followed.
 
     Attributes
     ----------
     was_open : bool
-        Whether the recording was growing when it was seen first.
+        Whether the recording was growing when it was opened.
     """
 
     def __init__(self, app: App[None], ended: threading.Event) -> None:

@@ -12,21 +12,31 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
-from daq.results.band_summary import band_of, channel_means, correlation_of, decibels, reached_cov
+from daq.results.band_summary import band_of, channel_means, correlation_of, decibels
+from daq.results.partners import without_partners
+from daq.results.precision import precision
+from estimator.diagnostics.kinds import Level
 from tui.application.curves import data_curve, noise_curve
+from tui.output.advice.alerts import alert
+from tui.output.advice.sentences import Names
 from tui.output.formatting import clock_time, roughly, several, signed, time_left
-from tui.output.vocabulary import FLAG_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
+from tui.output.results import faulty_channels, why_no_segment
+from tui.output.verdict_text import STYLES as STYLES_OF_VERDICTS
+from tui.output.verdict_text import headline, record_for
+from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
+    from daq.results.partners import WithoutPartner
+    from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
     from tui.application.curves import Curve
 
-DATA_STYLE = "#7d8799"
+DATA_STYLE, MUTED = "#7d8799", "#9aa5b8"
 STYLES = {
     "three-sensor": ("#4cc9f0", "#1d6f8c", "●"),
     "three-channel": ("#f4a261", "#8a5a34", "×"),
@@ -53,7 +63,7 @@ def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: 
     shown = [
         data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
     ]
-    correlation = correlation_of(settings)
+    correlation, added = correlation_of(settings), snapshot.added_by_clocks
     for method in choice.methods:
         if method not in snapshot.results:
             continue
@@ -70,6 +80,7 @@ def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: 
                 style=style,
                 band_style=band_style,
                 marker=marker,
+                added=None if added is None else added[:, column],
             )
         )
     return shown
@@ -87,7 +98,7 @@ def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tup
     if method is None:
         return ()
     band = band_of(settings, snapshot)
-    return channel_means(snapshot.results[method], snapshot.frequency, settings, band)
+    return channel_means(snapshot.results[method], snapshot, settings, band)
 
 
 def sensor_table(
@@ -98,14 +109,15 @@ def sensor_table(
     *,
     means: Sequence[BandMeans],
     width: int,
+    is_followed: bool = True,
 ) -> Table:
     """Return a row per sensor: how it is, and the noise of each of its channels in the band.
 
-    What there is no room for is left out: rates first, then numbers of samples, then of gaps.
+    Without room, rates are omitted first, then numbers of samples, then of gaps.
     """
     noise = partial(_noise_columns, now, snapshot, settings, choice, means)
     columns = {"sensor": [Text(sensor.name, "bold") for sensor in now.sensors]}
-    columns["state"] = [state(sensor) for sensor in now.sensors]
+    columns["state"] = _states(now, is_followed=is_followed)
     columns["Hz"] = [Text(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
     columns["samples"] = [Text(grouped(s.n_samples)) for s in now.sensors]
     columns["gaps"] = [_gaps(sensor) for sensor in now.sensors]
@@ -124,6 +136,27 @@ def sensor_table(
     return table
 
 
+def state_table(now: RecordingStatus, trouble: str) -> Table:
+    """Return a row per sensor: how it is, before there is an estimate."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold #9aa5b8")
+    for title in ("sensor", "state", "Hz", "samples", "gaps"):
+        right = title in {"Hz", "samples", "gaps"}
+        table.add_column(title, justify="right" if right else "left", no_wrap=True)
+    table.add_column("port", overflow="fold")
+    for sensor, how in zip(now.sensors, _states(now, is_followed=not trouble), strict=True):
+        rate, count = f"{sensor.sampling_rate:g}", grouped(sensor.n_samples)
+        name, port = Text(sensor.name, "bold"), Text(sensor.port)
+        table.add_row(name, how, rate, count, _gaps(sensor), port)
+    return table
+
+
+def _states(now: RecordingStatus, *, is_followed: bool) -> list[Text]:
+    """Return the state of every sensor: of one that nobody records, that this is so."""
+    if is_followed or now.closed:
+        return [state(sensor) for sensor in now.sensors]
+    return [Text("■ not recorded", MUTED) for _ in now.sensors]
+
+
 def _noise_columns(
     now: RecordingStatus,
     snapshot: Snapshot,
@@ -136,14 +169,16 @@ def _noise_columns(
     """Return the columns of channels, by their titles."""
     band, of_sensor = band_of(settings, snapshot), _columns_of(snapshot)
     titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
-    columns = {}
+    columns, alone = {}, without_partners(snapshot, band)
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
         cells = columns[title] = [Text("") for _ in now.sensors]
         for row, sensor in enumerate(now.sensors):
             mine = of_sensor.get(sensor.name, [])
             if number < len(mine):
-                cells[row] = _channel_noise(snapshot, mine[number], means, with_error=with_error)
+                cells[row] = _channel_noise(
+                    snapshot, mine[number], means, alone, with_error=with_error
+                )
                 if mine[number] == choice.channel:
                     cells[row].stylize("reverse")
     return columns
@@ -189,12 +224,19 @@ def state(sensor: SensorStatus) -> Text:
 
 
 def _channel_noise(
-    snapshot: Snapshot, column: int, means: Sequence[BandMeans], *, with_error: bool
+    snapshot: Snapshot,
+    column: int,
+    means: Sequence[BandMeans],
+    alone: Mapping[int, WithoutPartner],
+    *,
+    with_error: bool,
 ) -> Text:
     name = snapshot.channels[column].channel
     value, style = "…", ""
     if said := _flagged(snapshot, column):
         value, style = said, "bold #ff6b6b"
+    elif column in alone:
+        value, style = PARTNER_WORDS[alone[column]], "bold #ff6b6b"
     elif means:
         mean, high = float(means[column].mean[0]), float(means[column].high[0])
         if mean > 0:
@@ -218,35 +260,34 @@ def _flagged(snapshot: Snapshot, column: int) -> str:
 
 
 def progress_line(
-    now: RecordingStatus, snapshot: Snapshot, settings: Settings, choice: Choice, *, width: int
+    now: RecordingStatus, snapshot: Snapshot, settings: Settings, *, width: int
 ) -> Text:
     """Return how far the test is: a bar where its end is known, segments, c.o.v., time left."""
-    cov, target = math.nan, settings.target_cov
-    if choice.methods and choice.methods[0] in snapshot.results:
-        cov = reached_cov(snapshot, settings, choice.methods[0])
+    reached = precision(snapshot, settings)
+    cov, target = reached.cov, reached.target
     waits = (
         [sensor.name for sensor in now.sensors if sensor.state.is_overdue] if not now.closed else []
     )
     if snapshot.n_segments == 0:
         text = f"waits for the first {settings.segment:g} s segment"
         if snapshot.n_dropped:
-            text += f" without gaps; {snapshot.n_dropped} left out"
+            text += f" without gaps; {snapshot.n_dropped} excluded"
         return Text(text, "#9aa5b8")
     parts = [several(snapshot.n_segments, "segment")]
     if snapshot.n_dropped:
-        parts.append(f"{snapshot.n_dropped} left out")
+        parts.append(f"{snapshot.n_dropped} excluded")
     if not math.isnan(cov):
         parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
-    left = snapshot.time_left
+    left = reached.seconds_left
     if left is not None:
         left = max(0.0, left - _gone_on(now, snapshot))
     if snapshot.closed:
         if target is not None:
-            parts.append("target reached" if cov <= target else "target not reached")
+            parts.append("target reached" if reached.is_reached else "target not reached")
     elif waits:
         parts.append(f"waits for {', '.join(waits)}")
     elif target is not None:
-        parts.append("target reached" if cov <= target else _until_target(left, now))
+        parts.append("target reached" if reached.is_reached else _until_target(left, now))
     if now.ends_in is not None:
         parts.append(f"ends in {roughly(now.ends_in)}")
     left = min((each for each in (left, now.ends_in) if each is not None), default=None)
@@ -276,7 +317,7 @@ def _until_target(left: float | None, now: RecordingStatus) -> str:
 
 
 def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
-    """Return what is wrong with which sensor, and what to do; the worst first."""
+    """Return faults of sensors with remedies, the worst first."""
     found: list[tuple[int, str]] = []
     for sensor in now.sensors:
         if sensor.state.is_overdue:
@@ -286,7 +327,7 @@ def alerts(now: RecordingStatus, settings: Settings | None) -> list[Text]:
             found.append((3, f"{channels} is stuck: no signal; check the cable"))
         elif sensor.is_clipping:
             kept = settings is not None and settings.reject is False
-            effect = "are kept: do not trust its noise" if kept else "are left out"
+            effect = "are kept: do not trust its noise" if kept else "are excluded"
             found.append((4, f"{sensor.name} is clipping: segments with clipped samples {effect}"))
         if sensor.was_stuck:
             channels = ", ".join(f"{sensor.name}.{name}" for name in sensor.was_stuck)
@@ -303,8 +344,29 @@ def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
     return alert.format(sensor=sensor.name, time=time, reason=sensor.reason)
 
 
-def advice(snapshot: Snapshot, choice: Choice) -> Text:
-    """Return one line on what to know about what is shown."""
+def findings(snapshot: Snapshot, *, width: int) -> list[Text]:
+    """Return what the diagnosis has found wrong with the test, a line each, the worst first."""
+    styles = {Level.PROBLEM: "bold #ff6b6b", Level.WARNING: "yellow"}
+    names = Names.of(snapshot)
+    found = [
+        (alert(each, names), styles[each.level])
+        for each in snapshot.diagnostics.advice
+        if each.level in styles
+    ]
+    faulty = [(line, styles[Level.PROBLEM]) for line in faulty_channels(snapshot)]
+    unusable = [(line, styles[Level.PROBLEM]) for line in why_no_segment(snapshot)]
+    whole = [*unusable, *found[:1], *faulty, *found[1:]]
+    lines = [Text(f"▲ {words}", style) for words, style in whole]
+    for line in lines:
+        line.truncate(width, overflow="ellipsis")
+    return lines
+
+
+def advice(snapshot: Snapshot, choice: Choice, verdict: TestVerdict | None = None) -> Text:
+    """Return one line on what to know about what is shown: first the verdict so far."""
+    if verdict is not None:
+        todo = "" if verdict.prediction is None else f" {record_for(verdict.prediction)}"
+        return Text(f"{headline(verdict)}{todo}", STYLES_OF_VERDICTS[verdict.verdict])
     refused = [f"{method}: {why}" for method, why in snapshot.refused.items()]
     if refused:
         return Text(refused[0], "yellow")

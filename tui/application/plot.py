@@ -39,7 +39,7 @@ class PlainMonochrome(Monochrome):
 
 
 class FrequencyAxis(AxisFormatter):
-    """Ticks on an axis of log10 of frequency: decades, and 2 and 5 between where there is room."""
+    """Ticks on an axis of log10 of frequency: decades, and with room 2 and 5."""
 
     def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
         """Return tick positions in log10 of Hz."""

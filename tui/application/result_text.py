@@ -1,24 +1,27 @@
-"""What the application says when a test is over, and the details at any time; no Textual here."""
+"""The result and the details in the application. Does not use Textual."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from daq.protocols.block import EventKind
-from daq.results.band_summary import band_of, channel_means, reached_cov
-from daq.results.limits import exceeded
-from estimator.self_noise.band_means import band_edges
+from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.limits import judge
+from daq.results.partners import without_partners
+from daq.results.precision import channel_covs, precision
+from daq.results.verdict import Verdict
 from tui.application.panels import alerts, grouped, state
 from tui.output.diagnostics import details as diagnosis_details
 from tui.output.diagnostics import summary
 from tui.output.formatting import clock_time, level, level_with_error, utc
-from tui.output.results import left_out, limit_line, remarks
+from tui.output.results import left_out, remarks
+from tui.output.verdict_text import MARKS, STYLES, headline, limit_line, what_to_do
+from tui.output.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,7 +33,6 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from estimator.self_noise.band_means import FloatArray
 
 LATEST_EVENTS = 200
 MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
@@ -63,34 +65,31 @@ def _verdict(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> Ite
         for method, why in snapshot.refused.items():
             yield Text(f"{method}: {why}", BAD)
         return
-    failures = exceeded(bench, snapshot, settings)
-    if failures:
-        yield Text("✗ FAILED: not every channel meets the limits", BAD)
-        yield from (Text(f"  {limit_line(failure)}", BAD) for failure in failures)
-    elif bench is not None and bench.limits:
-        names = ", ".join(limit.name for limit in bench.limits)
-        yield Text(f"✓ PASSED: every channel meets {names}", "bold green")
-    else:
+    found = judge(bench, snapshot, settings)
+    if found is None:
         yield Text("No limits in the bench file: neither passed nor failed.", MUTED)
-    cov, target = reached_cov(snapshot, settings), settings.target_cov
-    if target is not None and not math.isnan(cov):
-        reached = cov <= target
-        text = f"{'✓' if reached else '✗'} c.o.v. {cov:.3f}, target {target:g}"
-        if not reached:
-            seconds = snapshot.elapsed * (cov / target) ** 2
-            text += f": would have taken {clock_time(seconds)} in all"
-        yield Text(text, "green" if reached else "yellow")
+    else:
+        style = STYLES[found.verdict]
+        yield Text(f"{MARKS[found.verdict]} {headline(found)}", style)
+        yield from (Text(line, style.removeprefix("bold ")) for line in what_to_do(found))
+        for each in sorted(found.limits, key=lambda each: each.verdict is Verdict.PASS):
+            style = STYLES[each.verdict].removeprefix("bold ")
+            yield Text(f"  {MARKS[each.verdict]} {limit_line(each)}", style)
+    reached = precision(snapshot, settings)
+    if reached.target is not None and not math.isnan(reached.cov):
+        mark, style = ("✓", "green") if reached.is_reached else ("✗", "yellow")
+        text = f"{mark} c.o.v. {reached.cov:.3f}, target {reached.target:g}"
+        if not reached.is_reached and reached.total is not None:
+            text += f": would have taken {clock_time(reached.total)} in all"
+        yield Text(text, style)
 
 
 def _channels(snapshot: Snapshot, settings: Settings) -> Table:
     method, noise = next(iter(snapshot.results.items()))
     band = band_of(settings, snapshot)
-    inside = slice(*band_edges(snapshot.frequency, band))
-    data = np.average(
-        snapshot.data_psd[inside], axis=0, weights=np.gradient(snapshot.frequency)[inside]
-    )
-    means = channel_means(noise, snapshot.frequency, settings, band)
-    cov = reached_cov_by_channel(snapshot, settings, method)
+    data = data_means(snapshot, band)
+    means = channel_means(noise, snapshot, settings, band)
+    cov = channel_covs(snapshot, settings, method)
     table = Table(
         box=None,
         pad_edge=False,
@@ -103,7 +102,12 @@ def _channels(snapshot: Snapshot, settings: Settings) -> Table:
     table.add_column("channel", no_wrap=True)
     for title in ("data", "noise, 95 %", "from", "to", "c.o.v."):
         table.add_column(title, justify="right", no_wrap=True)
+    alone = without_partners(snapshot, band)
     for column, label in enumerate(snapshot.channels):
+        if column in alone:
+            words = PARTNER_WORDS[alone[column]]
+            table.add_row(Text(label.name, "bold"), level(float(data[column])), Text(words, BAD))
+            continue
         mean = means[column]
         low, high = float(mean.low[0]), float(mean.high[0])
         table.add_row(
@@ -155,7 +159,7 @@ def _segments(snapshot: Snapshot, settings: Settings) -> Text:
         f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"
     )
     if snapshot.n_dropped:
-        text += f"; {snapshot.n_dropped} left out{left_out(snapshot)}"
+        text += f"; {snapshot.n_dropped} excluded{left_out(snapshot)}"
     return Text(text)
 
 
@@ -173,18 +177,6 @@ def _events(now: RecordingStatus) -> Table:
     if len(shown) < len(now.events):
         table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
     return table
-
-
-def reached_cov_by_channel(snapshot: Snapshot, settings: Settings, method: str) -> list[float]:
-    """Return the c.o.v. per frequency of every channel, median in the band."""
-    low, high = band_of(settings, snapshot)
-    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-    return [_median(column) for column in snapshot.results[method].cov[inside].T]
-
-
-def _median(values: FloatArray) -> float:
-    known = sorted(float(value) for value in values if math.isfinite(value))
-    return known[len(known) // 2] if known else math.nan
 
 
 def _item(text: str) -> Table:

@@ -38,7 +38,7 @@ WORDS = (
     ("c.o.v.", "relative scatter of the noise at one frequency, worst channel"),
     ("→ 0.05", "the scatter wanted: the bench file's target_cov"),
     ("segment", "a piece of the recording that is averaged; more make noise surer"),
-    ("left out", "segments with a gap, clipped, or disturbed"),
+    ("excluded", "segments with a gap, clipping or a transient"),
     ("gaps", "how often samples are missing, and (how many)"),
     *((state.value, meaning) for state, meaning in STATE_MEANINGS.items()),
     ("clipping", "the motion exceeds the sensor's range"),
@@ -67,13 +67,13 @@ def help_text() -> RenderableType:
 
 
 class TextScreen(ModalScreen[None]):
-    """Something to read: it scrolls, and is written anew while it is open.
+    """A text that scrolls and is updated while it is open.
 
     Parameters
     ----------
     title : str
     content : callable
-        Returns what to show.
+        Returns the text.
     refresh_every : float, optional
         Seconds; never, if not given.
     """
@@ -106,7 +106,7 @@ class TextScreen(ModalScreen[None]):
             self.set_interval(self._refresh_every, self.rewrite)
 
     def rewrite(self) -> None:
-        """Write it anew."""
+        """Update the text."""
         self.query_one(Static).update(self._content())
 
 
@@ -139,21 +139,43 @@ class MarkScreen(ModalScreen[str | None]):
         self.dismiss(event.value.strip() or "mark")
 
 
-class StopScreen(ModalScreen[bool]):
-    """Asks whether the recording is really to be stopped: it cannot be taken up again."""
+class QuestionScreen(ModalScreen[bool]):
+    """Asks before something that cannot be taken back: only ``y`` does it, no key struck twice.
+
+    Parameters
+    ----------
+    title, question : str
+    does : str
+        What ``y`` does.
+    """
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("x,enter,y", "dismiss(True)", "Stop"),
-        Binding("escape,n,q,ctrl+c", "dismiss(False)", "Go on"),
+        Binding("y", "dismiss(True)", "Yes"),
+        Binding("escape,n,q,ctrl+c", "dismiss(False)", "No"),
     ]
 
-    def __init__(self, so_far: str) -> None:
+    def __init__(self, title: str, question: str, *, does: str) -> None:
         super().__init__()
-        self._so_far = so_far
+        self._title, self._question, self._does = title, question, does
 
     def compose(self) -> ComposeResult:
         """Lay out the question."""
-        question = Static(Text(f"Stop the recording after {self._so_far}?"))
-        question.border_title = "stop"
-        question.border_subtitle = "x or enter stops · esc goes on"
+        question = Static(Text(self._question))
+        question.border_title = self._title
+        question.border_subtitle = f"y {self._does} · esc goes back"
         yield question
+
+
+class StopScreen(QuestionScreen):
+    """Asks whether the recording is really to be stopped: it cannot be taken up again."""
+
+    def __init__(self, so_far: str) -> None:
+        super().__init__("stop", f"Stop the recording after {so_far}?", does="stops")
+
+
+class StartScreen(QuestionScreen):
+    """Asks whether a new recording is to take the place of a test that is shown."""
+
+    def __init__(self, name: str) -> None:
+        question = f"Start a new recording? {name} is kept."
+        super().__init__("start", question, does="starts")

@@ -29,20 +29,21 @@ from tui.cli.options import (
 def tui(
     source: Annotated[
         Path | None,
-        typer.Argument(metavar="BENCH", help="Bench file, or a recording to look at."),
+        typer.Argument(metavar="BENCH", help="Bench file, or a recording to view."),
     ] = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application: start, watch and stop a huddle test.
 
-    Closing it does not stop a recording; opening it again finds it.
+    Closing the application does not stop a recording. Opening it again shows
+    the running recording.
     """
     if source is None:
         there = sorted(path.name for path in Path().glob("*.toml"))
-        here = f"; in this folder: {', '.join(there)}" if there else ""
+        here = f"; this folder has {', '.join(there)}" if there else ""
         raise typer.BadParameter(
-            f"expected a bench file (huddle init writes one) or a recording{here}; without either,"
-            " huddle demo shows a bench at work"
+            f"expected a bench file (huddle init writes one) or a recording{here}; huddle demo"
+            " needs neither"
         )
     from tui.commands.tui import open_application
 
@@ -67,7 +68,7 @@ def run(
             min=0.001,
             max=1.0,
             metavar="COV",
-            help="Stop when the noise in the band is known to this coefficient of variation.",
+            help="Stop when the noise in the band has this coefficient of variation.",
         ),
     ] = None,
     out: OutOption = None,
@@ -82,10 +83,11 @@ def run(
     csv: CsvOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Run one huddle test without a screen: record, estimate live, print the result.
+    """Run one huddle test: record, estimate live, print the result.
 
-    The recorder is a process of its own; the estimate follows its file.
-    Ctrl-C stops the recorder and still prints the result.
+    The recorder is a separate process; the estimate reads its file.
+    Ctrl-C stops the recorder, and the command prints the result. Ctrl-C
+    during the final estimate finishes it first; a second Ctrl-C aborts.
     """
     from tui.commands.run import run_test
 
@@ -111,13 +113,13 @@ def record(
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Record, and nothing else, until the duration is over or Ctrl-C."""
+    """Record without estimating, until the duration has passed or Ctrl-C."""
     from tui.commands.record import record_bench
 
     record_bench(bench, duration=duration, out=out, json=json)
 
 
-@examples("huddle watch night.h5", "huddle watch night.h5 --json -   (a line of JSON each update)")
+@examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")
 @with_logging
 @with_estimate_options
 def watch(
@@ -128,7 +130,7 @@ def watch(
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Watch a recording that another process writes."""
+    """Show the live estimate of a recording that another process writes."""
     from tui.commands.watch import watch_recording
 
     watch_recording(file, start=start, end=end, json=json, **wanted)
@@ -145,14 +147,14 @@ def serve(
     bench: BenchArgument,
     *,
     show: Annotated[
-        bool, typer.Option("--list", help="Show when the next runs start, and exit.")
+        bool, typer.Option("--list", help="Show the times of the next runs, and exit.")
     ] = False,
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Run huddle tests at the times that the bench file's cron lines give, until Ctrl-C.
+    """Run huddle tests on the schedule of the bench file, until Ctrl-C.
 
-    Options of the estimate hold for every run.
+    Options of the estimate apply to every run.
     """
     from tui.commands.serve import serve_bench
 

@@ -1,4 +1,4 @@
-"""The subcommands: options and help here, what they do elsewhere and loaded when they run."""
+"""Examples in the help of subcommands."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound="Callable[..., object]")
 
 EXAMPLES: dict[str, tuple[str, ...]] = {}
-"""Lines that the help of a subcommand shows, by the name of its function."""
+"""Example lines by the name of the function of a subcommand."""
 
 
 def examples(*lines: str) -> Callable[[Command], Command]:
-    """Give a subcommand examples."""
+    """Add examples to the help of a subcommand."""
 
     def keep(command: Command) -> Command:
         EXAMPLES[command.__name__] = lines

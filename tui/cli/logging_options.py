@@ -1,4 +1,4 @@
-"""``--log-level`` and ``--log-format``, for commands that run for long."""
+"""Options of log lines, for commands that run for long."""
 
 # ruff: noqa: PLC0415 - what sets up logging is imported when a command runs
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from tui.output.log_options import LogFormat, LogLevel
+from tui.output.logs.options import LogFormat, LogLevel
 
 _PANEL = "Log lines on standard error"
 
@@ -20,7 +20,7 @@ LogLevelOption: TypeAlias = Annotated[
         "--log-level",
         metavar="LEVEL",
         rich_help_panel=_PANEL,
-        help="debug, info, warning or error (default info).",
+        help="Lowest severity to write: debug, info, warning or error (default info).",
         show_default=False,
     ),
 ]
@@ -30,7 +30,8 @@ LogFormatOption: TypeAlias = Annotated[
         "--log-format",
         metavar="FORMAT",
         rich_help_panel=_PANEL,
-        help="text, or json: one object a line, and nothing else on standard error.",
+        help="text, or json: one JSON object per line, and no other output on standard error"
+        " (default text).",
         show_default=False,
     ),
 ]
@@ -40,7 +41,7 @@ LogFileOption: TypeAlias = Annotated[
         "--log-file",
         metavar="FILE",
         rich_help_panel=_PANEL,
-        help="Append log lines to this file. Without it the application writes none.",
+        help="Append log lines to this file (default: write none).",
     ),
 ]
 
@@ -48,7 +49,7 @@ LogFileOption: TypeAlias = Annotated[
 def _to_standard_error(
     *, log_level: LogLevelOption = LogLevel.INFO, log_format: LogFormatOption = LogFormat.TEXT
 ) -> None:
-    from tui.output.logs import configure
+    from tui.output.logs.lines import configure
 
     configure(log_level, log_format)
 
@@ -59,18 +60,18 @@ def _to_file(
     log_format: LogFormatOption = LogFormat.TEXT,
     log_file: LogFileOption = None,
 ) -> None:
-    from tui.output.logs import configure
+    from tui.output.logs.lines import configure
 
     configure(log_level, log_format, file=log_file, screen=False)
 
 
 def with_logging(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of its log lines, which go to standard error."""
+    """Add options of log lines on standard error to a command."""
     return _with(_to_standard_error, command)
 
 
 def with_log_file(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that has the screen to itself the options of its log lines."""
+    """Add options of log lines in a file to a command that uses the whole screen."""
     return _with(_to_file, command)
 
 

@@ -1,10 +1,9 @@
 """The ``huddle`` command: its subcommands, and the one place where errors become exit codes.
 
-What a subcommand needs is imported when it runs; so ``huddle --help`` loads neither numpy nor
-HDF5, and ``huddle record`` never loads Textual.
+Each subcommand imports its modules when it runs, so ``huddle --help`` loads neither numpy nor HDF5,
+and ``huddle record`` does not load Textual.
 
-The codes are in :mod:`tui.output.exit_codes`; every error of ours says which one it means by its
-type.
+Exit codes are in :mod:`tui.output.exit_codes`. The type of an error decides its code.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ if TYPE_CHECKING:
 
 
 class HuddleGroup(TyperGroup):
-    """Runs a subcommand and turns what it raises into a message and an exit code."""
+    """Runs a subcommand; converts its exceptions into messages and exit codes."""
 
     def main(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401 - the library's own
-        """Run the command; where standard error is no terminal, say usage errors line by line."""
+        """Run the command. Without a terminal, usage errors are plain lines."""
         if sys.stderr.isatty() or not options.get("standalone_mode", True):
             return super().main(*args, **options)
         try:
@@ -40,7 +39,7 @@ class HuddleGroup(TyperGroup):
         except typer.Abort:  # the end of standard input where an answer is expected
             code = ExitCode.TROUBLE
         except typer.TyperException as error:  # a usage error
-            from tui.output.logs import report_failure  # noqa: PLC0415 - seldom needed
+            from tui.output.logs.lines import report_failure  # noqa: PLC0415 - seldom needed
 
             context = getattr(error, "ctx", None)
             lines = [error.format_message()]
@@ -62,7 +61,7 @@ class HuddleGroup(TyperGroup):
         except (typer.Exit, typer.Abort, typer.TyperException):
             raise  # of the library, which shows usage errors itself
         except Exception as error:  # noqa: BLE001 -- the one place where errors become exit codes
-            from tui.output.logs import COMMAND, report_failure  # noqa: PLC0415 - seldom needed
+            from tui.output.logs.lines import COMMAND, report_failure  # noqa: PLC0415 - seldom needed
 
             code = exit_code(error)
             lines = list(messages(error))
@@ -90,7 +89,7 @@ def exit_code(error: BaseException) -> ExitCode | None:
 
 
 def messages(error: BaseException) -> Iterator[str]:
-    """Yield what went wrong, line by line."""
+    """Yield the message of an error, line by line."""
     if isinstance(error, BaseExceptionGroup):
         for inner in error.exceptions:
             yield from messages(inner)
@@ -114,14 +113,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help=(
-        "Self-noise of accelerometers that stand side by side: read them over their wires, "
-        "record, estimate - however they happen to point.\n\n"
-        "No hardware at hand? [b]huddle demo[/b] runs a whole test on a simulated bench."
+        "Measure the self-noise of accelerometers placed side by side (huddle test): read them, "
+        "record, estimate. The sensors may point in any direction.\n\n"
+        "Without hardware, [b]huddle demo[/b] runs a complete test on simulated sensors."
     ),
 )
 
 _PANELS = {
-    "On the bench": (
+    "Bench": (
         setup.init,
         setup.check,
         setup.plan,
@@ -160,7 +159,7 @@ def _options(
     ),
 ) -> None:
     del version
-    from tui.output.logs import configure  # noqa: PLC0415 - not for --help
+    from tui.output.logs.lines import configure  # noqa: PLC0415 - not for --help
 
     configure()
 

@@ -11,7 +11,7 @@ import typer
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, default_text, from_text
 
-_ESTIMATE_PANEL = "Estimate (default: as the bench file says)"
+_ESTIMATE_PANEL = "Estimate (defaults come from the bench file)"
 
 
 def duration(value: str | float) -> float:
@@ -28,7 +28,7 @@ BenchArgument: TypeAlias = Annotated[
 FileArgument: TypeAlias = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.h5).")]
 FilesArgument: TypeAlias = Annotated[
     list[Path],
-    typer.Argument(metavar="FILE", help="Recordings (.h5); several are estimated together."),
+    typer.Argument(metavar="FILE", help="Recordings (.h5). Several are estimated together."),
 ]
 OutOption: TypeAlias = Annotated[
     Path | None,
@@ -54,7 +54,7 @@ DurationOption: TypeAlias = Annotated[
         "-d",
         metavar="TIME",
         parser=duration,
-        help="Length of the recording, such as 90s, 20min or 3h (default: as the bench file says).",
+        help="Length of the recording, such as 90s, 20min or 3h (default: from the bench file).",
     ),
 ]
 StartOption: TypeAlias = Annotated[
@@ -62,15 +62,16 @@ StartOption: TypeAlias = Annotated[
     typer.Option(
         "--start",
         metavar="T",
-        help="Start of the span to estimate: UTC such as 2026-11-21T03:00:00, or a time after the"
-        " start of the recording such as 2h.",
+        help="Start of the time span to estimate: UTC such as 2026-11-21T03:00:00, or a time after"
+        " the start of the recording such as 2h.",
     ),
 ]
 EndOption: TypeAlias = Annotated[
-    str | None, typer.Option("--end", metavar="T", help="End of the span to estimate: as --start.")
+    str | None,
+    typer.Option("--end", metavar="T", help="End of the time span to estimate, as --start."),
 ]
 DiagnosticsOption: TypeAlias = Annotated[
-    bool, typer.Option("--diagnostics", help="Show the whole diagnosis of the test, band by band.")
+    bool, typer.Option("--diagnostics", help="Print the complete diagnosis of the test, by band.")
 ]
 SpeedOption: TypeAlias = Annotated[
     float | None,
@@ -78,7 +79,7 @@ SpeedOption: TypeAlias = Annotated[
         "--speed",
         metavar="FACTOR",
         min=0.01,
-        help="Speed of the simulation relative to real time (default: as the bench file says).",
+        help="Speed of the simulation relative to real time (default: from the bench file).",
     ),
 ]
 

@@ -27,6 +27,7 @@ from tui.cli.options import (
     "huddle estimate night.h5 --method all --band 1:20",
     "huddle estimate night.h5 --segment 60s --overlap 0.75 --json - --csv noise.csv",
     "huddle estimate night.h5 --octaves --dimension auto --diagnostics",
+    "huddle estimate night.h5 --noise-parameters",
 )
 @with_estimate_options
 def estimate(
@@ -35,18 +36,33 @@ def estimate(
     start: StartOption = None,
     end: EndOption = None,
     diagnostics: DiagnosticsOption = False,
+    noise_parameters: Annotated[
+        bool,
+        typer.Option(
+            "--noise-parameters",
+            help="Fit white, flicker, random-walk and f² noise to every channel; show the Allan "
+            "deviation, and compare with the data sheet in the bench file.",
+        ),
+    ] = False,
     json: JsonOption = None,
     csv: CsvOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate the self-noise of every channel from recordings.
 
-    What is not given here is taken from the bench file inside the recording.
+    Options not given come from the bench file inside the recording.
     """
     from tui.commands.estimate import estimate_recordings
 
     estimate_recordings(
-        files, start=start, end=end, diagnostics=diagnostics, json=json, csv=csv, **wanted
+        files,
+        start=start,
+        end=end,
+        diagnostics=diagnostics,
+        noise_parameters=noise_parameters,
+        json=json,
+        csv=csv,
+        **wanted,
     )
 
 
@@ -65,22 +81,21 @@ def report(
             "--out",
             "-o",
             metavar="FILE",
-            help="Where to write it: .html for a page, .pdf for paper; beside the recording "
-            "where not given.",
+            help="Report to write, .html or .pdf (default: beside the recording).",
         ),
     ] = None,
     start: StartOption = None,
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Write the calibration report of a huddle test, for the screen and for paper.
+    """Write the calibration report of a huddle test as HTML or PDF.
 
-    Noise of every channel with its uncertainty, pass or fail by the limits
-    of the bench file, alignment, clocks, what happened, a place to sign.
-    A recording that is still being written is reported on as it stands.
+    It contains the noise of every channel with its uncertainty, the
+    verdict on the limits of the bench file, alignment, clocks, events, and a
+    place to sign. The report of a growing recording is preliminary.
 
-    What is not given here is taken from the bench file inside the recording.
-    Ends with 1 where a limit is not met.
+    Options not given come from the bench file inside the recording.
+    The exit code is 1 if a limit is not met, and 4 if that is not decided.
     """
     from tui.commands.report import report_recordings
 
@@ -97,7 +112,7 @@ def report(
 def import_(
     sources: Annotated[
         list[Path],
-        typer.Argument(metavar="SRC", help="miniSEED (or what ObsPy reads), .npz, .mat, .csv."),
+        typer.Argument(metavar="SRC", help="miniSEED, .npz, .mat or .csv files."),
     ],
     *,
     out: Annotated[
@@ -106,7 +121,7 @@ def import_(
     bench: Annotated[
         Path | None,
         typer.Option(
-            "--bench", metavar="BENCH", help="Bench file: sensitivities, names, settings."
+            "--bench", metavar="BENCH", help="Bench file with sensitivities, names and settings."
         ),
     ] = None,
     response: Annotated[
@@ -114,22 +129,27 @@ def import_(
         typer.Option(
             "--response",
             metavar="FILE",
-            help="RESP or StationXML; a file with one response serves all channels.",
+            help="Response, RESP or StationXML. A file with one response applies to all channels.",
         ),
     ] = None,
     sampling_rate: Annotated[
         float | None,
-        typer.Option("--sampling-rate", metavar="HZ", min=1e-6, help="Where no file says it."),
+        typer.Option(
+            "--sampling-rate",
+            metavar="HZ",
+            min=1e-6,
+            help="Sampling rate, if the files do not give it.",
+        ),
     ] = None,
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Make a recording from files of other programs.
+    """Convert files of other programs into a recording.
 
-    [b]miniSEED[/b]  a sensor is network.station.location, its channels are codes
+    [b]miniSEED[/b]  a sensor is network.station.location, a channel is its code
 
-    [b].npz .mat[/b] sampling_rate (Hz), start_time (UTC) or none, and per sensor one array of
-    counts (n_samples, n_channels) that has its name
+    [b].npz .mat[/b] sampling_rate (Hz), start_time (UTC, optional), and for each sensor an array of
+    counts (n_samples, n_channels) under its name
 
     [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
     """
@@ -153,8 +173,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="Bench file with a \\[simulation] table, or of the paper: fig4, fig5, fig9, "
-            "fig12, fig13, setup1, setup2, waves.",
+            help="Bench file with a \\[simulation] table, or a scenario of the paper: fig4, fig5, "
+            "fig9, fig12, fig13, setup1, setup2, waves.",
         ),
     ],
     *,
@@ -164,7 +184,7 @@ def simulate(
     duration: DurationOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Write a recording straight from the model, without devices and wires."""
+    """Simulate a recording without devices."""
     from tui.simulation.write_recording import simulate_recording
 
     simulate_recording(scenario, out=out, duration=duration, json=json)
@@ -174,12 +194,12 @@ def simulate(
 def repair(
     file: FileArgument,
     *,
-    check: Annotated[bool, typer.Option("--check", help="Only look, change nothing.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check only; change nothing.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Check a recording's checksums, and close what a crash left open.
+    """Verify the checksums of a recording, and close it if a crash left it open.
 
-    Everything that had been acknowledged is kept; a tail that had not is cut off.
+    All acknowledged samples are kept. Samples not acknowledged are removed.
     """
     from tui.commands.repair import repair_recording
 

@@ -19,9 +19,9 @@ def init(
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FILE", help="Bench file to write.")
     ] = Path("bench.toml"),
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a commented bench file, to be filled in for your sensors."""
+    """Write a commented bench file to fill in."""
     from tui.commands.check import write_template
 
     write_template(out, force=force)
@@ -30,7 +30,8 @@ def init(
 @examples(
     "huddle check lab.toml",
     "huddle check lab.toml --no-devices --json -",
-    "huddle check --port /dev/ttyUSB0   (what is connected there, without a bench file)",
+    "huddle check lab.toml --write   (write serial numbers and port names into the file)",
+    "huddle check --port /dev/ttyUSB0   (identify a device without a bench file)",
 )
 def check(
     bench: Annotated[
@@ -42,45 +43,67 @@ def check(
         typer.Option(
             "--port",
             metavar="PORT",
-            help="Look on this port instead, for Epson accelerometers and for Modbus devices 1 to "
-            "5 and 80 at 9600 to 115200 baud.",
+            help="Search this port for Epson accelerometers, for Modbus devices 1 to 5 and 80 at "
+            "9600 to 115200 baud, and for lines of text.",
         ),
     ] = None,
     devices: Annotated[
-        bool, typer.Option("--devices/--no-devices", help="Talk to the devices as well.")
+        bool, typer.Option("--devices/--no-devices", help="Also connect to the devices.")
     ] = True,
+    write: Annotated[
+        bool,
+        typer.Option(
+            "--write",
+            help="Write missing serial numbers and persistent port names (/dev/serial/by-id) into "
+            "the bench file.",
+        ),
+    ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Validate a bench file, then ask each device who it is.
+    """Validate a bench file, then identify every device and read a few samples.
 
-    Every fault of the file is told at once, and so is every device that does not answer.
+    The command reports all errors in the file together, and all devices that
+    do not answer.
     """
     from tui.commands.check import check_bench, check_port
 
     if (bench is None) == (port is None):
         raise typer.BadParameter("expected either a bench file or --port PORT")
     if bench is not None:
-        check_bench(bench, devices=devices, json=json)
+        if write and not devices:
+            raise typer.BadParameter("--write needs the devices: leave out --no-devices")
+        check_bench(bench, devices=devices, write=write, json=json)
     elif port is not None:
         check_port(port, json=json)
 
 
 @examples(
     "huddle devices lab.toml",
-    "huddle devices lab.toml --speed 10 -o simulated.toml   (and in another terminal:)",
+    "huddle devices --driver labjack   (list the settings of a driver)",
+    "huddle devices lab.toml --speed 10 -o simulated.toml   (then in another terminal:)",
     "huddle run simulated.toml --duration 10min",
 )
 @with_logging
 def devices(
-    bench: BenchArgument,
+    bench: Annotated[
+        Path | None, typer.Argument(metavar="BENCH", help="Bench file (TOML).")
+    ] = None,
     *,
+    driver: Annotated[
+        str | None,
+        typer.Option(
+            "--driver",
+            metavar="NAME",
+            help="List the settings of this driver; serve no devices.",
+        ),
+    ] = None,
     speed: SpeedOption = None,
     faults: Annotated[
         Path | None,
         typer.Option(
             "--faults",
             metavar="FILE",
-            help="What goes wrong, and when: a TOML file (docs/simulation.md).",
+            help="Faults to simulate (TOML; docs/simulation.md).",
         ),
     ] = None,
     log: Annotated[
@@ -88,28 +111,35 @@ def devices(
         typer.Option(
             "--log",
             metavar="FILE",
-            help="Note each fault that strikes, and all that is sent: a line of JSON each.",
+            help="Log every fault and everything sent, one JSON object per line.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="FILE", help="Bench file to write; printed where not given."
+            "--out", "-o", metavar="FILE", help="Bench file to write (default: print it)."
         ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Serve a bench's devices, simulated, until Ctrl-C.
+    """Serve simulated devices of a bench file, until Ctrl-C.
 
-    Each device is a process of its own and speaks its real protocol, on a
-    pseudo-terminal or a TCP port. Makes a bench file that connects to them.
+    Each device is a separate process that speaks its real protocol on a
+    pseudo-terminal or a TCP port. The command makes a bench file that
+    connects to them.
 
-    What moves, and how noisy each sensor is, stands in the bench file under
-    simulation.
+    The table simulation of the bench file defines motion and noise.
     """
-    from tui.simulation.devices import serve_devices
+    if (bench is None) == (driver is None):
+        raise typer.BadParameter("expected either a bench file or --driver NAME")
+    if driver is not None:
+        from tui.commands.drivers import list_settings
 
-    serve_devices(bench, speed=speed, faults=faults, log=log, out=out, json=json)
+        list_settings(driver, json=json)
+    elif bench is not None:
+        from tui.simulation.devices import serve_devices
+
+        serve_devices(bench, speed=speed, faults=faults, log=log, out=out, json=json)
 
 
 @examples("huddle demo", "huddle demo --duration 10min --speed 10 --keep demo.h5")
@@ -123,7 +153,7 @@ def demo(
             "-d",
             metavar="TIME",
             parser=read_duration,
-            help="As in 90s, 20min, 3h; 5min where not given.",
+            help="Length of the recording, such as 90s, 20min or 3h (default 5min).",
         ),
     ] = None,
     speed: Annotated[
@@ -132,23 +162,24 @@ def demo(
             "--speed",
             metavar="FACTOR",
             min=0.01,
-            help="How many times as fast as life; 4 where not given.",
+            help="Speed of the simulation relative to real time (default 4).",
         ),
     ] = None,
     keep: Annotated[
-        Path | None, typer.Option("--keep", metavar="FILE", help="Keep the recording here.")
+        Path | None, typer.Option("--keep", metavar="FILE", help="Copy the recording to this file.")
     ] = None,
     table: Annotated[
-        bool, typer.Option("--table", help="Print the table even on a terminal.")
+        bool, typer.Option("--table", help="Print the table instead of opening the application.")
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Run a whole huddle test on a simulated bench, over its real protocols.
+    """Run a complete huddle test on simulated sensors.
 
-    Three triaxial accelerometers that do not point the same way stand on one
-    floor. Their noise is known, so the table shows which estimate is right.
+    The recorder reads three simulated triaxial accelerometers over their
+    real protocol. They point in different directions. Their noise is known,
+    so the table shows which estimate is right.
 
-    On a terminal it opens the application.
+    On a terminal the command opens the application.
     """
     from tui.commands.demo import run_demo
 
@@ -166,7 +197,7 @@ def plan(
             metavar="RATIO",
             min=1e-6,
             max=1e9,
-            help="Motion over noise, as ratio of PSDs.",
+            help="Ratio of motion to noise, of their PSDs.",
         ),
     ] = 1000.0,
     cov: Annotated[
@@ -176,14 +207,15 @@ def plan(
             metavar="COV",
             min=1e-4,
             max=1.0,
-            help="Wanted coefficient of variation at one frequency.",
+            help="Target coefficient of variation at one frequency.",
         ),
     ] = 0.05,
     json: JsonOption = None,
 ) -> None:
-    """Say how long to record for a wanted precision, with each method.
+    """Compute the duration of recording for a target precision, by method.
 
-    The sensors stand as the bench file's simulation says, or along common axes.
+    Orientations come from the simulation table of the bench file; without
+    it all sensors point the same way.
     """
     from tui.commands.plan import plan_test
 

@@ -20,24 +20,24 @@ def reproduce(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, clocks; "
-            "all if none.",
+            help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, clocks, "
+            "verdicts (default: all).",
         ),
     ] = None,
     *,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="FOLDER", help="Where figures go; reproduced/ where not given."
+            "--out", "-o", metavar="FOLDER", help="Folder of the figures (default: reproduced)."
         ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Reproduce the paper's figures from the model and the estimators, beside the theory.
+    """Reproduce the figures of the paper and compare them with theory.
 
-    Samples are simulated at the paper's own length, three and ten hours; all
-    studies together take a few minutes. Exits with 1 if a point is off theory
-    by more than statistical error.
+    Recordings are simulated at the length of the paper, three and ten hours.
+    All studies together take a few minutes. The exit code is 1 if a point
+    deviates from theory by more than its statistical error.
     """
     from tui.studies.reproduce import run
 

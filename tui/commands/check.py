@@ -1,4 +1,4 @@
-"""Writing and checking bench files."""
+"""``huddle init`` and ``huddle check``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ from rich.table import Table
 
 from daq.acquisition.device_check import discover, probe_bench, search_description
 from daq.bench.durations import format_duration
+from daq.bench.editing import set_sensor_values
+from daq.bench.toml_text import to_toml
 from daq.drivers.bench_file import load
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
+from daq.transport.serial_ports import stable_path
+from tui.commands.drivers import print_others, summaries
 from tui.output.console import check_places, console, for_people, write_json, write_text
 from tui.output.formatting import signed
 from tui.output.json_values import plain
@@ -24,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from daq.acquisition.device_check import SensorCheck
+    from daq.acquisition.device_check import DiscoveredDevice, SensorCheck
     from daq.bench.model import Bench
     from daq.errors import DeviceError
 
@@ -35,7 +39,7 @@ def write_template(out: Path, *, force: bool) -> None:
     Raises
     ------
     typer.BadParameter
-        There is one already, or no folder for it.
+        The file exists, or its folder does not.
     """
     if out.exists() and not force:
         raise typer.BadParameter(f"{out}: exists already; --force replaces it")
@@ -43,17 +47,20 @@ def write_template(out: Path, *, force: bool) -> None:
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     write_text(str(out), text)
     console().print(f"{out} written. Fill in ports and sensitivities, then: huddle check {out}")
+    print_others(text)
 
 
-def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
-    """Validate a bench file and ask its devices who they are.
+def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | None) -> None:
+    """Validate a bench file and identify its devices.
+
+    With ``write``, missing serial numbers and persistent port names are written into the file.
 
     Raises
     ------
     BenchFileError
-        With every fault of the file.
+        With every error in the file.
     ExceptionGroup
-        Of a DeviceError for every port that is in trouble, after the others have been shown.
+        With a DeviceError for every port that failed, after the others have been shown.
     """
     bench = load(path)
     screen = for_people(json)
@@ -70,6 +77,11 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
                 for remark in _remarks(entry):
                     screen.print(f"  {entry.information.sensor}: {remark}")
             screen.print(_channel_table(found))
+    if write and (identities := new_identities(bench, found)):
+        set_sensor_values(path, identities)
+        for name, values in identities.items():
+            for key, value in values.items():
+                screen.print(f'{path}: sensor {name}: {key} = "{value}" written')
     write_json(
         json,
         {
@@ -82,22 +94,40 @@ def check_bench(path: Path, *, devices: bool, json: str | None) -> None:
         raise ExceptionGroup("devices in trouble", errors)
 
 
+def new_identities(bench: Bench, found: Sequence[SensorCheck]) -> dict[str, dict[str, str]]:
+    """Return identities of sensors that the bench file lacks."""
+    told = {entry.information.sensor: entry.information for entry in found}
+    identities: dict[str, dict[str, str]] = {}
+    for sensor in bench.sensors:
+        if sensor.name not in told:
+            continue
+        values = {}
+        serial_number = told[sensor.name].serial_number
+        if serial_number and not sensor.serial_number:
+            values["serial_number"] = serial_number
+        if (port := stable_path(sensor.port)) != sensor.port:
+            values["port"] = port
+        if values:
+            identities[sensor.name] = values
+    return identities
+
+
 def check_port(port: str, *, json: str | None) -> None:
-    """Look for devices on a port, and say what a bench file must say to read them.
+    """Search a port for devices, and show the settings of a bench file that reads them.
 
     Raises
     ------
     NotConnectedError
         The port cannot be opened.
     NoAnswerError
-        Nothing answers there.
+        No device answers.
     """
     found = asyncio.run(discover(port, SystemClock()))
     write_json(json, {"port": port, "devices": plain(found)})
     if not found:
         raise NoAnswerError(
-            f"port {port}: nothing answers as {search_description(port)}; check power and"
-            " cable; other devices, rates and addresses must be named in a bench file"
+            f"port {port}: no reply as {search_description(port)}; check power and cable; for other"
+            " devices, rates or addresses write a bench file"
         )
     table = _table(["driver", "settings", "device"])
     for device in found:
@@ -107,7 +137,29 @@ def check_port(port: str, *, json: str | None) -> None:
             said = f"{about.model} {about.serial_number} {about.firmware} {said}".strip()
         settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
         table.add_row(device.driver, settings, said)
-    for_people(json).print(table)
+    screen = for_people(json)
+    screen.print(table)
+    for device in found:
+        if device.driver == "text":
+            screen.print("\nFor the bench file, with names and sensitivities to be filled in:\n")
+            screen.print(_sensor_table(device), markup=False, highlight=False)
+
+
+def _sensor_table(device: DiscoveredDevice) -> str:
+    """Return a device that sends text as a table of the bench file."""
+    places = device.settings.get("columns") or device.settings.get("channel_names") or ()
+    channels = [
+        {"name": place if isinstance(place, str) else f"column {place}", "sensitivity": 1.0}
+        for place in places
+    ]
+    sensor = {
+        "name": "text",
+        "driver": device.driver,
+        "port": device.port,
+        "channels": channels,
+        "settings": device.settings,
+    }
+    return to_toml({"sensors": [sensor]})
 
 
 def _summary(bench: Bench) -> str:
@@ -117,11 +169,19 @@ def _summary(bench: Bench) -> str:
         for sensor in bench.sensors
     )
     return (
-        f"{bench.name}: the bench file is right.\n"
+        f"Bench file {bench.source or bench.name}: no errors.\n"
         f"  sensors   {sensors}\n"
+        f"{_drivers(bench)}"
         f"  estimate  {', '.join(estimate.methods)}, {format_duration(estimate.segment)} segments, "
         f"{estimate.window}, {estimate.overlap:.0%} overlap"
     )
+
+
+def _drivers(bench: Bench) -> str:
+    """Return a line for each driver of the bench, with its summary."""
+    told = summaries()
+    names = dict.fromkeys(sensor.driver for sensor in bench.sensors)
+    return "".join(f"  driver    {name}: {told[name]}\n" for name in names)
 
 
 def _table(columns: Sequence[str]) -> Table:
@@ -150,7 +210,7 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
 
 
 def _remarks(entry: SensorCheck) -> Iterator[str]:
-    """Yield what else there is to say of a sensor, a line each."""
+    """Yield remarks on a sensor, one per line."""
     if entry.clipped:
         yield "clipped: samples at the end of the range"
     if entry.n_missing:
@@ -178,6 +238,6 @@ def _channel_table(found: Sequence[SensorCheck]) -> Table:
                 signed(channel.rms, ".3g"),
                 f"{signed(channel.minimum, '.4g')} … {signed(channel.maximum, '.4g')}",
                 channel.unit,
-                "stuck: nothing connected?" if channel.is_stuck else "",
+                "constant: nothing connected?" if channel.is_stuck else "",
             )
     return table

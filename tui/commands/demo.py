@@ -1,4 +1,4 @@
-"""``huddle demo``: a whole huddle test on a simulated bench, beside the truth."""
+"""``huddle demo``: a complete huddle test on simulated sensors, compared with the truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import typer
 from rich.table import Table
 from rich.text import Text
@@ -21,9 +20,9 @@ from daq.bench.loading import dump
 from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.band_summary import band_of, correlation_of
-from daq.results.clock_effect import effect
-from estimator.self_noise.band_means import band_edges, band_means
+from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.clock_effect import added_in_bands
+from estimator.self_noise.band_means import band_edges
 from tui.commands.run import result_of
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
@@ -34,22 +33,19 @@ from tui.simulation.devices import scenario_of, simulated
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
-    from estimator.self_noise.band_means import FloatArray
     from sim_devices.world.scenario import Scenario
 
 _LOGGER = logging.getLogger(__name__)
 METHODS = ("three-channel", "three-sensor")
 ALL_AT_ONCE = 2.773
-"""Standard deviations within which nine errors lie together 95 times in 100 (Bonferroni)."""
-CLOCK_MARGIN = 4.0
-"""What clocks add goes with the square of what is left between them: twice its rms is allowed."""
-TOLD = 0.01
-"""Share of the noise from which on the table says what the clocks may have added."""
+"""Half width of a simultaneous 95 % interval of nine values in standard deviations, Bonferroni."""
+SHOWN_SHARE = 0.01
+"""Share of the noise above which the table states the effect of the clocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """One channel's noise in the band by one method, beside the truth; PSD in unit²/Hz."""
+    """Noise of one channel in the band by one method, and the truth; PSD in unit²/Hz."""
 
     sensor: str
     channel: str
@@ -59,7 +55,7 @@ class Compared:
     low: float
     high: float
     clocks: float = 0.0
-    """What the clocks may have added; taken off the interval's lower end."""
+    """Largest effect of the clocks; the lower limit allows for it."""
 
     @property
     def covers(self) -> bool:
@@ -75,7 +71,7 @@ def run_demo(
     table: bool,
     json: str | None,
 ) -> None:
-    """Serve the demo's bench, record it, estimate, and compare; or open the application on it."""
+    """Serve the demo bench; then record, estimate and compare, or open the application."""
     check_places(None if keep is None else str(keep))
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     bench = parse(text, "demo")
@@ -110,10 +106,12 @@ def run_demo(
     added = max(entry.clocks / entry.true_psd for entry in compared)
     screen.print(
         Text.assemble(
-            (f"Self-noise from {low:g} to {high:g} Hz", "bold"),
-            f" in dB re 1 ({snapshot.unit})²/Hz, {snapshot.n_segments} segments;\n"
-            "± is the 95 % interval of all nine at once, ✓ where it covers the truth",
-            f"\nand what its clocks may add: up to {_percent(added)}" if added >= TOLD else "",
+            (f"Self-noise, mean over {low:g} to {high:g} Hz", "bold"),
+            f", dB re 1 ({snapshot.unit})²/Hz, {snapshot.n_segments} segments\n"
+            "± simultaneous 95 % interval of all channels; ✓ it covers the truth",
+            f"\nThe interval includes the effect of the clocks, up to {_percent(added)}."
+            if added >= SHOWN_SHARE
+            else "",
         )
     )
     screen.print(comparison_table(compared, snapshot, settings))
@@ -131,11 +129,10 @@ def _show(path: Path, settings: Settings) -> Path | None:
 
 
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
-    """Record without a screen; return whether Ctrl-C ended it."""
+    """Record; return whether Ctrl-C ended it."""
     notices().print(
-        "Three simulated accelerometers on their serial protocol, "
-        f"{format_duration(duration)} at {speed:g} times real time: it takes "
-        f"{format_duration(duration / speed)}."
+        f"Recording three simulated accelerometers for {format_duration(duration)} at {speed:g} "
+        f"times real time, which takes {format_duration(duration / speed)}."
     )
     recorder = RecorderProcess(path, out, duration=duration)
     try:
@@ -152,24 +149,18 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
 
 
 def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:
-    """Return every channel's noise in the band by each method, with the truth."""
-    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
+    """Return the noise of every channel in the band by each method, with the truth."""
+    band = band_of(settings, snapshot)
+    edges = band_edges(snapshot.frequency, band)
     inside = snapshot.frequency[slice(*edges)]
-    correlation = correlation_of(settings)
-    clocks = _added_by_clocks(snapshot, settings)
     compared = []
     for method, noise in snapshot.results.items():
+        means = channel_means(noise, snapshot, settings, band, quantile=ALL_AT_ONCE)
         places: dict[str, int] = {}
-        for column, label in enumerate(snapshot.channels):
+        for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
-            mean = band_means(
-                noise.noise_psd[:, column],
-                noise.cov[:, column],
-                edges,
-                correlation,
-                quantile=ALL_AT_ONCE,
-            )
+            clocks = float(added_in_bands(snapshot, settings, edges, column)[0])
             compared.append(
                 Compared(
                     sensor=label.sensor,
@@ -177,34 +168,26 @@ def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[
                     method=method,
                     true_psd=float(scenario.true_noise_psd(label.sensor, place, inside).mean()),
                     noise_psd=float(mean.mean[0]),
-                    low=float(mean.low[0] - clocks[column]),
+                    low=float(mean.low[0]),
                     high=float(mean.high[0]),
-                    clocks=float(clocks[column]),
+                    clocks=clocks,
                 )
             )
     return compared
 
 
-def _added_by_clocks(snapshot: Snapshot, settings: Settings) -> FloatArray:
-    """Return what clocks may have added to each channel's mean noise in the band, in unit²/Hz."""
-    first = next(iter(snapshot.results.values()), None)
-    if first is None:
-        return np.zeros(len(snapshot.channels))
-    edges = band_edges(snapshot.frequency, band_of(settings, snapshot))
-    noise = np.abs(first.noise_psd[slice(*edges)].mean(axis=0))
-    share = CLOCK_MARGIN * np.nan_to_num(effect(snapshot, settings))
-    return np.asarray(np.minimum(share, 1.0) * noise)
-
-
 def _percent(share: float) -> str:
-    return "all of it (this demo is too short to know them)" if share >= 1 else f"{share:.0%} of it"
+    return (
+        "100 % of the noise (too short to measure the clocks)"
+        if share >= 1
+        else f"{share:.0%} of the noise"
+    )
 
 
 def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Settings) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
     band = band_of(settings, snapshot)
-    edges = band_edges(snapshot.frequency, band)
-    data = snapshot.data_psd[slice(*edges)].mean(axis=0)
+    data = data_means(snapshot, band)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("channel", "data", "true noise"):
         table.add_column(name, justify="left" if name == "channel" else "right")
@@ -228,7 +211,7 @@ def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Set
 
 
 def verdict(compared: list[Compared]) -> list[str]:
-    """Say in plain words what the table shows."""
+    """Return the conclusions from the table."""
     lines = []
     for method in METHODS:
         entries = [entry for entry in compared if entry.method == method]
@@ -242,9 +225,8 @@ def verdict(compared: list[Compared]) -> list[str]:
             + "."
         )
     lines.append(
-        "The sensors do not point the same way, so the motion they share leaks into the "
-        "three-channel estimate: it reads too high, or even below zero, which no noise can be. "
-        "The three-sensor estimate needs no alignment."
+        "The sensors point in different directions, so motion leaks into the three-channel "
+        "estimate, which is too high or below zero. The three-sensor estimate needs no alignment."
     )
     return lines
 

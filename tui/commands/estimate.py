@@ -6,23 +6,39 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from daq.estimation.estimation import estimate
-from daq.results.limits import exceeded
+from daq.results.limits import judge
+from daq.results.noise_parameters import noise_parameters as parameters_of
+from daq.results.noise_parameters import quantisation_shares
+from daq.results.verdict import Verdict
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
-from tui.output.exit_codes import ExitCode
 from tui.output.json_document import document
-from tui.output.results import curves_csv, limit_line, remarks, result_table, result_title
+from tui.output.noise_parameters import (
+    allan_table,
+    notes,
+    quantisation_notes,
+    sheet_table,
+    term_table,
+)
+from tui.output.results import curves_csv, remarks, result_table, result_title
+from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, what_to_do
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from rich.console import Console
+
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.noise_parameters import ChannelNoise
+    from daq.results.verdict import TestVerdict
 
 
 def estimate_recordings(
@@ -31,21 +47,42 @@ def estimate_recordings(
     start: str | None,
     end: str | None,
     diagnostics: bool = False,
+    noise_parameters: bool = False,
     json: str | None,
     csv: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Estimate recordings and show the result.
 
-    Settings come from `wanted` and, where that holds None, from the first recording. `diagnostics`
-    shows the whole diagnosis, and not only what needs attention.
+    Settings come from `wanted`; those that are None come from the first recording. With
+    `diagnostics` the complete diagnosis is shown, otherwise its findings;
+    `noise_parameters` fits terms to the noise of every channel.
     """
     check_places(json, csv)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
-    met = show_result(snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics)
-    hint(f"for a report: huddle report {files[0]}")
-    if not met:
-        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+    found = show_result(
+        snapshot,
+        settings,
+        json=json,
+        csv=csv,
+        bench=bench,
+        diagnostics=diagnostics,
+        parameters=parameters_of(snapshot, settings, bench) if noise_parameters else None,
+    )
+    hint(f"For a report: huddle report {files[0]}")
+    exit_with(found)
+
+
+def exit_with(found: TestVerdict | None) -> None:
+    """End the command with the exit code of the verdict.
+
+    Raises
+    ------
+    typer.Exit
+        With 1 if a limit is not met, with 4 if that is not decided.
+    """
+    if found is not None and EXIT_CODES[found.verdict]:
+        raise typer.Exit(EXIT_CODES[found.verdict])
 
 
 def estimated(
@@ -80,13 +117,14 @@ def show_result(
     csv: str | None,
     bench: Bench | None,
     diagnostics: bool = False,
-) -> bool:
-    """Print the table for people, and write what programs asked for.
+    parameters: Sequence[ChannelNoise] | None = None,
+) -> TestVerdict | None:
+    """Print the table, and write JSON and CSV if requested.
 
     Returns
     -------
-    bool
-        Whether every channel meets the limits of the bench file.
+    TestVerdict or None
+        None where the bench file has no limits.
     """
     screen = for_people(json, csv)
     table = result_table(snapshot, settings)  # refuses a band without frequencies
@@ -94,15 +132,40 @@ def show_result(
     screen.print(table)
     for line in remarks(snapshot):
         screen.print(line)
+    for line in quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)):
+        screen.print(line)
+    if parameters is not None:
+        _show_parameters(screen, parameters, snapshot.unit)
     for part in details(snapshot) if diagnostics else summary(snapshot):
         screen.print(part)
-    write_json(json, document(snapshot))
+    found = judge(bench, snapshot, settings)
+    write_json(json, document(snapshot, found, parameters))
     if csv is not None:
         write_text(csv, curves_csv(snapshot))
-    failures = exceeded(bench, snapshot, settings)
-    for failure in failures:
-        screen.print(limit_line(failure), style="red")
-    if bench is not None and bench.limits and not failures:
-        names = ", ".join(limit.name for limit in bench.limits)
-        screen.print(f"every channel meets {names}", style="green")
-    return not failures
+    if found is not None:
+        for each in found.limits:
+            if each.verdict is not Verdict.PASS:
+                screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
+        screen.print(headline(found), style=STYLES[found.verdict])
+        for line in what_to_do(found):
+            screen.print(line)
+    return found
+
+
+def _show_parameters(screen: Console, found: Sequence[ChannelNoise], unit: str) -> None:
+    """Print the noise parameters as tables."""
+    for title, (header, rows) in (
+        (f"Noise terms at 1 Hz, dB re 1 ({unit})²/Hz, with standard errors", term_table(found)),
+        (f"Allan deviation of the self-noise in {unit}, with 95 % intervals", allan_table(found)),
+        ("Data sheet", sheet_table(found)),
+    ):
+        if rows:
+            table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+            for number, name in enumerate(header):
+                table.add_column(name, justify="right" if number else "left", no_wrap=True)
+            for row in rows:
+                table.add_row(*map(Text, row))
+            screen.print(Text(title, "bold"))
+            screen.print(table)
+    for line in notes(found):
+        screen.print(line)

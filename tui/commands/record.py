@@ -1,4 +1,4 @@
-"""``huddle record``: the recorder, alone."""
+"""``huddle record``: the recorder without an estimate."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 GAP_INTERVAL = 60.0
-"""Seconds at least between two log lines about gaps: a polled sensor may have many."""
+"""Minimum seconds between two log lines about gaps; a polled sensor can have many."""
 
 
 def record_bench(path: Path, *, duration: float | None, out: Path | None, json: str | None) -> None:
-    """Record a bench until the duration is over, or until SIGINT or SIGTERM.
+    """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
 
     Raises
     ------
     ExceptionGroup
-        Of a DeviceError for every sensor that cannot be used at the start.
+        With a DeviceError for every sensor that cannot be used at the start.
     """
     bench = load(path)
     if duration is None:
@@ -61,7 +61,7 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
 
 
 class GapLog:
-    """Logs how many samples are missing, when that has grown: once a minute at most.
+    """Logs the number of missing samples when it has grown, once a minute at most.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class GapLog:
         self._known: dict[str, int] = {}
 
     def look(self, status: RecorderStatus) -> None:
-        """Take the recorder's state."""
+        """Log new gaps of a recorder's status."""
         if self._now() < self._next and not status.closed:
             return
         for name, sensor in status.sensors.items():
@@ -90,7 +90,7 @@ class GapLog:
 
 
 def progress_line(status: RecorderStatus, duration: float | None = None) -> str:
-    """Return what is safe of every sensor, and when a run of this duration ends."""
+    """Return the safe samples of every sensor, and the time until a run of this duration ends."""
     sensors = "  ".join(
         f"{name} {sensor.samples}"
         + (f" ({several(sensor.gaps, 'gap')}, {sensor.missing} missing)" if sensor.gaps else "")

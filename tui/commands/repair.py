@@ -1,4 +1,4 @@
-"""``huddle repair``: what survived a crash, checked and closed."""
+"""``huddle repair``: verifies a recording, and closes it after a crash."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def repair_recording(path: Path, *, check: bool, json: str | None) -> None:
-    """Check every acknowledged block and, unless only asked to check, close the recording.
+    """Verify every acknowledged block; close the recording unless `check` is set.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def repair_recording(path: Path, *, check: bool, json: str | None) -> None:
     report = verify(path) if check else repair(path)
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("sensor")
-    for name in ("samples", "blocks", "gaps", "damaged blocks", "rows never acknowledged"):
+    for name in ("samples", "blocks", "gaps", "damaged blocks", "unacknowledged rows"):
         table.add_column(name, justify="right")
     for sensor in report.sensors:
         table.add_row(
@@ -43,4 +43,4 @@ def repair_recording(path: Path, *, check: bool, json: str | None) -> None:
     screen.print(f"{path}: {state}")
     write_json(json, plain(report) | {"path": str(path)})
     if not report.intact:
-        raise RecordingError(f"{path}: blocks that had been acknowledged are damaged")
+        raise RecordingError(f"{path}: acknowledged blocks are damaged")

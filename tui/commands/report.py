@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.results.limits import exceeded
-from tui.commands.estimate import estimated
+from daq.results.limits import judge
+from tui.commands.estimate import estimated, exit_with
 from tui.output.console import check_places, console, notices
-from tui.output.exit_codes import ExitCode
+from tui.output.extras import require
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,25 +37,27 @@ def report_recordings(
     Raises
     ------
     typer.Exit
-        1 where a limit is not met, when the report has been written.
+        With 1 if a limit is not met, with 4 if that is not decided, after the report was written.
     """
     out = checked(files[0].with_suffix(".html") if out is None else out)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
     write_report(snapshot, out, recordings=files, settings=settings, screen=console())
-    if exceeded(bench, snapshot, settings):
-        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+    exit_with(judge(bench, snapshot, settings))
 
 
 def checked(out: Path) -> Path:
-    """Refuse the name of a report before anything is measured.
+    """Check the name of a report before the measurement.
 
     Raises
     ------
     typer.BadParameter
-        If its suffix says nothing, or its folder is not there.
+        The suffix is unknown, or the folder does not exist.
+    MissingPackageError
+        A package that writes reports is missing.
     """
+    require("matplotlib", "jinja2")
     if out.suffix.lower() not in SUFFIXES:
-        raise typer.BadParameter(f"{out}: expected a report's name to end in .html or .pdf")
+        raise typer.BadParameter(f"{out}: expected a file name that ends in .html or .pdf")
     check_places(str(out))
     return out
 
@@ -68,7 +70,7 @@ def write_report(
     settings: Settings,
     screen: Console,
 ) -> None:
-    """Write a report and say so on a screen.
+    """Write a report, and print its verdict and name.
 
     Raises
     ------

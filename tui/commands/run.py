@@ -1,4 +1,4 @@
-"""``huddle run``: a recorder in a process of its own, and the estimate that follows its file."""
+"""``huddle run``: starts a recorder process and estimates its recording."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from daq.acquisition.recorder import recording_path
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import shortest_duration
 from daq.drivers.bench_file import load
-from daq.errors import HuddleError
+from daq.errors import HuddleError, RecordingError
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import RecordingLeftOpenError, follow
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
+from daq.recording.reader import Recording
 from daq.recording.repair import repair
-from daq.results.band_summary import reached_cov
+from daq.results.precision import precision
 from daq.results.store import store_results
-from estimator.errors import EstimatorError
-from tui.commands.estimate import show_result
+from tui.commands.estimate import exit_with, show_result
 from tui.commands.report import checked, write_report
 from tui.output.console import check_places, for_people, hint, progress
 from tui.output.exit_codes import ExitCode
 from tui.output.formatting import clock_time, time_left
+from tui.output.results import why_no_segment
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.runs.interrupt import defer_interrupt
 from tui.runs.recorder_process import RecorderProcess
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus
 
 _LOGGER = logging.getLogger(__name__)
+STATUS_INTERVAL = 1.0
+"""Seconds between two looks at a recorder whose estimate has failed."""
 
 
 def run_test(
@@ -63,9 +66,10 @@ def run_test(
     Raises
     ------
     HuddleError
-        Whatever kept the recorder from going on; the result of what was recorded is shown before.
+        The recorder failed; the result of what was recorded is shown before.
     typer.Exit
-        130 after Ctrl-C, 1 where a limit is not met: when the result has been shown.
+        With 130 after Ctrl-C, 1 if a limit is not met, 4 if that is not decided, after the result
+        has been shown.
     """
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
@@ -86,13 +90,13 @@ def run_test(
         hint("Ctrl-C stops the recording and shows the result")
         with defer_interrupt(recorder.request_stop) as interruption:
             snapshot = result_of(recorder, settings, duration=duration, until_cov=until_cov)
-            met = show_result(
+            # First into the recording, whatever becomes of screens and other files.
+            stored = _Stored(out, snapshot)
+            found = show_result(
                 snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
             )
-            try:
-                store_results(out, snapshot)
-            finally:
-                recorder.check()  # its error says more than one that follows from it
+            recorder.check()  # its error says more than one that follows from it
+            stored.check()
             if report is not None:
                 write_report(
                     snapshot,
@@ -107,11 +111,26 @@ def run_test(
     finally:
         recorder.close()
     if report is None:
-        hint(f"for a report: huddle report {out}")
+        hint(f"For a report: huddle report {out}")
     if interruption.pressed:
         raise typer.Exit(ExitCode.INTERRUPTED)
-    if not met:
-        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+    exit_with(found)
+
+
+class _Stored:
+    """Writes the results into the recording, and raises later what kept it from that."""
+
+    def __init__(self, out: Path, snapshot: Snapshot) -> None:
+        self._error: RecordingError | None = None
+        try:
+            store_results(out, snapshot)
+        except RecordingError as error:
+            self._error = error
+
+    def check(self) -> None:
+        """Raise the error that occurred, if there was one."""
+        if self._error is not None:
+            raise self._error
 
 
 def result_of(
@@ -121,14 +140,15 @@ def result_of(
     duration: float | None,
     until_cov: float | None = None,
 ) -> Snapshot:
-    """Follow the recording of a recorder to its end, and return the result of all of it.
+    """Follow the recording of a recorder to its end, and return its result.
 
-    A recording that its recorder left open is closed and estimated as it is.
+    A recording that its recorder left open is repaired and estimated. If the estimate fails while
+    the recorder runs, the recorder goes on to its end, and the whole recording is estimated then.
 
     Raises
     ------
     HuddleError, EstimatorError
-        What the recorder failed with, or else why there is no result.
+        The recorder failed, or the recording gives no result.
     """
     with _progress(duration) as bar:
         observer = _Run(recorder, bar, until_cov)
@@ -138,11 +158,19 @@ def result_of(
             )
         except RecordingLeftOpenError:
             snapshot = None
-        except (HuddleError, EstimatorError):
+        except Exception as error:
             recorder.check()  # its error says more than one that follows from it
-            raise
+            if recorder.ended or getattr(error, "is_usage_error", False):
+                raise
+            reason = str(error) or type(error).__name__
+            _LOGGER.error(  # noqa: TRY400 - the final estimate raises it again if it stays
+                "the live estimate failed (%s); the recording continues, and is estimated when it"
+                " has ended. Ctrl-C ends it now",
+                reason,
+            )
+            snapshot = _estimate_at_end(recorder, settings)
     if snapshot is None:
-        _LOGGER.error("%s: the recorder ended without closing it", recorder.out)
+        _LOGGER.error("%s: the recorder ended without closing the recording", recorder.out)
         try:
             repair(recorder.out)
         except HuddleError as error:  # a full disk; the file can be read all the same
@@ -152,58 +180,74 @@ def result_of(
     return snapshot
 
 
+def _estimate_at_end(recorder: RecorderProcess, settings: Settings) -> Snapshot | None:
+    """Wait for the recorder, and estimate its recording; None if it was left open."""
+    while not recorder.ends_within(STATUS_INTERVAL):
+        pass
+    recorder.check()
+    with Recording.open(recorder.out) as recording:
+        closed = recording.closed
+    return estimate([recorder.out], settings) if closed else None
+
+
 class _Run:
-    """Shows the progress of a run, and stops its recorder when the noise is known well enough."""
+    """Shows the progress of a run, and stops its recorder when the target c.o.v. is reached."""
 
     def __init__(self, recorder: RecorderProcess, bar: _Bar, until_cov: float | None) -> None:
         self._recorder, self._bar, self._until_cov = recorder, bar, until_cov
+        self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
-        """Show nothing: the line shows the estimate alone."""
+        """Show nothing; the progress line shows the estimate only."""
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Show how far the run is."""
+        """Show the progress of the run."""
         if snapshot.closed:
             return
         self._bar.recording(snapshot, settings)
-        if self._until_cov is not None and reached_cov(snapshot, settings) <= self._until_cov:
+        reason = " ".join(why_no_segment(snapshot))
+        if reason and not self._says_why:
+            self._says_why = True
+            _LOGGER.warning("%s", reason)
+        if self._until_cov is not None and precision(snapshot, settings).is_reached:
             self._recorder.request_stop()
 
     def progress(self, done: int, total: int) -> None:
-        """Show how far the result is."""
+        """Show the progress of the result."""
         self._bar.result(done, total)
 
 
 def refuse_hopeless(bench: Bench, settings: Settings, duration: float | None) -> None:
-    """Say before the run that a duration is too short for any estimate.
+    """Refuse a duration that is too short for any estimate.
 
     Raises
     ------
     typer.BadParameter
-        With how long it must be.
+        With the minimum duration.
     """
     n_segments, shortest = shortest_duration(settings, bench.sensors)
     if duration is not None and duration < shortest:
         raise typer.BadParameter(
-            f"{format_duration(duration)} hold fewer than {n_segments} segments of"
-            f" {format_duration(settings.segment)}, which allow no estimate; expected at least"
+            f"a duration of {format_duration(duration)} has fewer than {n_segments} segments of"
+            f" {format_duration(settings.segment)}, too few for an estimate; expected at least"
             f" {format_duration(math.ceil(shortest))}, or shorter segments"
         )
 
 
 class _Bar:
-    """A line that follows a run: time, segments, c.o.v., time left."""
+    """Progress line of a run: time, segments, c.o.v., time left."""
 
     def __init__(self, bar: Progress, duration: float | None) -> None:
         self._bar, self._duration = bar, duration
         self._task = bar.add_task("0:00", total=None, state="")
 
     def recording(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Show how far the recording is."""
+        """Show the progress of the recording."""
+        reached = precision(snapshot, settings)
         left = None if self._duration is None else max(0.0, self._duration - snapshot.elapsed)
         if settings.target_cov is not None and self._duration is None:
-            left = snapshot.time_left
-        cov = reached_cov(snapshot, settings)
+            left = reached.seconds_left
+        cov = reached.cov
         parts = [f"{snapshot.n_segments} segments"]
         if not math.isnan(cov):
             parts.append(f"c.o.v. {cov:.3f}")
@@ -218,7 +262,7 @@ class _Bar:
         )
 
     def result(self, done: int, total: int) -> None:
-        """Show how far the result of the whole recording is."""
+        """Show the progress of the final estimate."""
         self._bar.update(
             self._task,
             description="result",

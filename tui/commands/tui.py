@@ -1,4 +1,4 @@
-"""Opens the application on a bench or on a recording."""
+"""``huddle tui``: opens the application on a bench file or a recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from daq.recording.reader import Recording
 from daq.results.store import store_results
 from tui.application.app import HuddleApp
 from tui.output.console import notices
-from tui.output.logs import screen_taken
+from tui.output.extras import require
+from tui.output.logs.lines import screen_taken
 from tui.runs.estimate_settings import check_fit, chosen, settings_for
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
@@ -33,14 +34,14 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 ALWAYS = ("three-sensor", "three-channel")
-"""Estimates that cost little: shown beside the bench's own, for comparison."""
+"""Cheap methods, shown for comparison with the chosen ones."""
 FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
-"""Endings of files that are to be imported first."""
+"""Suffixes of files that must be imported first."""
 
 
 @dataclass
 class BenchControls:
-    """Controls of a bench file: recorders are started as processes of their own."""
+    """Controls of a bench file, which start recorder processes."""
 
     path: Path
     bench: Bench
@@ -67,7 +68,7 @@ class BenchControls:
         return table
 
     def start(self) -> Path:
-        """Start a recorder; returns its file once that is there."""
+        """Start a recorder; return its file once it exists."""
         out = recording_path(self.bench, SystemClock().now())
         recorder = RecorderProcess(self.path, out, duration=self.bench.recording.duration)
         self.started.append(recorder)
@@ -75,7 +76,7 @@ class BenchControls:
         return out
 
     def find_running(self) -> Path | None:
-        """Return the file of a recorder of this bench that runs already."""
+        """Return the file of a running recorder of this bench, if there is one."""
         return running_recording(self.bench)
 
     def stop(self, path: Path) -> None:
@@ -87,7 +88,7 @@ class BenchControls:
         ask(path, "mark", text)
 
     def keep(self, path: Path, snapshot: Snapshot) -> None:
-        """Write the result into the recording, unless somebody has done so."""
+        """Write the result into the recording, unless it holds one."""
         with Recording.open(path) as recording:
             if recording.results():
                 return
@@ -98,14 +99,14 @@ class BenchControls:
         return _report(path, snapshot, settings, folder=self.reports)
 
     def release(self) -> None:
-        """Forget the recorders; they go on."""
+        """Release the recorders, which continue."""
         for recorder in self.started:
             recorder.close()
 
 
 @dataclass(frozen=True)
 class RecordingControls:
-    """Controls of a recording that is looked at: it can be stopped and marked while it grows."""
+    """Controls of a recording: while it grows it can be stopped and marked."""
 
     path: Path
     settings: Settings
@@ -118,11 +119,11 @@ class RecordingControls:
         return self.path.stem
 
     def description(self) -> str:
-        """Return what to show until the first snapshot is there."""
+        """Return the text to show until the first snapshot."""
         return "opening …"
 
     def start(self) -> Path:
-        """Refuse."""
+        """Raise an error: a recording cannot be started again."""
         raise HuddleError("this is a recording; huddle tui BENCH starts one")
 
     def find_running(self) -> Path:
@@ -138,7 +139,7 @@ class RecordingControls:
         ask(path, "mark", text)
 
     def keep(self, path: Path, snapshot: Snapshot) -> None:
-        """Leave that to who records."""
+        """Do nothing: the process that records writes the result."""
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report beside the recording."""
@@ -148,6 +149,7 @@ class RecordingControls:
 def _report(
     path: Path, snapshot: Snapshot, settings: Settings, *, folder: Path | None = None
 ) -> Path:
+    require("matplotlib", "jinja2")
     from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
 
     out = (folder or path.parent) / f"{path.stem}.html"
@@ -161,22 +163,22 @@ def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fie
     Raises
     ------
     BenchFileError
-        It is neither, or a bench file with faults.
+        The file is neither, or a bench file with errors.
     typer.BadParameter
-        There is no terminal.
+        Standard input or output is not a terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
         open_recording(source, **wanted)
     elif source.suffix.lower() in FOREIGN:
         problem = (
-            "neither a bench file (.toml) nor a recording (.h5); make a recording of it first:"
+            "neither a bench file (.toml) nor a recording (.h5); convert it to a recording first:"
             f" huddle import {source} --out {source.with_suffix('.h5')}"
         )
         raise BenchFileError(FileFault("", problem), source=source)
     elif not source.exists():
         problem = (
-            f"there is no such file; write a bench file with huddle init -o {source}, or see one at"
-            " work with huddle demo"
+            f"file does not exist; huddle init -o {source} writes a bench file, and huddle demo"
+            " needs none"
         )
         raise BenchFileError(FileFault("", problem), source=source)
     else:
@@ -197,11 +199,11 @@ def open_bench(path: Path, **wanted: Any) -> None:  # noqa: ANN401 - fields of E
 
 
 def _run(app: HuddleApp, *, again: Path) -> None:
-    """Run it; say afterwards where a recording lies, and that it goes on."""
+    """Run the application; print the name of its recording, and whether it continues."""
     if not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
         raise typer.BadParameter(
-            "the application needs a terminal; huddle watch RECORDING and huddle run BENCH do"
-            " without"
+            "the application needs a terminal; huddle watch RECORDING and huddle run BENCH need"
+            " none"
         )
     with screen_taken():
         app.run()
@@ -209,22 +211,22 @@ def _run(app: HuddleApp, *, again: Path) -> None:
         return
     if app.recording:
         notices().print(
-            f"The recording goes on: {app.path}\nLook at it again, or stop it: huddle tui {again}",
+            f"The recording continues: {app.path}\nTo view or stop it: huddle tui {again}",
             soft_wrap=True,
         )
     else:
-        notices().print(f"recording: {app.path}", soft_wrap=True)
+        notices().print(f"Recording: {app.path}", soft_wrap=True)
 
 
 def show_demo(path: Path, settings: Settings) -> Path | None:
-    """Open the application on a simulated bench, recording at once; stop with the application.
+    """Open the application on a simulated bench and start recording; stop with the application.
 
     Returns
     -------
     Path or None
         The last recording, closed.
     """
-    # The demo's recording goes when the demo ends; what has been asked for stays.
+    # The recording of the demo is deleted when the demo ends; reports are kept.
     controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
         with screen_taken():
@@ -250,7 +252,7 @@ def open_recording(
 
 
 def _with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:
-    """Add methods that cost little, for comparison, unless the user chose the methods."""
+    """Add cheap methods for comparison, unless the user chose the methods."""
     if wanted.get("methods") is not None or "all" in settings.methods:
         return settings
     return replace(settings, methods=tuple(dict.fromkeys((*settings.methods, *ALWAYS))))

@@ -1,4 +1,4 @@
-"""``huddle watch``: look on while somebody else records."""
+"""``huddle watch``: shows the live estimate of a recording that another process writes."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from daq.estimation.follow import follow
-from daq.results.band_summary import band_of, channel_means, reached_cov
-from tui.commands.estimate import show_result
+from daq.results.band_summary import band_of, channel_means
+from daq.results.limits import judge
+from daq.results.precision import precision
+from tui.commands.estimate import exit_with, show_result
 from tui.output.console import console, finite, write_text
 from tui.output.formatting import clock_time, time_left
+from tui.output.json_document import verdict_document
 from tui.output.json_values import plain
+from tui.output.results import why_no_segment
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
@@ -31,41 +36,46 @@ def watch_recording(
     json: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Show a recording while it grows: on a screen, as lines, or as lines of JSON.
+    """Show a growing recording: in the application, as lines, or as lines of JSON.
 
     Raises
     ------
     RecordingError
-        The recording cannot be read (any more).
+        The recording cannot be read.
+    typer.Exit
+        With 1 if a limit is not met, with 4 if that is not decided.
     """
     if json is None and sys.stdout.isatty() and sys.stdin.isatty():
         from tui.commands.tui import open_recording  # noqa: PLC0415 - Textual where it is shown
 
         open_recording(file, start=start, end=end, **wanted)
         return
-    settings, _ = settings_for(file, start=start, end=end, **wanted)
-    lines = _Lines(json)
+    settings, bench = settings_for(file, start=start, end=end, **wanted)
+    lines = _Lines(json, bench)
     try:
         follow(file, settings, lines)
     finally:
         if lines.last is not None and lines.last.results and json is None:
-            show_result(lines.last, settings, json=None, csv=None, bench=None)
+            show_result(lines.last, settings, json=None, csv=None, bench=bench)
+    if lines.last is not None:
+        exit_with(judge(bench, lines.last, settings))
 
 
 class _Lines:
-    """Writes a line when a segment or an event has come: for people, or as JSON."""
+    """Writes a line for each new segment and event, as text or as JSON."""
 
-    def __init__(self, json: str | None) -> None:
-        self._json = json
+    def __init__(self, json: str | None, bench: Bench | None) -> None:
+        self._json, self._bench = json, bench
         self._now: RecordingStatus | None = None
         self._n_events = 0
         self.last: Snapshot | None = None
+        self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
         before, self._now = self._now, status
         events = status.events[self._n_events :]
         self._n_events = len(status.events)
-        if before is None:  # what was before we came
+        if before is None:  # events from before
             return
         for event in events:
             at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
@@ -83,12 +93,19 @@ class _Lines:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         before, self.last = self.last, snapshot
+        reason = " ".join(why_no_segment(snapshot))
+        if reason and not self._says_why:
+            self._says_why = True
+            if self._json is None:
+                console().print(f"{clock_time(snapshot.elapsed)}  {reason}", soft_wrap=True)
+            else:
+                self._write({"no_segment": plain(snapshot.no_segment), "text": reason})
         if before is not None and not snapshot.closed and snapshot.n_segments == before.n_segments:
             return
         if self._json is None:
             console().print(_line(snapshot, settings))
         else:
-            self._write(_update(snapshot, settings, self._now))
+            self._write(_update(snapshot, settings, self._now, self._bench))
 
     def progress(self, done: int, total: int) -> None:
         pass
@@ -100,20 +117,23 @@ class _Lines:
 
 
 def _line(snapshot: Snapshot, settings: Settings) -> str:
-    state = "ended" if snapshot.closed else time_left(snapshot.time_left)
-    cov = reached_cov(snapshot, settings)
-    known = "" if math.isnan(cov) else f"c.o.v. {cov:.3f}  "
+    reached = precision(snapshot, settings)
+    state = "ended" if snapshot.closed else time_left(reached.seconds_left)
+    known = "" if math.isnan(reached.cov) else f"c.o.v. {reached.cov:.3f}  "
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 
-def _update(snapshot: Snapshot, settings: Settings, now: RecordingStatus | None) -> dict[str, Any]:
-    """Return what has changed, for a program: states, and the noise of each channel in the band."""
+def _update(
+    snapshot: Snapshot, settings: Settings, now: RecordingStatus | None, bench: Bench | None
+) -> dict[str, Any]:
+    """Return the update for programs: states, noise in the band, verdict."""
+    reached = precision(snapshot, settings)
     document: dict[str, Any] = {
         "elapsed": snapshot.elapsed,
         "segments": snapshot.n_segments,
         "effective_averages": snapshot.n_effective,
-        "cov": reached_cov(snapshot, settings),
-        "time_left": snapshot.time_left,
+        "cov": reached.cov,
+        "time_left": reached.seconds_left,
         "closed": snapshot.closed,
         "sensors": {
             sensor.name: {
@@ -127,6 +147,7 @@ def _update(snapshot: Snapshot, settings: Settings, now: RecordingStatus | None)
             for sensor in (() if now is None else now.sensors)
         },
         "left_out": plain(snapshot.left_out),
+        **plain(verdict_document(judge(bench, snapshot, settings))),
     }
     if snapshot.results:
         band = band_of(settings, snapshot)
@@ -140,7 +161,7 @@ def _update(snapshot: Snapshot, settings: Settings, now: RecordingStatus | None)
                 }
                 for label, mean in zip(
                     snapshot.channels,
-                    channel_means(noise, snapshot.frequency, settings, band),
+                    channel_means(noise, snapshot, settings, band),
                     strict=True,
                 )
             }

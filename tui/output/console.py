@@ -1,4 +1,4 @@
-"""Where results go: tables for people to standard output, JSON for programs where it is asked.
+"""Output of results: tables to standard output, JSON to a file or standard output.
 
 Text is printed as it is: names of sensors and files may hold brackets and colons, which would
 otherwise be taken for markup and emoji. Colour is asked for with ``style=`` or ``rich.text.Text``.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from functools import cache
 from pathlib import Path
@@ -16,25 +17,45 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn
+from rich.segment import Segment
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
+
+    from rich.console import ConsoleOptions, RenderableType
 
 STANDARD_OUTPUT = "-"
 WIDTH_OF_FILES = 110
 """Columns of tables that go into a file or a pipe."""
 _for_json = False
+_SHOWN = {
+    code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
+}
+
+
+class PlainConsole(Console):
+    """A console on which no text acts: control characters in names or files are shown as such."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Yield segments, with control characters only where Rich has put them."""
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text == "\n" or segment.text.isprintable():
+                yield segment
+            else:
+                yield Segment(segment.text.translate(_SHOWN), segment.style)
 
 
 def console() -> Console:
     """Return standard output."""
-    return Console(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
+    return PlainConsole(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
 
 
 @cache
 def notices() -> Console:
     """Return standard error, where progress and remarks go; nowhere if it carries JSON."""
-    return Console(
+    return PlainConsole(
         stderr=True,
         highlight=False,
         markup=False,
@@ -104,23 +125,38 @@ def write_text(file: str, text: str, *, append: bool = False) -> None:
     Raises
     ------
     OSError
-        With the name of what could not be written: a full disk tells none.
+        With the name of the file, which the error of a full disk lacks.
     """
     try:
         if file == STANDARD_OUTPUT:
             sys.stdout.write(text)
             sys.stdout.flush()
-        else:
-            with Path(file).open("a" if append else "w", encoding="utf-8") as out:
+        elif append or (Path(file).exists() and not Path(file).is_file()):
+            with Path(file).open("a", encoding="utf-8") as out:
                 out.write(text)
+        else:
+            write_whole(Path(file), text.encode())
     except OSError as error:
         if error.filename is None:
             error.filename = "standard output" if file == STANDARD_OUTPUT else file
         raise
 
 
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is complete when it has its name; an earlier one stays until then."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def write_json(file: str | None, document: Mapping[str, Any]) -> None:
-    """Write a document as one line of JSON, if a file is given; what is not finite becomes null."""
+    """Write a document as one line of JSON, if a file is given; infinite numbers become null."""
     if file is not None:
         write_text(file, json.dumps(finite(document), ensure_ascii=False, allow_nan=False) + "\n")
 

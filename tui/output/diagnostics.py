@@ -1,4 +1,4 @@
-"""What the averages show of the test itself: what applies, or all of it."""
+"""The diagnosis of a test: its findings, or all of it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions, TooFewSensors
+from estimator.diagnostics.advice import (
+    ModelMisfit,
+    NoSharedMotion,
+    TooFewDimensions,
+    TooFewSensors,
+)
 from estimator.diagnostics.kinds import Level, Untested
 from estimator.spectra.segment_rejection import Reason
-from tui.output.advice_summary import summarise
-from tui.output.advice_text import Names, explain, model
+from tui.output.advice.sentences import Names, explain, model
+from tui.output.advice.summary import summarise
 from tui.output.formatting import degrees, ratio, signed, span
 
 if TYPE_CHECKING:
@@ -27,18 +32,20 @@ _LEGEND = (
     "Coherence: the lowest between like channels of two sensors. Condition: condition number of "
     "the cross-spectral matrix between two sensors, of the worst pair; 1 is best. Dimension: of "
     "the motion. SNR: motion over noise, lowest and highest of all channels. Model test: its "
-    "statistic over the expectation, 1 where one common motion explains everything; p: "
-    "probability of so large a statistic by chance."
+    "statistic over its expectation, 1 if one common motion explains the averages; p: "
+    "probability of a statistic this large by chance."
 )
 
 
 def summary(snapshot: Snapshot) -> list[str]:
-    """Return what applies to this test, a line for each kind of thing; worst first."""
+    """Return the findings of this test, one line per kind, worst first."""
     diagnostics = snapshot.diagnostics
     lines = summarise(diagnostics.advice, Names.of(snapshot))
     found = diagnostics.diagnosis
     if found is not None:
-        failing = any(isinstance(a, ModelMisfit | TooFewDimensions) for a in found.advice)
+        failing = any(
+            isinstance(a, ModelMisfit | NoSharedMotion | TooFewDimensions) for a in found.advice
+        )
         if diagnostics.untested is None:
             if not failing:
                 lines.append(
@@ -51,16 +58,16 @@ def summary(snapshot: Snapshot) -> list[str]:
 
 
 def problems(snapshot: Snapshot) -> list[str]:
-    """Return what is wrong with the test, or may be, a line each."""
+    """Return problems and warnings of the test, one line each."""
     names, found = Names.of(snapshot), snapshot.diagnostics.advice
     return [str(explain(each, names)) for each in found if each.level is not Level.NOTE]
 
 
 _WHY_UNTESTED = {
-    Untested.UNFINISHED: "The test is diagnosed when the recording has ended.",
-    Untested.NO_SEGMENTS: "The model test takes averages, and there is no segment.",
-    Untested.TOO_FEW_SENSORS: "The model test takes three sensors with a signal of their own.",
-    Untested.TOO_FEW_AVERAGES: "The model test takes more averages ({n:.0f} now) than channels "
+    Untested.UNFINISHED: "The diagnosis follows with the first segments.",
+    Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
+    Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
+    Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
     "({channels}).",
     Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
     "few channels.",
@@ -70,7 +77,7 @@ _WHY_UNTESTED = {
 
 
 def why_untested(snapshot: Snapshot) -> str:
-    """Return why the model of one common motion was not tested; nothing where it was."""
+    """Return why the model of one common motion was not tested; empty if it was."""
     why, found = snapshot.diagnostics.untested, snapshot.diagnostics.diagnosis
     if why is None:
         return ""
@@ -132,7 +139,7 @@ def _known(value: float, spec: str) -> str:
 
 
 def _octaves(snapshot: Snapshot) -> Table:
-    table = _table("octave (Hz)", "segment", "segments", "left out: gap", "disturbed", "averages")
+    table = _table("octave (Hz)", "segment", "segments", "excluded: gap", "transient", "averages")
     for octave in snapshot.octaves:
         table.add_row(
             f"{octave.low:.3g}–{octave.high:.3g}",
@@ -161,7 +168,7 @@ def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:
 
 
 def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
-    """Return the choice and its price for the bands where it is not the usual one, in short."""
+    """Return the bands with an unusual dimension, and its cost in precision."""
     if not choices:
         return []
     unusual = [choice for choice in choices if choice.accepted and choice.n_factors != choice.usual]
@@ -180,7 +187,7 @@ def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
 
 
 def _choice(choice: BandDimension) -> str:
-    """Return an unusual choice of the dimension, and its price."""
+    """Return an unusual dimension, and its cost in precision."""
     price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
     if math.isfinite(choice.usual_cov):
         price += f" instead of {choice.usual_cov:.2g}"

@@ -15,4 +15,6 @@ class ExitCode(IntEnum):
     """The command line, a bench file or another file that a person wrote is wrong."""
     TROUBLE = 3
     """A device or a recording is in trouble."""
+    NOT_DECIDED = 4
+    """The limits are not decided: the uncertainty spans one, or data are missing."""
     INTERRUPTED = 130

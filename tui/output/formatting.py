@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
+ONE_SIDED = 1.1
+"""Lower half of an interval over its upper half, from which on both are shown."""
+
+
 def utc(ns: int) -> str:
     """Return an instant as ISO 8601 to the millisecond."""
     whole, rest = divmod(ns, 1_000_000_000)
@@ -43,17 +47,24 @@ def roughly(seconds: float) -> str:
 
 
 def level(psd: float) -> str:
-    """Return a PSD in dB, and say so where it has none."""
+    """Return a PSD in dB, or a word if it has none."""
     if math.isnan(psd):
         return "?"
     return "below 0" if psd <= 0 else signed(decibels(psd), ".2f")
 
 
-def level_with_error(psd: float, high: float) -> str:
-    """Return a PSD in dB with half the width of its 95 % interval."""
+def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
+    """Return a PSD in dB with half the width of its 95 % interval.
+
+    With both halves where the lower one is larger, as by what the clocks may have added.
+    """
     if not (psd > 0 and high > psd):
         return level(psd)
-    return f"{level(psd)} ±{decibels(high) - decibels(psd):.2f}"
+    up = decibels(high) - decibels(psd)
+    if math.isnan(low) or low <= 0:
+        return f"{level(psd)} ±{up:.2f}"
+    down = decibels(psd) - decibels(low)
+    return f"{level(psd)} {f'±{up:.2f}' if down < ONE_SIDED * up else f'+{up:.2f} −{down:.2f}'}"
 
 
 def interval(low: float, high: float) -> str:

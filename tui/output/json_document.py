@@ -7,11 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from estimator.diagnostics.advice import Advice
 from estimator.self_noise.result import Flag
-from tui.output.advice_text import Names, explain
+from tui.output.advice.sentences import Names, explain
 from tui.output.json_values import plain
+from tui.output.noise_parameters import noise_parameters_document
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daq.estimation.snapshot import Diagnosis, Snapshot
+    from daq.results.noise_parameters import ChannelNoise
+    from daq.results.verdict import TestVerdict
 
 
 def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
@@ -41,10 +46,55 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
     }
 
 
-def document(snapshot: Snapshot) -> dict[str, Any]:
+def document(
+    snapshot: Snapshot,
+    verdict: TestVerdict | None = None,
+    noise_parameters: Sequence[ChannelNoise] | None = None,
+) -> dict[str, Any]:
     """Return the JSON of a result: of its one method, or of all of them under ``results``."""
     documents = [result_document(snapshot, method) for method in snapshot.results]
-    return documents[0] if len(documents) == 1 else {"results": documents}
+    whole = documents[0] if len(documents) == 1 else {"results": documents}
+    whole |= verdict_document(verdict)
+    if noise_parameters is not None:
+        whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
+    return whole
+
+
+def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
+    """Return the verdict on the limits of the bench file; null where it has none."""
+    if found is None:
+        return {"verdict": None, "limits": []}
+    prediction = found.prediction
+    return {
+        "verdict": found.verdict,
+        "obstacles": list(found.obstacles),
+        "record_for": None
+        if prediction is None
+        else {
+            "seconds": prediction.seconds,
+            "longest": prediction.longest,
+            "resolution_db": prediction.resolution_db,
+        },
+        "limits": [
+            {
+                "limit": each.limit,
+                "sensor": each.sensor,
+                "channel": each.channel,
+                "method": each.method,
+                "verdict": each.verdict,
+                "obstacle": each.obstacle,
+                "frequency_hz": each.frequency,
+                "noise_psd": each.noise_psd,
+                "noise_psd_low": each.low,
+                "noise_psd_high": each.high,
+                "limit_psd": each.limit_psd,
+                "margin_db": each.margin_db,
+                "margin_low_db": each.margin_low_db,
+                "margin_high_db": each.margin_high_db,
+            }
+            for each in found.limits
+        ],
+    }
 
 
 def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:

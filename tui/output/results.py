@@ -1,4 +1,4 @@
-"""A finished estimate as a table with remarks, as arrays and as CSV."""
+"""A finished estimate as a table, remarks and CSV."""
 
 from __future__ import annotations
 
@@ -10,36 +10,25 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, channel_means, highest_known
+from daq.results.band_summary import band_of, channel_means, data_means, highest_known
+from daq.results.partners import without_partners
 from daq.timing.clock_model import ClockSource
-from estimator.diagnostics.advice import Copies, NoSignal
-from estimator.self_noise.band_means import band_edges
+from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tui.output.formatting import clock_time, level, level_with_error, several, signed, utc
-from tui.output.vocabulary import FLAG_WORDS, REASONS, WITHOUT_ESTIMATE
+from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, REASONS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.limits import LimitResult
-
-
-def limit_line(result: LimitResult) -> str:
-    """Return whether a channel meets a mask, in one line."""
-    meets = "meets" if result.met else "does not meet"
-    return (
-        f"{result.sensor}.{result.channel} {meets} {result.limit!r}: {result.method} "
-        f"{level(result.noise_psd)} dB at {result.frequency:.3g} Hz, limit "
-        f"{level(result.limit_psd)} dB"
-    )
 
 
 def result_title(snapshot: Snapshot, settings: Settings) -> Text:
-    """Return what the table of results holds."""
+    """Return the title of the table of results."""
     low, high = band_of(settings, snapshot)
     wanted = high if settings.band is None else settings.band[1]
-    asked = f" ({wanted:.3g} was asked for)" if wanted > high else ""
+    asked = f" ({wanted:.3g} requested)" if wanted > high else ""
     return Text.assemble(
         (f"Self-noise, mean over {low:.3g} to {high:.3g} Hz", "bold"),
         f"{asked}, dB re 1 ({snapshot.unit})²/Hz, with its 95 % interval",
@@ -56,23 +45,26 @@ def result_table(snapshot: Snapshot, settings: Settings) -> Table:
     columns = []
     for method, noise in snapshot.results.items():
         table.add_column(method, justify="right")
-        columns.append(channel_means(noise, snapshot.frequency, settings, band))
-    inside = slice(*band_edges(snapshot.frequency, band))
-    width = np.gradient(snapshot.frequency)[inside]
-    data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
+        columns.append(channel_means(noise, snapshot, settings, band))
+    data, alone = data_means(snapshot, band), without_partners(snapshot, band)
     for number, label in enumerate(snapshot.channels):
         power = float(data[number])
         no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
         row = [label.sensor, label.channel, no_signal if power == 0 else level(power)]
         for means in columns:
             mean = means[number]
-            row.append(level_with_error(float(mean.mean[0]), float(mean.high[0])))
+            if number in alone:
+                row.append(PARTNER_WORDS[alone[number]])
+                continue
+            row.append(
+                level_with_error(float(mean.mean[0]), float(mean.high[0]), float(mean.low[0]))
+            )
         table.add_row(*map(Text, row))
     return table
 
 
 def remarks(snapshot: Snapshot) -> list[str]:
-    """Return what must be said beside the numbers."""
+    """Return the remarks below the table."""
     taken = (
         f"{several(snapshot.n_segments, 'segment')} ({snapshot.n_effective:.0f} effective averages)"
     )
@@ -80,7 +72,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
     if snapshot.octaves:
         lowest, highest = snapshot.octaves[0], snapshot.octaves[-1]
         if lowest is highest:
-            lines.append("octaves: still too few segments for longer ones at lower frequencies")
+            lines.append("octaves: too few samples for longer segments at lower frequencies")
         else:
             lines[0] += f" above {highest.low:.3g} Hz"
             lines.append(
@@ -93,9 +85,15 @@ def remarks(snapshot: Snapshot) -> list[str]:
             if octave.left_out.get(Reason.TRANSIENT)
         ]
         if disturbed:
-            lines.append(f"disturbed segments left out: {', '.join(disturbed)}")
+            lines.append(f"segments with transients excluded: {', '.join(disturbed)}")
+    lines += [
+        f"{sensor.name}: {several(sensor.n_damaged, 'block')} of the file damaged (wrong"
+        " checksum) and excluded; huddle repair --check counts all of them"
+        for sensor in snapshot.sensors
+        if sensor.n_damaged
+    ]
     if snapshot.n_dropped:
-        lines.append(f"{several(snapshot.n_dropped, 'segment')} left out{left_out(snapshot)}")
+        lines.append(f"{several(snapshot.n_dropped, 'segment')} excluded{left_out(snapshot)}")
     lines += [
         f"{sensor.name}: {several(sensor.n_gaps, 'gap')}, "
         f"{several(sensor.n_missing, 'sample')} missing"
@@ -110,29 +108,29 @@ def remarks(snapshot: Snapshot) -> list[str]:
         within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
         lines.append(f"clocks {rates}, aligned to about {within} µs")
     if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
-        lines.append(f"above {limit:.4g} Hz there is no estimate: samples have been resampled")
+        lines.append(f"no estimate above {limit:.4g} Hz, where resampling attenuates")
     lines += faulty_channels(snapshot)
     if "two-channel" in snapshot.results:
         lines.append(
-            "two-channel: assumes that like channels point the same way, and that their gains are "
-            "as given (--gain) or equal"
+            "two-channel: assumes that like channels are parallel and have equal gains, or those "
+            "given by --gain"
         )
     named = any(isinstance(each, NoSignal | Copies) for each in snapshot.diagnostics.advice)
     for method, noise in snapshot.results.items():
         lines += flagged(snapshot, method, besides=_NAMED if named else _NONE)
-        lines += unresolved(snapshot, method)
+        if not any(isinstance(each, NoSharedMotion) for each in snapshot.diagnostics.advice):
+            lines += unresolved(snapshot, method)  # else a longer recording would not help
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
             lines.append(
-                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values are at or below "
-                "zero, and are kept"
+                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values are at or below zero"
             )
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines
 
 
 def faulty_channels(snapshot: Snapshot) -> list[str]:
-    """Return which channels are clipped, or were dead for a while, and what to do."""
+    """Return remarks on channels that are clipped or were temporarily dead, with remedies."""
     lines = []
     clipped, stood_still = snapshot.diagnostics.clipped, snapshot.diagnostics.stood_still
     if clipped:
@@ -150,15 +148,34 @@ def faulty_channels(snapshot: Snapshot) -> list[str]:
             for column, seconds in stood_still.items()
         )
         lines.append(
-            f"Dead for a while: {names} had a constant count, and a signal otherwise: the motion "
-            "missing there counts as noise. Exclude that time (--reject; --start and --end for "
+            f"Temporarily dead: {names} had a constant count. The motion missing there counts as "
+            "noise. Exclude that time (--reject; --start and --end for "
             "minutes), and check the cable and the power supply."
         )
     return lines
 
 
+def why_no_segment(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return why no segment counts, and what to do; empty where one does, or may soon."""
+    found = snapshot.no_segment
+    if found is None:
+        return ()
+    head = f"No segment of {found.segment:g} s can be used:"
+    if found.reason is Reason.GAP:
+        return (
+            f"{head} {found.sensor} has at most {found.longest:.2g} s without a gap.",
+            "Check its cable, lower its sampling rate, or choose a shorter --segment.",
+        )
+    if found.reason is Reason.CLIPPED:
+        return (
+            f"{head} samples are clipped.",
+            "Choose a larger range, reduce the motion, or keep them (--no-reject).",
+        )
+    return f"{head} there are transients.", "Wait for a quieter time, or leave out --reject."
+
+
 def left_out(snapshot: Snapshot) -> str:
-    """Return why segments were left out, to follow their number."""
+    """Return why segments were excluded; the text follows their number."""
     counts = {reason: count for reason, count in snapshot.left_out.items() if count}
     if len(counts) == 1:
         return " " + REASONS[next(iter(counts))]
@@ -166,13 +183,13 @@ def left_out(snapshot: Snapshot) -> str:
 
 
 _NONE = Flag(0)
-_NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # with its advice, once for all methods
+_NAMED = Flag.DEAD_CHANNEL | Flag.DUPLICATE  # advice names these once for all methods
 
 
 def flagged(snapshot: Snapshot, method: str, *, besides: Flag = _NONE) -> list[str]:
-    """Return which channels have frequencies without a sound estimate, and why.
+    """Return channels with frequencies without a valid estimate, and the reason.
 
-    ``besides`` are flags that have been named already.
+    Flags in ``besides`` are omitted.
     """
     flags = snapshot.results[method].flags[snapshot.frequency <= highest_known(snapshot)]
     lines = []
@@ -191,7 +208,7 @@ def flagged(snapshot: Snapshot, method: str, *, besides: Flag = _NONE) -> list[s
 
 
 def unresolved(snapshot: Snapshot, method: str) -> list[str]:
-    """Return where averages are too few for the motion's strength, and what that does."""
+    """Return where the averages are too few to resolve weak motion, and the effect."""
     noise = snapshot.results[method]
     here = (noise.flags[1:-1] & Flag.UNRESOLVED) != 0
     left_in = noise.cov[1:-1][here & np.isfinite(noise.cov[1:-1])]
@@ -200,12 +217,16 @@ def unresolved(snapshot: Snapshot, method: str) -> list[str]:
     where = here.any(axis=1)
     frequency = snapshot.frequency[1:-1][where]
     line = (
-        f"{method}: at {where.sum()} of {len(where)} frequencies ({frequency[0]:.3g} to "
-        f"{frequency[-1]:.3g} Hz) there are too few averages for the weak motion: some of it may "
-        f"be left in the noise, up to about {100 * float(np.median(left_in)):.2g} % of it. Record "
-        "longer to remove it"
+        f"{method}: too few averages for the weak motion at {where.sum()} of {len(where)} "
+        f"frequencies ({frequency[0]:.3g} to {frequency[-1]:.3g} Hz): the noise may include "
+        f"motion, up to about {100 * float(np.median(left_in)):.2g} %. Record longer to remove it"
     )
     return [line]
+
+
+def _not_a_formula(text: str) -> str:
+    """Return a cell that a spreadsheet does not calculate, whatever a sensor is called."""
+    return f"'{text}" if text[:1] in set("=+-@\t\r") else text
 
 
 def curves_csv(snapshot: Snapshot) -> str:
@@ -224,7 +245,7 @@ def curves_csv(snapshot: Snapshot) -> str:
             ]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
+    writer.writerow(map(_not_a_formula, header))
     for row in np.stack(columns, axis=1):
         writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
     return text.getvalue()

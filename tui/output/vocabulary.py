@@ -1,4 +1,4 @@
-"""Words for enumerated values, for screens, tables and reports alike."""
+"""Words for enumerated values in screens, tables and reports."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daq.recording.sensor_state import SensorState
+from daq.results.partners import WithoutPartner
 from daq.timing.clock_model import ClockSource
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -21,11 +22,11 @@ STATE_MEANINGS: Mapping[SensorState, str] = {
     SensorState.LATE: "no block for two block periods",
     SensorState.STALLED: "connected, but sends nothing; reconnected automatically",
     SensorState.DISCONNECTED: "connection lost; retried until the recording ends",
-    SensorState.REFUSED: "not the device that the bench file names, or that was there before",
+    SensorState.REFUSED: "not the device in the bench file, or not the one recorded before",
     SensorState.SILENT: "no samples, while other sensors continue",
     SensorState.ENDED: "the recording is closed",
 }
-"""A state is called by its value; this says what it means."""
+"""Meaning of each state."""
 STATE_ALERTS: Mapping[SensorState, str] = {
     SensorState.LATE: "{sensor} is late: no block for {time}",
     SensorState.STALLED: "{sensor} has been stalled for {time}: check power and cable;"
@@ -35,18 +36,18 @@ STATE_ALERTS: Mapping[SensorState, str] = {
     SensorState.REFUSED: "{sensor} is refused: {reason}",
     SensorState.SILENT: "{sensor} has been silent for {time}: check power and cable",
 }
-"""What is wrong, and what to do, in each state in which a sensor is overdue."""
+"""Fault and remedy for each state in which a sensor is overdue."""
 REASONS: Mapping[Reason, str] = {
     Reason.GAP: "where a sensor has a gap",
     Reason.CLIPPED: "where a sensor is at the end of its range",
     Reason.TRANSIENT: "with a transient",
 }
-"""Why segments were left out, to follow their number."""
+"""Why segments were excluded; the text follows their number."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlagWords:
-    """What a flag is called.
+    """Names of a flag.
 
     Attributes
     ----------
@@ -70,20 +71,25 @@ FLAG_WORDS: Mapping[Flag, FlagWords] = {
     ),
     Flag.SINGULAR: FlagWords(
         "singular",
-        "no estimate, as the other channels are missing or move too little to compare with (a "
-        "matrix is singular)",
+        "no estimate: the other channels are missing or move too little (a matrix is singular)",
     ),
     Flag.NO_COUNTERPART: FlagWords(
-        "unmatched", "no estimate, as the other sensors have too few channels to compare with"
+        "unmatched", "no estimate: the other sensors have no channel that measures the same motion"
     ),
     Flag.NOT_CONVERGED: FlagWords("not converged", "the iteration did not reach the maximum"),
     Flag.NEGATIVE: FlagWords("below 0", "the estimate is at or below zero"),
-    Flag.BOUNDARY: FlagWords("at zero", "the likelihood is largest without any noise"),
+    Flag.BOUNDARY: FlagWords("at zero", "the likelihood is largest at zero noise"),
     Flag.UNRESOLVED: FlagWords(
-        "unresolved", "too few averages for the weak motion: some of it may be left in"
+        "unresolved", "too few averages for the weak motion, which the noise may include"
     ),
 }
-"""In the order in which they are named."""
+"""In the order in which tables name them."""
+
+PARTNER_WORDS: Mapping[WithoutPartner, str] = {
+    WithoutPartner.ALONE: "no shared motion",
+    WithoutPartner.ONE_PARTNER: "no third sensor",
+}
+"""In place of a noise level that cannot be told from motion."""
 
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL
@@ -97,12 +103,12 @@ WITHOUT_ESTIMATE = (
 
 
 def clock_source(clock: ClockState, *, short: bool = False) -> str:
-    """Return how the times of a sensor's samples are known."""
+    """Return the source of the times of a sensor's samples."""
     words = clock.source.value
     if clock.source is ClockSource.SHARED_CLOCK:
         words = f"clock of {clock.shared_clock}"
     elif short and clock.source is ClockSource.ARRIVAL_TIMES:
         words = "arrivals"
     if clock.offset_source is not None:
-        words += f", whole samples apart by {clock.offset_source}"
+        words += f", whole samples from {clock.offset_source}"
     return words

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.results.band_summary import band_of
+from daq.results.limits import judge
 from tui.output.formatting import span
 from tui.report.evidence import (
     advice_section,
@@ -15,7 +16,8 @@ from tui.report.evidence import (
     happenings_section,
     model_test_section,
 )
-from tui.report.noise import judgements, limits_section, noise_section, verdict
+from tui.report.noise import limits_section, noise_section, verdict
+from tui.report.parameters import parameters_section
 from tui.report.parts import Facts, Paragraph, Part, Report, Section, Signatures, Table
 from tui.report.wording import is_known, local_time, plain_number, utc_time
 
@@ -34,9 +36,9 @@ _STATES = {
     "left open": "not closed: its recorder was killed",
 }
 _CLOCKS = {
-    "refined": "by arrival times and the motion that the sensors share",
-    "arrivals": "by arrival times alone",
-    "nominal": "samples taken at face value",
+    "refined": "from arrival times and the common motion",
+    "arrivals": "from arrival times alone",
+    "nominal": "from the nominal rates",
 }
 
 
@@ -53,8 +55,8 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
         The recordings it was made from.
     """
     bench = found[0].bench
-    judged = judgements(bench, snapshot, settings)
-    sentence = verdict(bench, judged)
+    judged = judge(bench, snapshot, settings)
+    sentence = verdict(judged)
     states = {source.state for source in found}
     if "growing" in states or (not snapshot.closed and states == {"closed"}):
         sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")
@@ -66,8 +68,9 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
     sections = [
         _test_section(found),
         _sensors_section(snapshot, found),
-        limits_section(bench, snapshot, judged),
+        limits_section(snapshot, judged),
         noise_section(snapshot, settings, bench),
+        parameters_section(snapshot, settings, bench),
         advice_section(snapshot),
         model_test_section(snapshot, settings),
         alignment_section(snapshot),
@@ -190,7 +193,7 @@ def _settings_section(snapshot: Snapshot, settings: Settings) -> Section:
         ("Frequency resolution", f"{1 / settings.segment:.4g} Hz between frequencies"),
         ("Segments used", f"{snapshot.n_segments}, n = {snapshot.n_effective:.1f} effective"),
         ("Small-sample bias", "removed" if settings.correct else "left in"),
-        ("Segments left out", _rejection(settings)),
+        ("Segments excluded", _rejection(settings)),
         ("Clocks", _CLOCKS[settings.clocks]),
         ("Band of the tables", span(low, high)),
         ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),

@@ -11,14 +11,15 @@ import numpy as np
 from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
+from estimator.diagnostics.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.output.diagnostics import summary, why_untested
 from tui.output.formatting import several, span, utc
 from tui.output.results import faulty_channels, left_out
 from tui.output.vocabulary import clock_source
-from tui.report.drift import drift_plot
+from tui.report.figures.curves import model_test_plot
+from tui.report.figures.drift import drift_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.report.plots import model_test_plot
 from tui.report.wording import (
     NOTHING,
     plain_number,
@@ -70,6 +71,14 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
             parts.append(
                 Paragraph("Elsewhere one common motion explains what they have in common.")
             )
+    elif any(isinstance(advice, NoSharedMotion) for advice in found.advice):
+        parts.append(
+            Paragraph(
+                "The test passes: it cannot show that a sensor records another motion. See the "
+                "advice.",
+                "doubtful",
+            )
+        )
     else:
         parts.append(
             Paragraph(
@@ -219,9 +228,9 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     text = f"{several(snapshot.n_segments, 'segment')} used"
     text += f" ({snapshot.n_effective:.0f} effective averages)."
     if snapshot.n_dropped:
-        text += f" {several(snapshot.n_dropped, 'segment')} left out{left_out(snapshot)}."
+        text += f" {several(snapshot.n_dropped, 'segment')} excluded{left_out(snapshot)}."
     else:
-        text += " None left out."
+        text += " None excluded."
     parts: list[Part] = [Paragraph(text)]
     for sensor in snapshot.sensors:
         if sensor.n_gaps:

@@ -5,98 +5,80 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from daq.results.band_summary import band_of, channel_means, decibels
-from daq.results.limits import judged
-from estimator.self_noise.band_means import band_edges
+from daq.results.band_summary import band_of, channel_means, data_means, decibels
+from daq.results.partners import without_partners
+from daq.results.precision import channel_covs
+from daq.results.verdict import Verdict
 from estimator.self_noise.result import Flag
-from tui.output.formatting import several, span
+from tui.output.formatting import ONE_SIDED, span
 from tui.output.results import flagged
-from tui.output.vocabulary import FLAG_WORDS
+from tui.output.verdict_text import WORDS, headline, margin, what_to_do
+from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS
+from tui.report.figures.curves import noise_plots
 from tui.report.parts import Items, Paragraph, Part, Section, Table
-from tui.report.plots import noise_plots
 from tui.report.wording import decibel, plain_number, scientific
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.limits import LimitResult
+    from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
     from tui.report.parts import Tone
 
 MOST_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
+_TONES: Mapping[Verdict, Tone] = {
+    Verdict.FAIL: "bad",
+    Verdict.NOT_DECIDED: "doubtful",
+    Verdict.PASS: "good",
+}
+"""Worst first."""
 
 
-def verdict(bench: Bench | None, found: list[LimitResult]) -> Paragraph:
+def verdict(found: TestVerdict | None) -> Paragraph:
     """Return what it all comes to, in a sentence or two."""
-    known = [each for each in found if each.known]
-    if not known:
-        why = (
-            "there are no limits in the bench file"
-            if bench is None or not bench.limits
-            else "the estimate says nothing at the frequencies of the limits"
-        )
-        return Paragraph(f"Measured, not judged: {why}.", "quiet")
-    channels = {(each.sensor, each.channel) for each in known}
-    failing = {(each.sensor, each.channel) for each in known if not each.met}
-    unsure = {(e.sensor, e.channel) for e in known if e.met and not e.certain} - failing
-    unknown = {(each.sensor, each.channel) for each in found} - channels
-    names = ", ".join(dict.fromkeys(each.limit for each in known))
-    if failing:
-        those = ", ".join(".".join(name) for name in sorted(failing))
-        text = (
-            f"FAIL: {len(failing)} of {several(len(channels), 'channel')} above {names}: {those}."
-        )
-    elif len(channels) == 1:
-        text = f"PASS: the channel meets {names}."
-    else:
-        text = f"PASS: all {len(channels)} channels meet {names}."
-    if unsure:
-        text += (
-            f" {several(len(unsure), 'channel')} within the uncertainty of the limit: "
-            "record longer to be certain."
-        )
-    if unknown:
-        text += f" Of {several(len(unknown), 'channel')} nothing can be said."
-    tone: Tone = "bad" if failing else "doubtful" if unsure or unknown else "good"
-    return Paragraph(text, tone)
+    if found is None:
+        return Paragraph("No verdict: the bench file has no limits.", "quiet")
+    text = " ".join([headline(found), *what_to_do(found)])
+    return Paragraph(text, _TONES[found.verdict])
 
 
-def limits_section(
-    bench: Bench | None, snapshot: Snapshot, found: list[LimitResult]
-) -> Section | None:
-    """Return every channel beside its limits; None where the bench file has none."""
-    if bench is None or not bench.limits:
+def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | None:
+    """Return every channel beside its limits, worst first; None where the bench file has none."""
+    if found is None:
         return None
     rows: list[tuple[str, ...]] = []
     tones: dict[tuple[int, int], Tone] = {}
-    for number, each in enumerate(found):
-        word, tone = _words(each)
-        tones[number, 6] = tone
+    order = list(dict.fromkeys(each.limit for each in found.limits))
+    ranks = list(_TONES)
+    for number, each in enumerate(
+        sorted(found.limits, key=lambda e: (order.index(e.limit), ranks.index(e.verdict)))
+    ):
+        tones[number, 6] = _TONES[each.verdict]
         rows.append(
             (
-                f"{each.sensor}.{each.channel}",
+                each.name,
                 each.limit,
                 plain_number(each.frequency, ".3g"),
                 decibel(each.noise_psd),
                 decibel(each.limit_psd),
-                plain_number(each.margin_db, "+.1f"),
-                word,
+                margin(each),
+                WORDS[each.verdict] if each.known else "no estimate",
             )
         )
-    method = next(iter(snapshot.results), "")
+    method = next((each.method for each in found.limits), "")
     header = (
         "channel", "limit", "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict",
     )  # fmt: skip
     note = (
         f"By the {method} estimate, in bands a third of an octave wide; shown is the band where "
-        f"the channel does worst. dB re 1 ({snapshot.unit})²/Hz. A channel fails where the whole "
-        "95 % interval, of all these bands at once, is above the limit."
+        f"the channel does worst. dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
+        "interval of its margin is above zero in every band, and fails where it is below zero in "
+        "one. The intervals hold for all channels and bands together with a probability of 95 %, "
+        "and include what the clocks may add."
     )
     table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))
@@ -136,38 +118,20 @@ def noise_section(snapshot: Snapshot, settings: Settings, bench: Bench | None) -
     return Section("Self-noise", tuple(parts))
 
 
-def judgements(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> list[LimitResult]:
-    """Return every channel beside its limits, worst first within each limit."""
-    found = judged(bench, snapshot, settings)
-    order = list(dict.fromkeys(each.limit for each in found))
-    return sorted(found, key=lambda each: (order.index(each.limit), _rank(each)))
-
-
-def _rank(each: LimitResult) -> int:
-    return 3 if not each.known else 0 if not each.met else 1 if not each.certain else 2
-
-
-def _words(each: LimitResult) -> tuple[str, Tone]:
-    if not each.known:
-        return "nothing can be said", "doubtful"
-    if not each.met:
-        return "FAIL", "bad"
-    return ("pass", "good") if each.certain else ("pass, not certain", "doubtful")
-
-
 def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
     band = band_of(settings, snapshot)
     method, noise = next(iter(snapshot.results.items()))
-    means = channel_means(noise, snapshot.frequency, settings, band)
-    inside = slice(*band_edges(snapshot.frequency, band))
-    width = np.gradient(snapshot.frequency)[inside]
-    data = np.average(snapshot.data_psd[inside], axis=0, weights=width)
+    means = channel_means(noise, snapshot, settings, band)
+    data, covs = data_means(snapshot, band), channel_covs(snapshot, settings, method)
     no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
     rows = []
+    alone = without_partners(snapshot, band)
     for number, label in enumerate(snapshot.channels):
+        name, recorded = f"{label.sensor}.{label.channel}", decibel(float(data[number]))
+        if number in alone:
+            rows.append((name, recorded, PARTNER_WORDS[alone[number]], *["?"] * 5))
+            continue
         mean = _only(means[number])
-        cov = noise.cov[inside, number]
-        cov = cov[np.isfinite(cov)]
         rows.append(
             (
                 f"{label.sensor}.{label.channel}",
@@ -175,7 +139,7 @@ def _band_table(snapshot: Snapshot, settings: Settings) -> Table:
                 decibel(mean[0], 2),
                 _interval(mean[1], mean[2]),
                 scientific(math.sqrt(mean[0])) if mean[0] > 0 else decibel(mean[0]),
-                plain_number(float(np.median(cov)) if cov.size else math.nan, ".3f"),
+                plain_number(covs[number], ".3f"),
                 plain_number(mean[3], ".3f"),
                 _snr(float(data[number]), mean[0]),
             )
@@ -213,7 +177,7 @@ def _octave_table(snapshot: Snapshot, settings: Settings) -> Table | None:
     if len(bands) < 2:
         return None
     noise = next(iter(snapshot.results.values()))
-    columns = [channel_means(noise, snapshot.frequency, settings, band) for band in bands]
+    columns = [channel_means(noise, snapshot, settings, band) for band in bands]
     rows = []
     for number, label in enumerate(snapshot.channels):
         row = [f"{label.sensor}.{label.channel}"]
@@ -241,14 +205,15 @@ def _level_with_error(mean: float, low: float, high: float) -> str:
         return decibel(mean)
     if low <= 0:
         return f"< {decibel(high, 2)}"
-    return f"{decibel(mean, 2)} ±{decibels(high) - decibels(mean):.2f}"
+    up, down = decibels(high) - decibels(mean), decibels(mean) - decibels(low)
+    error = f"±{up:.2f}" if down < ONE_SIDED * up else f"+{up:.2f} −{down:.2f}"
+    return f"{decibel(mean, 2)} {error}"
 
 
 def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:
     band = band_of(settings, snapshot)
     columns = [
-        channel_means(noise, snapshot.frequency, settings, band)
-        for noise in snapshot.results.values()
+        channel_means(noise, snapshot, settings, band) for noise in snapshot.results.values()
     ]
     rows = tuple(
         (

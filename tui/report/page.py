@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from tui.report import drawing
+from tui.report.figures import drawing
 
 if TYPE_CHECKING:
     from tui.report.parts import Plot, Report
@@ -24,6 +24,7 @@ _LIGHT = {
     "noise": drawing.NOISE,
     "limit": drawing.LIMIT,
     "nothing": drawing.NOTHING,
+    "quantisation": drawing.QUANTISATION,
     **{f"line{number}": colour for number, colour in enumerate(drawing.LINES)},
 }
 _DARK_LINES = (
@@ -36,6 +37,7 @@ _DARK = {
     "noise": "#6cb6fe",
     "limit": "#ff7566",
     "nothing": "#6d6240",
+    "quantisation": "#b8a48e",
     **{f"line{number}": colour for number, colour in enumerate(_DARK_LINES)},
 }
 

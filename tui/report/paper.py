@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import TextToPath
 
-from tui.report import drawing
+from tui.report.figures import drawing
 from tui.report.parts import Facts, Items, Paragraph, Plot, Signatures, Table
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording
+from daq.recording.storage.locking import is_being_written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -94,7 +94,7 @@ def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
 
 
 def _source(path: Path) -> Source:
-    with Recording.open(path, isolated=True) as recording:
+    with Recording.open(path) as recording:
         created = recording.created_at.utc_ns
         last = max(
             (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),

@@ -1,11 +1,11 @@
-"""What a child process of ours writes to standard error: its log records, and why it failed."""
+"""Standard error of a child process: its log records, and the reason of a failure."""
 
 from __future__ import annotations
 
 import logging
 from collections import deque
 
-from tui.output import logs
+from tui.output.logs import lines as logs
 
 _LOGGER = logging.getLogger(__name__)
 MOST_LINES = 20
@@ -28,14 +28,14 @@ class ChildLog:
         self._others: deque[str] = deque(maxlen=MOST_LINES)
 
     def feed(self, content: bytes) -> None:
-        """Take what was written, in pieces of any length."""
+        """Take output, in pieces of any length."""
         *lines, self._pending = (self._pending + content).split(b"\n")
         for line in lines:
             self._take(line.decode(errors="replace").rstrip())
 
     @property
     def errors(self) -> list[str]:
-        """Why the command failed: the errors it reported, or else what it wrote beside its log."""
+        """The errors that the command reported; otherwise its output that is not a log line."""
         return self._errors or [line for line in self._others if line]
 
     def _take(self, line: str) -> None:

@@ -21,8 +21,8 @@ from typing import Any
 from daq.errors import HuddleError, RecordingError
 from daq.python_process import python_command
 from daq.recording.control import ask
-from tui.output import logs
 from tui.output.exit_codes import ExitCode
+from tui.output.logs import lines as logs
 from tui.runs.child_log import ChildLog
 
 POLL = 0.05
@@ -48,7 +48,7 @@ class RecorderProcess:
     out : Path
         Recording it writes; must not exist.
     duration : float, optional
-        In seconds; until it is told to stop, if not given.
+        In seconds; without it, until a stop is requested.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class RecorderProcess:
                 Path(name).unlink()
 
     def close(self) -> None:
-        """Forget the process; it goes on."""
+        """Release the process, which continues."""
         self._log.close()
         self._process.returncode = self._process.poll() or 0  # it may outlive us: that is meant
 
@@ -95,12 +95,12 @@ class RecorderProcess:
         return self._process.poll() is not None
 
     def wait_for_file(self) -> None:
-        """Return when the recording is there to be followed.
+        """Return when the recording exists.
 
         Raises
         ------
         RecorderFailedError
-            The recorder ended before.
+            The recorder ended first.
         """
         while not self.out.exists():
             if self.ended and not self.out.exists():
@@ -109,12 +109,12 @@ class RecorderProcess:
             time.sleep(POLL)
 
     def check(self) -> None:
-        """Raise what made the recorder fail, if it ended so.
+        """Raise an error if the recorder failed.
 
         Raises
         ------
         RecorderFailedError
-            With what it said.
+            With the errors of the recorder.
         """
         code = self._process.poll()
         if code in {None, 0}:
@@ -124,18 +124,18 @@ class RecorderProcess:
 
     def _how_it_ended(self, code: int) -> str:
         if code > 0:
-            return f"the recorder ended with exit code {code} and said nothing"
+            return f"the recorder ended with exit code {code} and no message"
         try:
             name = signal.Signals(-code).name
         except ValueError:
             name = "unknown"
         return (
-            f"the recorder was killed (signal {-code}, {name}); what it had acknowledged is safe: "
-            f"huddle repair {self.out} checks it, huddle estimate reads it; start anew to go on"
+            f"the recorder was killed (signal {-code}, {name}); acknowledged samples are safe: "
+            f"huddle repair {self.out} closes the recording; start a new run to continue"
         )
 
     def interrupt(self) -> None:
-        """Ask it to stop by a signal, where the control channel does not answer."""
+        """Request a stop by a signal, if the control channel does not answer."""
         if sys.platform == "win32":
             self._process.send_signal(signal.CTRL_BREAK_EVENT)
         else:
@@ -186,12 +186,12 @@ class _LogFollower:
         self._thread.start()
 
     def errors(self) -> list[str]:
-        """Return why the recorder failed, as far as it said."""
+        """Return the reported reason of the failure."""
         self._read()
         return self._log.errors
 
     def close(self) -> None:
-        """Read what is left, and stop."""
+        """Read the remaining output, and stop."""
         self._closed.set()
         self._thread.join()
         self._read()

@@ -60,9 +60,9 @@ def scenario_of(bench: Bench) -> Scenario:
 
 
 def specification(bench: Bench, *, speed: float, log: Path | None = None) -> dict[str, Any]:
-    """Return what ``sim_devices.server.serve`` needs to serve every port of a bench.
+    """Return the specification for ``sim_devices.server.serve`` of every port of a bench.
 
-    Each fault that strikes and all that is sent is noted in ``log``.
+    ``log`` receives each fault and everything sent.
     """
     scenario = scenario_of(bench).to_dict()
     faults = bench.simulation.get("faults", [])
@@ -106,7 +106,7 @@ def _device(sensors: Sequence[Sensor]) -> dict[str, Any]:
 
 
 def _kind(port: str) -> str:
-    """Return the kind of wire a simulated device is to be served on, after its port's address."""
+    """Return the kind of port for a simulated device, from the address of its port."""
     scheme, _, rest = port.partition("://")
     if rest:
         return "udp" if scheme == "udp" else "tcp"
@@ -153,7 +153,7 @@ def with_faults(bench: Bench, path: Path) -> Bench:
     Raises
     ------
     BenchFileError
-        With every fault of the script.
+        With every error in the script.
     """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -165,7 +165,7 @@ def with_faults(bench: Bench, path: Path) -> Bench:
         raise BenchFileError(FileFault("", problem), source=path) from None
     unknown = sorted(table.keys() - {"faults"})
     if unknown:
-        found = (FileFault(key, "there is no such key; expected [[faults]]") for key in unknown)
+        found = (FileFault(key, "unknown key; expected [[faults]]") for key in unknown)
         raise BenchFileError(*found, source=path)
     script = table.get("faults", [])
     _check_faults(bench, script, str(path))
@@ -173,7 +173,7 @@ def with_faults(bench: Bench, path: Path) -> Bench:
 
 
 def _check_faults(bench: Bench, script: object, source: str) -> None:
-    """Check that a fault script is one, and strikes what the bench has."""
+    """Check that a fault script is valid for the bench."""
     try:
         check(
             parse_faults(script), {sensor.name: sensor.n_main_channels for sensor in bench.sensors}
@@ -202,7 +202,7 @@ def serve_devices(
     out: Path | None,
     json: str | None,
 ) -> None:
-    """Serve a bench's devices until SIGINT or SIGTERM, and tell how to reach them."""
+    """Serve the devices of a bench until SIGINT or SIGTERM; print or write their ports."""
     bench = load(path)
     if faults is not None:
         bench = with_faults(bench, faults)
@@ -225,6 +225,6 @@ def serve_devices(
             )
         _LOGGER.info("%d sensors served at %g times real time", len(bench.sensors), speed)
         if out is not None:
-            hint(f"huddle run {out} connects to them; Ctrl-C ends them")
+            hint(f"Next: huddle run {out}. Ctrl-C ends the devices.")
         while True:
             time.sleep(3600)

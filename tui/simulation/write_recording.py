@@ -1,4 +1,4 @@
-"""A recording straight from the model: no devices, no wires, as fast as it can be computed."""
+"""``huddle simulate``: a recording from the model, without devices."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ DEFAULT_DURATION = 600.0
 BLOCK_SECONDS = 1.0
 CHUNK_SECONDS = 10.0
 SIMULATED = "simulated"
-"""The driver a recording names that never saw a wire."""
+"""Driver of a recording without devices."""
 HEADROOM = 30.0
-"""Full scale of a named scenario's counts over the rms of what a channel reads."""
+"""Full scale of a named scenario over the rms of a channel."""
 DIRECTIONS = ("X", "Y", "Z")
 
 
 def simulate(scenario: Scenario, duration: float) -> dict[str, FloatArray]:
-    """Simulate what every sensor reads from its first sample on.
+    """Simulate the samples of every sensor.
 
     Parameters
     ----------
     scenario
-        What moves, and which sensors feel it.
+        Motion and sensors.
     duration
         In seconds.
 
@@ -70,33 +70,31 @@ def simulate_recording(
     Raises
     ------
     ScenarioError
-        There is neither a scenario nor a file of this name.
+        No scenario and no file has this name.
     BenchFileError
-        The bench file has no simulation, or one that does not fit it.
+        The bench file has no simulation, or one for other sensors.
     RecordingError
         The recording exists or cannot be written.
     """
-    bench, described = _described(scenario)
+    bench, world = described(scenario)
     seconds = duration or bench.recording.duration or DEFAULT_DURATION
     with progress() as bar:
         task = bar.add_task("simulating", total=seconds)
         write(
             out,
             bench,
-            described,
+            world,
             duration=seconds,
             simulated=lambda s: bar.update(task, completed=s),
         )
-    for_people(json).print(f"{out}: {seconds:g} s of {', '.join(described.names)}, simulated")
+    for_people(json).print(f"{out}: {seconds:g} s of {', '.join(world.names)}, simulated")
     write_json(
         json,
         {
             "file": str(out),
-            "scenario": described.to_dict(),
+            "scenario": world.to_dict(),
             "duration": seconds,
-            "sampling_rate": {
-                name: model.sampling_rate for name, model in described.sensors.items()
-            },
+            "sampling_rate": {name: model.sampling_rate for name, model in world.sensors.items()},
         },
     )
 
@@ -122,7 +120,7 @@ def write(
     duration
         In seconds.
     simulated
-        Told how many seconds are done.
+        Receives the number of finished seconds.
     """
     world = World(scenario)
     layouts = {sensor.name: _layout(sensor, scenario) for sensor in bench.sensors}
@@ -166,7 +164,7 @@ def _write_samples(
     )
 
 
-def _described(scenario: str) -> tuple[Bench, Scenario]:
+def described(scenario: str) -> tuple[Bench, Scenario]:
     """Return a bench without auxiliary channels, and the world of its sensors."""
     path = Path(scenario)
     if not path.exists():
@@ -211,7 +209,7 @@ def bench_of(name: str, scenario: Scenario) -> Bench:
 
 
 def _rms(scenario: Scenario, sensor: str) -> FloatArray:
-    """Root mean square of what each channel reads, in m/s²."""
+    """Root mean square of each channel, in m/s²."""
     step = 0.05
     frequency = np.arange(step, scenario.sensors[sensor].sampling_rate / 2, step)
     csm = World(scenario).true_csm((sensor,), frequency)

@@ -258,7 +258,7 @@ def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) 
 
 
 def clocks(told: ProgressCallback, *, length: float = 1.0) -> Study:
-    """Study what free-running clocks do to the three-sensor estimate, and what is left of it.
+    """Study the effect of free-running clocks on the three-sensor estimate.
 
     Parameters
     ----------
@@ -318,10 +318,10 @@ def _panel(title: str, rows: dict[str, Row], length: float) -> Panel:
 
 
 def residuals(snapshot: Snapshot, scenario: Scenario) -> FloatArray:
-    """Return what is left between each clock and the first sensor's, in seconds rms.
+    """Return the residual of each clock against that of the first sensor, in seconds rms.
 
-    A constant delay is left out: the method does not mind it, and only instruments with equal
-    responses would allow to tell it from their own.
+    A constant delay is not included: the method tolerates it, and only instruments with equal
+    responses would separate it from their own delay.
     """
     start = (snapshot.start_utc_ns - ORIGIN.utc_ns) * 1e-9
     seconds = start + snapshot.drift[:, 0]

@@ -55,7 +55,7 @@ STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A scenario's cross-spectral matrix, and what it would be without statistical error.
+    """Cross-spectral matrix of a scenario, and the same without statistical error.
 
     That is `motion` (n_freqs, n_channels, n_channels) and `noise` (n_freqs, n_channels) on its
     diagonal.
@@ -168,7 +168,7 @@ def true_noise(scenario: Scenario, sensors: tuple[str, ...], frequency: FloatArr
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Noise of some channels, shapes (n_freqs, n_channels): estimated, and what it should be."""
+    """Estimated and true noise of some channels, shapes (n_freqs, n_channels)."""
 
     method: str
     estimate: FloatArray
@@ -223,7 +223,7 @@ def band_series(
     bands: tuple[tuple[float, float], ...] = BANDS,
     allowed: Callable[[float], float] = lambda _: 0.0,
 ) -> Series:
-    """Mean fractional bias over each band and all channels, beside its limit.
+    """Mean fractional bias over each band and all channels, and its limit.
 
     The error is as if the channels' estimates were wrong all in the same way, as they are where
     the motion is what they share.
@@ -298,7 +298,7 @@ def setup2(laboratory: Laboratory) -> Study:
 
 
 def fig14(laboratory: Laboratory) -> Study:
-    """Wider triangles, where coherence fails; and what all five sensors make of it."""
+    """Wider triangles, where coherence fails, and the estimate of all five sensors."""
     measured = laboratory.measured("setup1")
     record = _record(measured, "E")
     panels: list[Panel] = []

@@ -48,7 +48,7 @@ BAND = slice(1, 901)
 SEGMENTS_AT_ONCE = 24
 N_NOISES = 6
 AT = np.array([10.0])
-"""A frequency; the levels are the same at all."""
+"""A frequency; levels are the same at all frequencies."""
 
 SNRS = (1.0, 10.0, 100.0, 1e3, 1e4)
 BIAS = {"three-channel": three_channel_bias, "three-sensor": three_sensor_bias}
@@ -73,7 +73,7 @@ def unit_scenario(seed: int) -> Scenario:
 
 
 class Ingredients:
-    """Cross-spectral matrices of unit motions and unit noises, simulated when first wanted.
+    """Cross-spectral matrices of unit motions and unit noises, simulated on first use.
 
     Parameters
     ----------
@@ -113,12 +113,12 @@ class Ingredients:
 def outcome(
     ingredients: Ingredients, scenario: Scenario, *, n_segments: int, method: str, x: float
 ) -> tuple[Point, Point]:
-    """Bias and c.o.v. of the noise of a scenario's first channel, beside theory.
+    """Bias and c.o.v. of the noise of the first channel of a scenario, with theory.
 
     Parameters
     ----------
     ingredients
-        What the scenario's samples are mixed from.
+        Components of the samples of the scenario.
     scenario
         White motion with two directions; all noises of the paper's level.
     n_segments

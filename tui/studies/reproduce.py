@@ -14,10 +14,12 @@ from rich.text import Text
 
 from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
+from tui.output.extras import require
 from tui.studies.clocks import clocks
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE
+from tui.studies.verdicts import verdicts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,8 +28,8 @@ if TYPE_CHECKING:
 
     from tui.studies.study import ProgressCallback, Series, Study
 
-CLOCKS = "clocks"
-STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS)
+CLOCKS, VERDICTS = "clocks", "verdicts"
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
@@ -65,6 +67,8 @@ def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> I
     for name in names:
         if name == CLOCKS:
             yield clocks(told, length=length)
+        elif name == VERDICTS:
+            yield verdicts(told, length=length)
         elif name in NUMERICAL:
             yield NUMERICAL[name](ingredients)
         else:
@@ -97,6 +101,7 @@ def run(
         If there is no place for figures or points, before anything is simulated.
     """
     check_places(json)
+    require("matplotlib")
     folder = DEFAULT_FOLDER if out is None else out
     started = time.monotonic()
     studies: list[Study] = []

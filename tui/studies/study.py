@@ -53,7 +53,7 @@ class Series:
 
     label: str
     method: str
-    quantity: Literal["bias", "c.o.v."]
+    quantity: Literal["bias", "c.o.v.", "share"]
     points: tuple[Point, ...]
 
     @property

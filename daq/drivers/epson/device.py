@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, PositiveFloat, Strict, field_validator
 
-from daq.drivers.interface import DeviceInformation
+from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.epson import commands
 from daq.protocols.epson.burst import BurstDecoder
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.errors import DeviceError
+    from daq.protocols.block import HostTime
     from daq.transport.byte_stream import ByteStream
 
 REPLY_TIMEOUT = 0.3
@@ -29,8 +30,9 @@ QUIET = 0.03
 ATTEMPTS, READ_ATTEMPTS = 5, 3
 SETTLE_TIMEOUT = 3.0
 """For the device to get ready (flash, reset) or change its mode or filter, s."""
-WRITE_INTERVAL = 0.001
-"""Between two commands, s; the data sheet asks for 350 µs."""
+WRITE_INTERVAL = 0.002
+"""Seconds from one command to the next; the data sheet asks for 350 µs (also after selecting a
+window), and a USB adapter may join what is written within one of its frames of 1 ms."""
 
 Field = Literal["x", "y", "z", "temperature"]
 EXTERNAL = {
@@ -45,7 +47,9 @@ EXTERNAL = {
 class EpsonSettings(BaseModel):
     """``[sensors.settings]`` of an Epson accelerometer."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
     """As the device is set (it leaves the factory at 460800)."""
@@ -67,6 +71,8 @@ class EpsonSettings(BaseModel):
     """What the EXT pin does; 1PPS on the M-A370 only."""
     full_scale: PositiveFloat = 15.0
     """In g, peak; samples beyond are marked as clipped."""
+    patience: PositiveFloat = DEFAULT_PATIENCE
+    """Seconds without a frame after which the device is lost and connected again."""
 
     @field_validator("filter")
     @classmethod
@@ -130,10 +136,14 @@ class Configuration:
         return cls(rate, settings.filter or usual, fields, burst, settings, is_a370)
 
     @property
+    def is_triggered(self) -> bool:
+        """Whether each sample waits for a signal at the EXT pin."""
+        return self.settings.external.startswith("trigger")
+
+    @property
     def hint(self) -> str:
         """What to look at if no sample comes."""
-        is_triggered = self.settings.external.startswith("trigger")
-        return ", one for each trigger: is there a signal at EXT?" if is_triggered else ""
+        return ", one for each trigger: is there a signal at EXT?" if self.is_triggered else ""
 
     def decoder(self, sensor: str) -> BurstDecoder:
         """Return a decoder of the bursts the device will send."""
@@ -185,13 +195,25 @@ class Device:
     """Registers of one device in configuration mode."""
 
     def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
+        self.stream = stream
         self._sensor = sensor
         self._stream = stream
 
+    async def _send(self, payload: bytes) -> None:
+        """Send commands of three bytes each, every one by itself."""
+        for start in range(0, len(payload), commands.SIZE):
+            await self._stream.write(payload[start : start + commands.SIZE])
+            await asyncio.sleep(WRITE_INTERVAL)
+
+    async def ask(self, register: Register) -> None:
+        """Ask for a register, and leave what comes to the caller."""
+        await self._stream.write(bytes([commands.DELIMITER]))
+        await asyncio.sleep(WRITE_INTERVAL)
+        await self._send(commands.read(register))
+
     async def write(self, register: Register, value: int, *, high: bool = False) -> None:
         """Set the low or high byte of a register."""
-        await self._stream.write(commands.write(register, value, high=high))
-        await asyncio.sleep(WRITE_INTERVAL)
+        await self._send(commands.write(register, value, high=high))
 
     async def read(self, register: Register) -> int:
         """Read a register; an answer that was lost on the way is asked for again."""
@@ -202,7 +224,7 @@ class Device:
 
     async def _read(self, register: Register) -> int:
         self._stream.discard()
-        await self._stream.write(commands.read(register))
+        await self._send(commands.read(register))
         received = b""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(REPLY_TIMEOUT):
@@ -253,6 +275,7 @@ class Device:
             except (NoAnswerError, WrongDeviceError) as error:
                 failure = error
                 await self._stream.write(bytes([commands.DELIMITER]))
+                await asyncio.sleep(WRITE_INTERVAL)
                 continue
             if found == commands.DEVICE_ID:
                 return
@@ -262,14 +285,14 @@ class Device:
         if failure is not None:
             raise failure
 
-    async def answers(self) -> bool:
-        """Whether a device is there that does not stream; one that does is not disturbed."""
-        await self._stream.write(bytes([commands.DELIMITER]))
+    async def answer(self) -> tuple[bytes, HostTime] | None:
+        """Ask for the ID, which disturbs no stream; return what comes, None if nothing does."""
         for _ in range(READ_ATTEMPTS - 1):
-            with contextlib.suppress(NoAnswerError, WrongDeviceError):
-                await self._read(commands.ID)
-                return True
-        return False
+            await self.ask(commands.ID)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(REPLY_TIMEOUT):
+                    return await self._stream.read()
+        return None
 
     async def information(self) -> DeviceInformation:
         """Read what the device says about itself; refuse it if it is not the one expected."""

@@ -31,6 +31,7 @@ from daq.errors import (
     NotConnectedError,
     WrongDeviceError,
 )
+from daq.protocols.block import HostTime
 from daq.protocols.epson import commands
 from daq.transport.ports import open_port
 
@@ -39,14 +40,16 @@ if TYPE_CHECKING:
 
     from daq.drivers.interface import DeviceInformation, Session
     from daq.host_clock import HostClock
-    from daq.protocols.block import Block, Event, HostTime
+    from daq.protocols.block import Block, Event
     from daq.protocols.epson.burst import BurstDecoder
     from daq.transport.byte_stream import ByteStream
 
-STALLED = 1.0
-"""Without a frame for so long, in s, the device has stopped sending."""
+ASK_AFTER = 1.0
+"""Seconds of silence after which the device is asked whether it was restarted."""
 GATHER = 0.1
 """Frames of so many seconds are decoded together, which is what a row of ``blocks`` holds."""
+WAITING = 0.05
+"""Seconds within which bytes that are there already are read."""
 LISTEN = 0.5
 """How long a device that was lost is listened to, s; and again once something is heard."""
 
@@ -62,16 +65,19 @@ class EpsonSession:
 
     def __init__(
         self,
-        stream: ByteStream,
+        device: Device,
         configuration: Configuration,
         information: DeviceInformation,
         decoder: BurstDecoder,
+        clock: HostClock,
         *,
         heard: tuple[bytes, HostTime] | None = None,
     ) -> None:
         self.information = (information,)
         self.decoder = decoder
-        self._stream = stream
+        self._device = device
+        self._clock = clock
+        self._stream = device.stream
         self._configuration = configuration
         self._heard = heard
 
@@ -83,31 +89,72 @@ class EpsonSession:
     async def read(self) -> AsyncIterator[Block | Event]:
         """Start sampling and yield blocks and events."""
         configuration = self._configuration
-        # filters settle before the first frame
-        patience = STALLED + 1.0
         if self._heard is None:
             self._stream.discard()
-            await self._stream.write(
-                commands.write(commands.MODE_CTRL, commands.SAMPLING, high=True)
-            )
+            await self._device.write(commands.MODE_CTRL, commands.SAMPLING, high=True)
         else:
             self.decoder.resume()
             for item in self.decoder.receive(*self._heard):
                 yield item
+        at: HostTime | None = None
+        # One that waits for a trigger answers, and was not restarted.
+        ask_after = None if configuration.is_triggered else ASK_AFTER
         n_frames = round(GATHER * configuration.sampling_rate)
         while True:
             self._stream.expect(n_frames, configuration.burst.size, begun=self.decoder.begun)
             try:
-                async with asyncio.timeout(patience):
+                async with asyncio.timeout(ask_after):
                     received, at = await self._stream.read()
-            except TimeoutError as error:
-                raise NoAnswerError(
-                    f"{self._stream.label}: nothing came for {patience:g} s; expected"
-                    f" {configuration.sampling_rate} frames a second{configuration.hint}"
-                ) from error
-            patience = STALLED
+            except TimeoutError:
+                for item in self.decoder.receive(*await self._rest(at)):
+                    yield item
+                received, at = await self._asked()
             for item in self.decoder.receive(received, at):
                 yield item
+
+    @property
+    def patience(self) -> float:
+        """See :class:`daq.drivers.interface.PatientSession`."""
+        return self._configuration.settings.patience
+
+    @property
+    def hint(self) -> str:
+        """See :class:`daq.drivers.interface.PatientSession`."""
+        configuration = self._configuration
+        return f"expected {configuration.sampling_rate} frames a second{configuration.hint}"
+
+    async def _rest(self, last: HostTime | None) -> tuple[bytes, HostTime]:
+        """Return the frames that were too few to be read, and when the last of them came.
+
+        They came one after the other behind those read ``last``, not only now: by this time it is
+        estimated how long a device that was restarted has been silent.
+        """
+        received, now = b"", self._clock.now()
+        self._stream.expect(1)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(WAITING):
+                received, now = await self._stream.read()
+        if last is None:
+            return received, now
+        burst, rate = self._configuration.burst, self._configuration.sampling_rate
+        passed_ns = round(len(received) / burst.size / rate * 1e9)
+        return received, HostTime(last.monotonic_ns + passed_ns, last.utc_ns + passed_ns)
+
+    async def _asked(self) -> tuple[bytes, HostTime]:
+        """Ask a silent device for its ID, and return the next frames.
+
+        Raises
+        ------
+        NoAnswerError
+            If the device answers: it was restarted and does not stream any more. A device whose
+            frames are only held up does not answer.
+        """
+        await self._device.ask(commands.ID)
+        received, at = await self._stream.read()
+        answer = commands.find_reply(received, commands.ID.address)
+        if answer == commands.DEVICE_ID and len(received) < self._configuration.burst.size:
+            raise NoAnswerError(f"{self._stream.label}: the device was restarted")
+        return received, at
 
 
 async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInformation:
@@ -157,7 +204,7 @@ class EpsonDriver:
         sensor, configuration = _configured(sensors)
         async with (
             _port(sensor, configuration, clock) as stream,
-            _set_up(sensor, stream) as session,
+            _set_up(sensor, stream, clock) as session,
         ):
             yield session
 
@@ -169,22 +216,24 @@ class EpsonDriver:
         sensor, configuration = _configured(sensors)
         async with _port(sensor, configuration, clock) as stream:
             device = Device(sensor, stream)
-            heard = None
             if isinstance(before, EpsonSession):
-                heard = await _listen(stream, before.decoder)
+                heard = await _listen(stream, before.decoder) or await device.answer()
+                if heard is None:
+                    raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
+                if commands.find_reply(heard[0], commands.ID.address) == commands.DEVICE_ID:
+                    heard = await _listen(stream, before.decoder)  # to one that streams yet
                 if heard is not None and before.decoder.follows(*heard):
                     async with _left_quiet(device, stream):
                         yield EpsonSession(
-                            stream,
+                            device,
                             configuration,
                             before.information[0],
                             before.decoder,
+                            clock,
                             heard=heard,
                         )
                     return
-            if heard is None and not await device.answers():
-                raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
-            async with _set_up(sensor, stream) as session:
+            async with _set_up(sensor, stream, clock) as session:
                 yield session
 
 
@@ -201,7 +250,9 @@ def _port(
 
 
 @contextlib.asynccontextmanager
-async def _set_up(sensor: Sensor, stream: ByteStream) -> AsyncIterator[EpsonSession]:
+async def _set_up(
+    sensor: Sensor, stream: ByteStream, clock: HostClock
+) -> AsyncIterator[EpsonSession]:
     device = Device(sensor, stream)
     await device.identify()
     async with _left_quiet(device, stream):
@@ -214,7 +265,7 @@ async def _set_up(sensor: Sensor, stream: ByteStream) -> AsyncIterator[EpsonSess
         actual = float(configuration.sampling_rate)
         information = replace(information, sampling_rate=actual)
         decoder = configuration.decoder(sensor.name)
-        yield EpsonSession(stream, configuration, information, decoder)
+        yield EpsonSession(device, configuration, information, decoder, clock)
 
 
 @contextlib.asynccontextmanager

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
     from daq.protocols.guralp.streams import Streams
 
-MARGIN = 3.0
-"""Beyond two blocks, how long nothing may come, s: streams may be in blocks of unequal length."""
 COMPONENTS = "ZNEX1234"
 
 
@@ -52,14 +50,16 @@ class GuralpSession:
         self,
         link: Link,
         *,
-        label: str,
+        patience: float,
         information: tuple[DeviceInformation, ...],
         heard: list[Block | Event],
         identify: Callable[[str], DeviceInformation],
     ) -> None:
         self.information = information
+        self.patience = patience
+        """See :class:`daq.drivers.interface.PatientSession`."""
+        self.hint = "check the digitizer's terminal, cable and power"
         self._link = link
-        self._label = label
         self._heard = heard
         self._identify = identify
         self._absent = {one.sensor for one in information if one.trouble}
@@ -67,7 +67,6 @@ class GuralpSession:
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        longest = 1.0  # of a block, s
         found, self._heard = self._heard, []
         while True:
             for item in found:
@@ -76,18 +75,8 @@ class GuralpSession:
                         yield self._identified(item)
                     if item.sensor in self._refused:
                         continue
-                    rate = self._link.streams.sampling_rate(item.sensor)
-                    longest = max(longest, item.n_samples / (rate or 1.0))
                 yield item
-            patience = 2 * longest + MARGIN
-            try:
-                async with asyncio.timeout(patience):
-                    found = await self._link.receive()
-            except TimeoutError as error:
-                raise NoAnswerError(
-                    f"{self._label}: nothing came for {patience:g} s;"
-                    f" expected a block at least every {longest:g} s"
-                ) from error
+            found = await self._link.receive()
 
     def _identified(self, first: Block) -> Event:
         """See who it is that was not there at the beginning: another device is left out."""
@@ -133,7 +122,7 @@ class GuralpDriver:
             by_name = {sensor.name: sensor for sensor in sensors}
             yield GuralpSession(
                 link,
-                label=label,
+                patience=settings.patience,
                 information=await _listen(link, sensors, settings, label, heard),
                 heard=heard,
                 identify=lambda name: _identity(link.streams, by_name[name], label),

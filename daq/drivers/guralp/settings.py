@@ -15,7 +15,7 @@ StreamId = Annotated[
 class GuralpSettings(BaseModel):
     """``[sensors.settings]`` of a Güralp digitizer."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     streams: tuple[StreamId, ...] | None = None
     """Stream ID of each channel, as ``("DEMOZ2", "DEMON2", "DEMOE2")``. If not given, those of the
@@ -28,6 +28,7 @@ class GuralpSettings(BaseModel):
     recovery_port: Annotated[int, Field(ge=0, le=65535)] | None = None
     """TCP port for packets lost over UDP; that of the server if not given, 0 for none."""
     patience: PositiveFloat = 30.0
-    """How long to wait until every stream has been heard, s."""
+    """Seconds to wait until every stream has been heard; and without any block later, after which
+    the digitizer is lost and connected again."""
     system_id: str = ""
     """Expected system ID; any, if empty."""

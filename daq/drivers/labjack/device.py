@@ -1,4 +1,4 @@
-"""Identify a LabJack and set it up: its settings in the bench file, its registers on the wire."""
+"""Identify a LabJack and set it up: its registers on the wire."""
 
 from __future__ import annotations
 
@@ -6,20 +6,11 @@ import asyncio
 import contextlib
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-)
-
-from daq.drivers.interface import DeviceInformation
+from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
+from daq.drivers.labjack.settings import RANGES, LabJackSettings, lacking, range_of
 from daq.drivers.port_rules import require_alike
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.errors import RemoteProtocolError
@@ -46,55 +37,6 @@ OWN = ("inputs", "range", "negative_inputs")
 BUFFERS = {"T7": 32768, "T8": 262144}
 
 
-def _input_number(value: object) -> object:
-    text = str(value).upper().removeprefix("AIN")
-    return int(text) if text.isdigit() else value
-
-
-def _range(value: float) -> float:
-    if value not in reg.GAINS:
-        raise ValueError(f"expected one of {', '.join(f'{volts:g}' for volts in reg.GAINS)} V")
-    return value
-
-
-def _power_of_two(value: int) -> int:
-    if value.bit_count() != 1:
-        raise ValueError("expected a power of 2")
-    return value
-
-
-Input = Annotated[int, BeforeValidator(_input_number), Field(ge=0, le=254)]
-
-
-class LabJackSettings(BaseModel):
-    """``[sensors.settings]`` of a sensor on a LabJack; ``inputs`` and ranges are the sensor's own.
-
-    What concerns the stream as a whole is taken from the port's first sensor.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    inputs: tuple[Input, ...] | None = None
-    """The analog input of each channel, such as ``["AIN0", "AIN1", "AIN2"]``; if not given, those
-    that follow the inputs of the port's sensors before."""
-    range: Annotated[float, AfterValidator(_range)] = 10.0
-    """Of the inputs, in volts, peak (T7)."""
-    negative_inputs: tuple[Input, ...] | None = None
-    """Of differential inputs, one for each channel; single-ended, if not given."""
-    resolution_index: Annotated[int, Field(ge=0, le=16)] = 0
-    settling_us: NonNegativeFloat = 0.0
-    mode: Literal["spontaneous", "command-response"] = "spontaneous"
-    stream_port: Annotated[int, Field(gt=0, le=65535)] = 702
-    samples_per_packet: Annotated[int, Field(gt=0, le=512)] | None = None
-    buffer_bytes: Annotated[int, Field(gt=0), AfterValidator(_power_of_two)] | None = None
-    """A power of 2; the largest the model has, if not given."""
-    core_timer: bool = True
-    external_clock_divisor: Annotated[int, Field(gt=0)] | None = None
-    """Scan on an external clock, divided by this; internal, if not given."""
-    trigger_index: NonNegativeInt = 0
-    """What starts the stream; 0: at once."""
-
-
 class Registers:
     """One connection to port 502."""
 
@@ -108,14 +50,16 @@ class Registers:
         """Name sensors and port, for error messages."""
         return self._stream.label
 
-    async def exchange(self, *commands: Command) -> tuple[bytes, HostTime]:
+    async def exchange(
+        self, *commands: Command, reply_within: float | None = REPLY_TIMEOUT
+    ) -> tuple[bytes, HostTime]:
         """Do several reads and writes at once; return what was read, and when it came."""
         self._transaction = (self._transaction + 1) % 65536
         request = Adu(self._transaction, 255, reg.encode_feedback(commands))
         await self._stream.write(reg.encode_adu(request))
         size = sum(2 * c.n_registers for c in commands if isinstance(c, Read))
         try:
-            async with asyncio.timeout(REPLY_TIMEOUT):
+            async with asyncio.timeout(reply_within):
                 while True:
                     received, at = await self._stream.read()
                     for adu in self._finder.receive(received):
@@ -123,7 +67,7 @@ class Registers:
                             return reg.feedback_values(adu.pdu, size), at
         except TimeoutError as error:
             raise NoAnswerError(
-                f"{self.label}: no reply of the device within {REPLY_TIMEOUT:g} s"
+                f"{self.label}: no reply of the device within {reply_within:g} s"
             ) from error
 
     async def do(self, doing: str, *commands: Command) -> bytes:
@@ -294,10 +238,18 @@ async def read_uptime(registers: Registers) -> Uptime | None:
 async def set_inputs(
     registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
 ) -> None:
-    """Set the range and the negative side of a sensor's inputs."""
+    """Set the range and the negative side of a sensor's inputs.
+
+    Raises
+    ------
+    WrongDeviceError
+        If the product does not have what the bench file says.
+    """
+    if fault := lacking(settings, numbers, product):
+        raise WrongDeviceError(f"{registers.label}: {fault}")
     negative = settings.negative_inputs or (reg.SINGLE_ENDED,) * len(numbers)
     for number, other in zip(numbers, negative, strict=True):
-        commands: list[Command] = [real(reg.AIN_RANGE + 2 * number, settings.range)]
+        commands: list[Command] = [real(reg.AIN_RANGE + 2 * number, range_of(settings, product))]
         if product == "T7":  # the T8's inputs are differential, each with a ground of its own
             commands.append(Write(reg.AIN_NEGATIVE_CHANNEL + number, other.to_bytes(2, "big")))
         await registers.do(f"setting AIN{number}", *commands)
@@ -322,6 +274,14 @@ def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: fl
     n_columns = len(scan_list)
     scans = max(1, min(labjack.MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
     return StreamPlan(scan_list, rate, settings.samples_per_packet or scans * n_columns)
+
+
+def patience_of(settings: LabJackSettings, stream: StreamPlan, product: str) -> float:
+    """Return the seconds for which the device keeps its samples while it cannot send them."""
+    if settings.patience is not None:
+        return settings.patience
+    n_samples = (settings.buffer_bytes or BUFFERS[product]) / 2
+    return max(DEFAULT_PATIENCE, n_samples / len(stream.scan_list) / stream.rate)
 
 
 async def set_stream(
@@ -349,32 +309,55 @@ async def set_stream(
     for start in range(0, len(stream.scan_list), 32):
         values = b"".join(a.to_bytes(4, "big") for a in stream.scan_list[start : start + 32])
         await registers.do("setting the scan list", Write(reg.STREAM_SCANLIST + 2 * start, values))
-    return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
+    if product == "T7":
+        return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
+    # A T8 tells its rate only while it streams; nobody takes these samples.
+    await registers.do("starting the stream", long(reg.STREAM_ENABLE, 1))
+    try:
+        return await registers.real(reg.STREAM_SCANRATE_HZ_ACTUAL)
+    finally:
+        await registers.stop_stream()
 
 
-async def read_calibrations(registers: Registers, product: str) -> tuple[Calibration, ...]:
-    """Return what the flash of a T7 holds, nothing for a T8."""
-    if product != "T7":
-        return ()
-    flash = await registers.do(
-        "reading the calibration",
-        long(reg.FLASH_READ_POINTER, reg.CALIBRATION_ADDRESS),
-        Read(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
+async def read_calibrations(
+    registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
+) -> tuple[Calibration, ...]:
+    """Return what the flash holds for each of a sensor's inputs, in their range."""
+    if product == "T7":
+        flash = await registers.do(
+            "reading the calibration",
+            long(reg.FLASH_READ_POINTER, reg.CALIBRATION_ADDRESS),
+            Read(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
+        )
+        gain = RANGES[product].index(range_of(settings, product))
+        return (reg.decode_calibrations(flash)[gain],) * len(numbers)
+    return tuple(
+        [
+            reg.decode_calibration(
+                await registers.do(
+                    "reading the calibration",
+                    long(
+                        reg.FLASH_READ_POINTER,
+                        reg.t8_calibration_address(number, range_of(settings, product)),
+                    ),
+                    Read(reg.FLASH_READ, 8),
+                )
+            )
+            for number in numbers
+        ]
     )
-    return reg.decode_calibrations(flash)
 
 
 def details_of(
-    settings: LabJackSettings,
-    inputs: tuple[int, ...],
-    calibrations: tuple[Calibration, ...],
+    range_: float, inputs: tuple[int, ...], calibrations: tuple[Calibration, ...]
 ) -> dict[str, str]:
-    """Return what is to be told of a sensor's inputs: their range and calibration."""
-    details = {"inputs": ", ".join(f"AIN{number}" for number in inputs)}
-    details["range"] = f"±{settings.range:g} V"
-    if calibrations:
-        calibration = calibrations[list(reg.GAINS).index(settings.range)]
-        details["counts per volt"] = f"{1 / calibration.positive_slope:.4f}"
-        details["counts per volt, negative"] = f"{-1 / calibration.negative_slope:.4f}"
-        details["counts at 0 V"] = f"{calibration.center:g}"
+    """Return the range and the calibration of a sensor's inputs, in words."""
+    names = [f"AIN{number}" for number in inputs]
+    details = {"inputs": ", ".join(names), "range": f"±{range_:g} V"}
+    alike = len(set(calibrations)) == 1
+    for name, calibration in zip(names, calibrations[:1] if alike else calibrations, strict=False):
+        where = "" if alike else f" of {name}"
+        details[f"counts per volt{where}"] = f"{1 / calibration.positive_slope:.4f}"
+        details[f"counts per volt{where}, negative"] = f"{-1 / calibration.negative_slope:.4f}"
+        details[f"counts at 0 V{where}"] = f"{calibration.center:g}"
     return details

@@ -5,10 +5,10 @@ analog input, and one scan list holds them all, so they are sampled by one clock
 have the same indices.
 
 What is recorded are the converter's counts (uint16), as they come. The device's calibration is read
-from its flash and told (``DeviceInformation.details``): counts per volt of each range. A channel's
-``sensitivity`` in the bench file is that times the sensor's volts per unit; at ±10 V the nominal
-3166.5 counts/V make 3166.5 × 1.27 for a sensor of 1.27 V/(m/s²). The centre of the converter (33523
-counts) is an offset like any other. The T8 does not show its calibration.
+from its flash (``DeviceInformation.details``): counts per volt, of each input where they differ. A
+channel's ``sensitivity`` in the bench file is that times the sensor's volts per unit; of a T7 at
+±10 V the nominal 3166.5 counts/V make 3166.5 × 1.27 for a sensor of 1.27 V/(m/s²). The centre of
+the converter (33523 counts of a T7) is an offset like any other.
 
 The device has few sockets: one on port 502 does everything but spontaneous streams, by function 76.
 With ``core_timer`` the scan list leads with the device's 40 MHz clock, so that gaps are counted
@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.drivers.labjack import device as setup
-from daq.drivers.labjack.device import LabJackSettings, Registers, StreamPlan, Uptime
-from daq.errors import DeviceError, NoAnswerError
+from daq.drivers.labjack.device import Registers, StreamPlan, Uptime
+from daq.drivers.labjack.settings import RANGES, LabJackSettings, lacking, range_of
+from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers as reg
 from daq.protocols.labjack import stream as labjack
@@ -45,8 +46,8 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
     from daq.protocols.block import Block, Event
 
-STALLED = 3.0
-"""Beyond two packets, how long nothing may come, s."""
+ASK_AFTER = 1.0
+"""Seconds of silence, beyond two packets, after which the device is asked whether it streams."""
 POLL_INTERVAL = 0.05
 """Between two reads of a stream by command, s, once it has been read up."""
 MOST_RESTARTS = 3
@@ -66,6 +67,7 @@ class LabJackSession:
         clock: HostClock,
         stream_address: str,
         packet_seconds: float,
+        patience: float,
         uptime: Uptime | None,
         resumed: bool,
     ) -> None:
@@ -78,7 +80,10 @@ class LabJackSession:
         self._settings = settings
         self._clock = clock
         self._stream_address = stream_address
-        self._patience = STALLED + 2 * packet_seconds
+        self.patience = patience
+        """See :class:`daq.drivers.interface.PatientSession`."""
+        self.hint = f"expected samples from {stream_address}"
+        self._ask_after = ASK_AFTER + 2 * packet_seconds
 
     @property
     def recovers(self) -> bool:
@@ -119,34 +124,39 @@ class LabJackSession:
             await self._start()
             while True:
                 try:
-                    async with asyncio.timeout(None if self.recovers else self._patience):
+                    async with asyncio.timeout(self._ask_after):
                         received, at = await stream.read()
-                except TimeoutError as error:
-                    raise NoAnswerError(
-                        f"{label}: no samples for {self._patience:g} s from {self._stream_address}"
-                    ) from error
-                yield self.decoder.receive(received, at)
+                except TimeoutError:
+                    await self._check_streaming()
+                else:
+                    yield self.decoder.receive(received, at)
+
+    async def _check_streaming(self) -> None:
+        """End the session if the device says that it does not stream any more.
+
+        One that does not answer may be behind a network that pauses; it keeps its samples.
+        """
+        with contextlib.suppress(RemoteProtocolError):
+            try:
+                values, _ = await self._registers.exchange(Read(reg.STREAM_ENABLE, 2))
+            except NoAnswerError:
+                return
+            if not int.from_bytes(values, "big"):
+                raise NoAnswerError(f"{self._registers.label}: the device does not stream any more")
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
-        silent_since = self._clock.now().monotonic_ns
         read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
         while True:
             try:
-                values, at = await self._registers.exchange(read)
+                # Samples that are on their way are in no other reply: no time limit.
+                values, at = await self._registers.exchange(read, reply_within=None)
             except RemoteProtocolError as error:
                 reason = await self._registers.reason()
                 raise DeviceError(
                     f"{self._registers.label}: reading the stream: {error}{reason}"
                 ) from error
             packet = labjack.decode_response(values)
-            if len(packet.samples) or packet.status == labjack.AUTO_RECOVER_ACTIVE:
-                silent_since = at.monotonic_ns
-            elif (at.monotonic_ns - silent_since) * 1e-9 > self._patience:
-                raise NoAnswerError(
-                    f"{self._registers.label}: no samples for {self._patience:g} s in register"
-                    f" {reg.STREAM_DATA_CR}"
-                )
             yield self.decoder.receive_response(packet, at)
             if len(packet.samples) < labjack.MAX_CR_SAMPLES:
                 await asyncio.sleep(POLL_INTERVAL)
@@ -195,6 +205,11 @@ class _Planned:
         first = sensors[0]
         settings = {s.name: LabJackSettings.model_validate(s.settings) for s in sensors}
         inputs = setup.inputs_of(sensors, settings)
+        for sensor in sensors:
+            product = next((p for p in RANGES if p in sensor.model.upper()), None)
+            fault = product and lacking(settings[sensor.name], inputs[sensor.name], product)
+            if fault:
+                raise BenchFileError(replace(fault, sensor=sensor.name))
         stream = setup.plan(settings[first.name], inputs, first.sampling_rate)
         return cls(settings, inputs, stream, setup.address_of(first))
 
@@ -218,13 +233,18 @@ async def _opened(
             for name, numbers in inputs.items():
                 await setup.set_inputs(registers, numbers, settings[name], product)
             rate = await setup.set_stream(registers, common, stream_plan, product)
-            calibrations = await setup.read_calibrations(registers, product)
+            calibrations = {
+                name: await setup.read_calibrations(registers, numbers, settings[name], product)
+                for name, numbers in inputs.items()
+            }
             information = tuple(
                 replace(
                     identity,
                     sensor=name,
                     sampling_rate=rate,
-                    details=setup.details_of(settings[name], numbers, calibrations),
+                    details=setup.details_of(
+                        range_of(settings[name], product), numbers, calibrations[name]
+                    ),
                 )
                 for name, numbers in inputs.items()
             )
@@ -245,6 +265,7 @@ async def _opened(
                 clock=clock,
                 stream_address=f"socket://{host}:{common.stream_port}",
                 packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
+                patience=setup.patience_of(common, stream_plan, product),
                 uptime=uptime,
                 resumed=resumed,
             )

@@ -1,8 +1,9 @@
-"""A Modbus bus: pymodbus's asynchronous client, with host times, named errors and no late replies.
+"""A Modbus bus: one request at a time, with host times, named errors and no late replies.
 
-On a serial bus nothing in a reply says which request it answers. After a timeout the bus is
-therefore left alone for as long again: a reply that comes late is then seen to belong to nobody,
-instead of answering the next request. Modbus TCP numbers its requests and needs no such pause.
+On a serial bus nothing in a reply says which request it answers. After silence the bus is therefore
+left alone for as long again: a reply that comes late then belongs to nobody, instead of answering
+the next request. A complete reply with a wrong checksum is known at once, and costs its poll only.
+Modbus TCP numbers its requests and needs no pause.
 """
 
 from __future__ import annotations
@@ -10,37 +11,43 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
-from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
+from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
 
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
+from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.modbus import rtu
-from daq.protocols.modbus.rtu import MAX_FRAME
+from daq.protocols.modbus.rtu import ReplyFinder
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+    from collections.abc import AsyncIterator, Iterator, Sequence
 
     from pymodbus.pdu import ModbusPDU
 
     from daq.host_clock import HostClock
     from daq.protocols.block import HostTime
+    from daq.transport.byte_stream import ByteStream
 
 # what it would print goes into our errors and events
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 TCP = "modbus-tcp://"
 LEAST_PATIENCE, LEAST_HURRIED = 0.2, 0.05
-"""For a reply, s: of a device whose replies are known, and where there may be none. With the pause
-after it, a lost reply must not take so long that the port looks stalled."""
+"""Shortest time to wait for a reply, s: of a device whose replies are known, and where there may be
+none."""
 KNOWN_AFTER = 5
 """Replies."""
+QUIET = 0.06
+"""Seconds without a byte after which a message has ended: more than a USB adapter (16 ms) or a
+serial server (40 ms) keeps bytes."""
 _UNIT = 6
-"""Where the unit stands in a frame over TCP."""
+"""Position of the unit in a frame over TCP."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -61,6 +68,10 @@ class RefusedError(DeviceError):
         self.code = code
 
 
+class DamagedReplyError(NoAnswerError):
+    """The device answered, and its reply was damaged on the way."""
+
+
 @dataclass(frozen=True, slots=True)
 class Reply:
     """Registers, when they were asked for, and when they came."""
@@ -68,6 +79,133 @@ class Reply:
     registers: Sequence[int]
     sent: HostTime
     received: HostTime
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """What a link received: registers, or the code of an exception; and when."""
+
+    registers: Sequence[int]
+    exception: int | None
+    received: HostTime
+
+
+class _Link(Protocol):
+    """What carries requests and replies.
+
+    Raises NoAnswerError with what came instead, as its message, and NotConnectedError.
+    """
+
+    async def ask(
+        self, device_id: int, function: int, address: int, value: int, patience: float
+    ) -> _Answer: ...
+
+    async def settle(self, seconds: float) -> None:
+        """Let a late reply come and go."""
+        ...
+
+
+class _RtuLink:
+    """Frames with a checksum on a serial line, or on what a serial server makes of one."""
+
+    def __init__(self, stream: ByteStream, *, echo: bool) -> None:
+        self._stream = stream
+        self._finder = ReplyFinder(echo=echo)
+
+    async def ask(
+        self, device_id: int, function: int, address: int, value: int, patience: float
+    ) -> _Answer:
+        stream, finder = self._stream, self._finder
+        request = rtu.encode(device_id, struct.pack(">BHH", function, address, value))
+        stream.discard()
+        finder.expect(request)
+        await stream.write(request)
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + patience
+        quiet = False
+        try:
+            while True:
+                until = min(deadline, loop.time() + QUIET) if quiet else deadline
+                async with asyncio.timeout_at(until):
+                    received, at = await stream.read()
+                reply = finder.receive(received)
+                if reply is not None:
+                    is_read = reply.exception is None and function != rtu.WRITE_SINGLE
+                    registers = reply.registers.tolist() if is_read else ()
+                    return _Answer(registers, reply.exception, at)
+                if finder.is_damaged:
+                    break
+                quiet = bool(finder.instead)
+        except TimeoutError:
+            pass
+        instead, other_unit = finder.instead, finder.other_unit
+        finder.forget()
+        if other_unit == device_id:
+            raise RemoteProtocolError(instead)
+        if instead and other_unit is None:
+            raise DamagedReplyError(instead)
+        if not instead:  # silence: a late reply must not answer the next request
+            await self.settle(patience)
+        raise NoAnswerError(instead)
+
+    async def settle(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+
+class _TcpLink:
+    """Modbus TCP."""
+
+    def __init__(self, client: AsyncModbusTcpClient, clock: HostClock) -> None:
+        self._client = client
+        self._clock = clock
+        self._heard = b""
+        client.ctx.trace_packet = self._trace  # what pymodbus would tell its log
+
+    async def ask(
+        self, device_id: int, function: int, address: int, value: int, patience: float
+    ) -> _Answer:
+        client = self._client
+        self._heard = b""
+        client.ctx.comm_params.timeout_connect = patience
+        task = asyncio.current_task()
+        n_cancelled = task.cancelling() if task else 0
+        try:
+            reply = await self._reply(device_id, function, address, value)
+            received = self._clock.now()
+            if task and task.cancelling() > n_cancelled:
+                # pymodbus waits by wait_for, which until Python 3.12 returns a reply that came in
+                # the same turn of the event loop as a cancellation, and forgets the cancellation
+                raise asyncio.CancelledError
+        except ConnectionException as error:
+            raise NotConnectedError("the port closed") from error
+        except ModbusIOException as error:
+            if not client.connected:
+                raise NotConnectedError("the port closed") from error
+            raise NoAnswerError(self._instead(device_id)) from error
+        code = int(getattr(reply, "exception_code", 0)) if reply.isError() else None
+        return _Answer(reply.registers, code, received)
+
+    async def _reply(self, device_id: int, function: int, address: int, value: int) -> ModbusPDU:
+        client = self._client
+        if function == rtu.WRITE_SINGLE:
+            return await client.write_register(address, value, device_id=device_id)
+        if function == rtu.READ_HOLDING:
+            return await client.read_holding_registers(address, count=value, device_id=device_id)
+        return await client.read_input_registers(address, count=value, device_id=device_id)
+
+    async def settle(self, seconds: float) -> None:
+        """Do nothing: replies are numbered."""
+
+    def _trace(self, sending: bool, packet: bytes) -> bytes:
+        if not sending:
+            whole = packet if packet.startswith(self._heard) else self._heard + packet
+            self._heard = whole[: rtu.MAX_FRAME]
+        return packet
+
+    def _instead(self, device_id: int) -> str:
+        if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
+            return f"a reply of unit {self._heard[_UNIT]} came, of unit {device_id} was asked"
+        return f"{len(self._heard)} bytes came that are no reply" if self._heard else ""
 
 
 @dataclass(slots=True)
@@ -81,24 +219,14 @@ class _Took:
 class ModbusBus:
     """One request at a time on one bus. Made by :func:`open_bus`."""
 
-    def __init__(
-        self,
-        client: AsyncModbusSerialClient | AsyncModbusTcpClient,
-        clock: HostClock,
-        *,
-        label: str,
-        timeout: float,
-    ) -> None:
+    def __init__(self, link: _Link, clock: HostClock, *, label: str, timeout: float) -> None:
         self.label = label
-        self._client = client
+        self._link = link
         self._clock = clock
         self._timeout = timeout
         self._patience = timeout
         self._hurries = False
         self._took: dict[int, _Took] = {}  # by device
-        self._serial = isinstance(client, AsyncModbusSerialClient)
-        self._heard = b""
-        client.ctx.trace_packet = self._trace  # what pymodbus would tell its log
 
     @contextlib.contextmanager
     def hurrying(self) -> Iterator[None]:
@@ -109,8 +237,8 @@ class ModbusBus:
         finally:
             self._hurries = False
 
-    def _wait_for(self, device_id: int) -> None:
-        """Wait as long as is due to a device: the others on the bus wait too."""
+    def _patience_with(self, device_id: int) -> float:
+        """Return how long to wait for a device, s: the others on the bus wait too."""
         took = self._took.get(device_id)
         seconds = self._timeout
         if self._hurries:
@@ -118,94 +246,77 @@ class ModbusBus:
             seconds = max(LEAST_HURRIED, 4 * longest)
         elif took is not None and took.n_replies >= KNOWN_AFTER:
             seconds = max(LEAST_PATIENCE, 4 * took.longest)
-        self._patience = self._client.ctx.comm_params.timeout_connect = min(seconds, self._timeout)
+        return min(seconds, self._timeout)
 
     async def read(self, function: int, device_id: int, address: int, count: int) -> Reply:
         """Read registers by function 3 or 4.
 
         Raises
         ------
+        DamagedReplyError
+            A reply came that was damaged on the way.
         NoAnswerError
             No reply, or none to this request, in time.
+        RemoteProtocolError
+            A reply to another request.
         RefusedError
             A Modbus exception.
         NotConnectedError
             The port is gone.
         """
-        client = self._client
-        ask = client.read_holding_registers if function == 3 else client.read_input_registers
         sent = self._clock.now()
-        reply = await self._reply(
+        answer = await self._asked(
             device_id,
-            lambda: ask(address, count=count, device_id=device_id),
+            function,
+            address,
+            count,
             f"device {device_id}, function {function}, registers {address} to"
             f" {address + count - 1}",
         )
-        received = self._clock.now()
-        seconds = (received.monotonic_ns - sent.monotonic_ns) * 1e-9 / self._clock.speed
+        elapsed_ns = answer.received.monotonic_ns - sent.monotonic_ns
         took = self._took.setdefault(device_id, _Took())
-        took.longest = max(0.99 * took.longest, seconds)
+        took.longest = max(0.99 * took.longest, elapsed_ns * 1e-9 / self._clock.speed)
         took.n_replies += 1
-        return Reply(reply.registers, sent, received)
+        return Reply(answer.registers, sent, answer.received)
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raises as :meth:`read` does."""
-        await self._reply(
+        await self._asked(
             device_id,
-            lambda: self._client.write_register(address, value, device_id=device_id),
+            rtu.WRITE_SINGLE,
+            address,
+            value,
             f"device {device_id}, function 6, register {address} ← {value}",
         )
 
-    async def _reply(
-        self, device_id: int, ask: Callable[[], Awaitable[ModbusPDU]], asked: str
-    ) -> ModbusPDU:
-        self._heard = b""
-        self._wait_for(device_id)
-        task = asyncio.current_task()
-        n_cancelled = task.cancelling() if task else 0
+    async def _asked(
+        self, device_id: int, function: int, address: int, value: int, asked: str
+    ) -> _Answer:
+        self._patience = self._patience_with(device_id)
         try:
-            reply = await ask()
-            if task and task.cancelling() > n_cancelled:
-                # pymodbus waits by wait_for, which until Python 3.12 returns a reply that came in
-                # the same turn of the event loop as a cancellation, and forgets the cancellation
-                raise asyncio.CancelledError
-        except ConnectionException as error:
+            answer = await self._link.ask(device_id, function, address, value, self._patience)
+        except NotConnectedError as error:
             raise NotConnectedError(f"{self.label}: the port closed") from error
-        except ModbusIOException as error:
-            if not self._client.connected:
-                raise NotConnectedError(f"{self.label}: the port closed") from error
+        except DamagedReplyError as error:
+            raise DamagedReplyError(f"{self.label}: a damaged reply to {asked}; {error}") from error
+        except NoAnswerError as error:
             if device_id in self._took:  # it may have become slower
                 self._took[device_id].longest *= 2
-            await self.settle()
-            instead = self._instead(device_id)
+            instead = f"; {error}" if str(error) else ""
             raise NoAnswerError(
-                f"{self.label}: no answer in {self._patience:.2g} s to {asked}"
-                f"{'; ' if instead else ''}{instead}"
+                f"{self.label}: no answer in {self._patience:.2g} s to {asked}{instead}"
             ) from error
-        if reply.isError():
-            code = int(getattr(reply, "exception_code", 0))
-            why = EXCEPTIONS.get(code, "unknown")
-            raise RefusedError(f"{self.label}: Modbus exception {code} ({why}) to {asked}", code)
-        return reply
+        if answer.exception is not None:
+            why = EXCEPTIONS.get(answer.exception, "unknown")
+            raise RefusedError(
+                f"{self.label}: Modbus exception {answer.exception} ({why}) to {asked}",
+                answer.exception,
+            )
+        return answer
 
     async def settle(self) -> None:
         """Let a late reply come and go."""
-        if self._serial:
-            await asyncio.sleep(self._patience)
-
-    def _trace(self, sending: bool, packet: bytes) -> bytes:
-        if not sending:
-            whole = packet if packet.startswith(self._heard) else self._heard + packet
-            self._heard = whole[:MAX_FRAME]
-        return packet
-
-    def _instead(self, device_id: int) -> str:
-        """Say what came instead of a reply of this device."""
-        if self._serial:
-            return rtu.describe(self._heard, device_id)
-        if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
-            return f"a reply of unit {self._heard[_UNIT]} came, of unit {device_id} was asked"
-        return f"{len(self._heard)} bytes came that are no reply" if self._heard else ""
+        await self._link.settle(self._patience)
 
 
 @contextlib.asynccontextmanager
@@ -218,6 +329,7 @@ async def open_bus(
     baud_rate: int = 9600,
     parity: str = "N",
     stop_bits: int = 1,
+    echo: bool = False,
 ) -> AsyncIterator[ModbusBus]:
     """Open a bus: ``modbus-tcp://host:port``, or a serial port or ``socket://`` for RTU.
 
@@ -226,30 +338,25 @@ async def open_bus(
     NotConnectedError
         It cannot be opened; the message says why and what to do.
     """
-    client: AsyncModbusSerialClient | AsyncModbusTcpClient
-    if port.startswith(TCP):
-        try:
-            host, number = host_and_port(port)
-        except ValueError as error:
-            raise NotConnectedError(f"{label}: {error}") from error
-        client = AsyncModbusTcpClient(
-            host, port=number, timeout=reply_timeout, retries=0, reconnect_delay=0
-        )
-    else:
-        client = AsyncModbusSerialClient(
-            port,
-            baudrate=baud_rate,
-            parity=parity,
-            stopbits=stop_bits,
-            timeout=reply_timeout,
-            retries=0,
-            reconnect_delay=0,
-        )
+    if not port.startswith(TCP):
+        async with open_port(
+            port, clock, label=label, baud_rate=baud_rate, parity=parity, stop_bits=stop_bits
+        ) as stream:
+            link = _RtuLink(stream, echo=echo)
+            yield ModbusBus(link, clock, label=label, timeout=reply_timeout)
+        return
+    try:
+        host, number = host_and_port(port)
+    except ValueError as error:
+        raise NotConnectedError(f"{label}: {error}") from error
+    client = AsyncModbusTcpClient(
+        host, port=number, timeout=reply_timeout, retries=0, reconnect_delay=0
+    )
     try:
         if not await client.connect():
             plain = port.replace(TCP, "socket://", 1)
             async with open_port(plain, clock, label=label):  # says why
                 raise NotConnectedError(f"{label}: the port opens, but not for Modbus")
-        yield ModbusBus(client, clock, label=label, timeout=reply_timeout)
+        yield ModbusBus(_TcpLink(client, clock), clock, label=label, timeout=reply_timeout)
     finally:
         client.close()

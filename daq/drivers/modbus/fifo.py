@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
-from daq.drivers.interface import DeviceInformation
+from daq.drivers.interface import DEFAULT_PATIENCE, DeviceInformation
 from daq.drivers.port_rules import only
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.modbus import rtu
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
 ATTEMPTS = 3
 HIGHEST_RATE = 65_535
-MOST_UNANSWERED = 5
-"""Reads without a reply, one after the other, after which the device is gone."""
 STALLED = 2.0
 """Without a sample for so long, in s, the device has stopped."""
 NOT_LESS = 3.0
@@ -48,7 +46,9 @@ NOT_LESS = 3.0
 class FifoSettings(BaseModel):
     """``[sensors.settings]`` of a device with a block FIFO."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
 
     baud_rate: PositiveInt = 3_000_000
     parity: Literal["N", "E", "O"] = "N"
@@ -63,6 +63,9 @@ class FifoSettings(BaseModel):
     """Between two reads, s, once the FIFO has been read up."""
     timeout: PositiveFloat = 0.3
     """How long a reply may take, s."""
+    patience: PositiveFloat | None = None
+    """Seconds without samples after which the device is lost and connected again; what the FIFO
+    holds (``capacity``), and at least 10 s, if not given."""
 
 
 class FifoSession:
@@ -76,8 +79,12 @@ class FifoSession:
         *,
         information: DeviceInformation,
         clock: HostClock,
+        patience: float,
     ) -> None:
         self.information = (information,)
+        self.patience = patience
+        """See :class:`daq.drivers.interface.PatientSession`."""
+        self.hint = "the device does not answer; check cable and power"
         self._stream = stream
         self._settings = settings
         self._decoder = decoder
@@ -86,16 +93,13 @@ class FifoSession:
     async def read(self) -> AsyncIterator[Block | Event]:
         """Read the FIFO and yield its blocks."""
         loop = asyncio.get_running_loop()
-        unanswered, fed = 0, loop.time()
+        fed = loop.time()
         least, lessened = math.inf, loop.time()
         while True:
             items, answered = await self._once()
             for item in items:
                 yield item
-            unanswered = 0 if answered else unanswered + 1
-            if unanswered > MOST_UNANSWERED:
-                raise NoAnswerError(f"{self._stream.label}: {unanswered} reads without a reply")
-            if (items and answered) or self._decoder.level:
+            if not answered or items or self._decoder.level:
                 fed = loop.time()
             elif loop.time() - fed > STALLED:
                 raise NoAnswerError(
@@ -121,10 +125,12 @@ class FifoSession:
         items: list[Block | Event] = []
         try:
             async with asyncio.timeout(self._settings.timeout):
-                while decoder.waiting:
+                while decoder.waiting and not decoder.is_damaged:
                     received, at = await stream.read()
                     items += decoder.receive(received, at)
         except TimeoutError:
+            pass
+        if decoder.waiting:
             return [*items, *decoder.timed_out(self._clock.now())], False
         return items, True
 
@@ -171,7 +177,15 @@ class FifoDriver:
                 sampling_rate=sensor.sampling_rate,
                 details={"unit": str(settings.unit), "header": settings.header},
             )
-            yield FifoSession(stream, settings, decoder, information=information, clock=clock)
+            kept = (settings.capacity or 0) / len(sensor.channels) / sensor.sampling_rate
+            yield FifoSession(
+                stream,
+                settings,
+                decoder,
+                information=information,
+                clock=clock,
+                patience=settings.patience or max(DEFAULT_PATIENCE, kept),
+            )
 
 
 def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.interface import DeviceInformation
-from daq.drivers.modbus.bus import ModbusBus, RefusedError, Reply, open_bus
+from daq.drivers.modbus.bus import DamagedReplyError, ModbusBus, RefusedError, Reply, open_bus
 from daq.drivers.port_rules import require_address, require_alike
 from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
@@ -48,7 +48,10 @@ late, since the others have to wait for it."""
 GATEWAY_CODES = {10, 11}
 """Modbus exceptions by which a gateway says that there is no answer behind it."""
 
-OF_THE_BUS = ("timeout", "baud_rate", "parity", "stop_bits")
+ATTEMPTS = 3
+"""Requests to a device that is set up, of which one must bring an undamaged reply."""
+
+OF_THE_BUS = ("timeout", "baud_rate", "parity", "stop_bits", "echo")
 """Settings of the port's first sensor, for all."""
 
 Address = Annotated[int, Field(ge=0, le=65535)]
@@ -57,7 +60,7 @@ Address = Annotated[int, Field(ge=0, le=65535)]
 class RegisterSettings(BaseModel):
     """``[sensors.settings]`` of the register poller."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     preset: Literal["witmotion", "labjack-ain"] | None = None
     """Settings of a known device; those given beside it go before."""
@@ -82,6 +85,9 @@ class RegisterSettings(BaseModel):
     baud_rate: PositiveInt = 9600
     parity: Literal["N", "E", "O"] = "N"
     stop_bits: Literal[1, 2] = 1
+    echo: bool = False
+    """Whether the adapter sends back what is written to it (two-wire RS-485). Where it is not
+    stated, the first reading shows it; a device whose settings are written needs it stated."""
 
 
 @dataclass(slots=True)
@@ -116,15 +122,12 @@ class _Polled:
             f" {self.device_id}"
         )
         try:
-            if self.settings.preset == "witmotion":
-                await self._set_witmotion_rate(bus)
-            try:
-                await self.read(bus)
-            except RefusedError as error:
-                if error.code in GATEWAY_CODES or self.apart:
-                    raise
-                self.apart = True
-                await self.read(bus)
+            for _ in range(ATTEMPTS - 1):
+                with contextlib.suppress(DamagedReplyError):
+                    await self._set_up(bus)
+                    break
+            else:
+                await self._set_up(bus)
         except NoAnswerError as error:
             raise NoAnswerError(
                 f"{wanted}; {error}; check cable, power, device_id and baud_rate"
@@ -139,6 +142,17 @@ class _Polled:
             sampling_rate=self.sensor.sampling_rate,
             details={"polled": "each sample at its own instant"},
         )
+
+    async def _set_up(self, bus: ModbusBus) -> None:
+        if self.settings.preset == "witmotion":
+            await self._set_witmotion_rate(bus)
+        try:
+            await self.read(bus)
+        except RefusedError as error:
+            if error.code in GATEWAY_CODES or self.apart:
+                raise
+            self.apart = True
+            await self.read(bus)
 
     async def read(self, bus: ModbusBus) -> Reply:
         """Ask for the registers that are needed.
@@ -197,6 +211,8 @@ class _Poller:
         try:
             reply = await self._polled.read(bus)
             found = self._decoder.receive(reply.registers, reply.sent, reply.received)
+        except DamagedReplyError as error:  # it is there: the next poll is due when it was
+            found = self._event(EventKind.CHECKSUM, str(error))
         except NoAnswerError as error:
             found = self._unanswered(str(error))
         except RefusedError as error:
@@ -321,6 +337,7 @@ class RegisterDriver:
             baud_rate=first.baud_rate,
             parity=first.parity,
             stop_bits=first.stop_bits,
+            echo=first.echo,
         ) as bus:
             information, errors = [], []
             for one in polled:

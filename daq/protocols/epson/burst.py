@@ -169,7 +169,7 @@ class BurstDecoder:
         found: list[Block | Event] = []
         for run in runs:
             if run.restarted:
-                text = f"COUNT began anew; missing: about {several(run.missing, 'sample')}"
+                text = f"COUNT restarted; missing: about {several(run.missing, 'sample')}"
                 found.append(Event(self._sensor, EventKind.RESET, text, at))
             found.append(self._block(run, counts[run.start : run.stop], at))
         return found

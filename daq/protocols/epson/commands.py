@@ -125,6 +125,10 @@ class Write:
         return bytes((self.address | 0x80, self.value, DELIMITER))
 
 
+SIZE = 3
+"""Bytes of a command. On a real line each is written by itself, 350 µs after the one before."""
+
+
 def read(register: Register) -> bytes:
     """Return the bytes that select the window and ask for a register."""
     return Write(WINDOW, register.window).encode() + Read(register.address).encode()

@@ -62,7 +62,7 @@ class SerialDecoder:
                     found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
                     self.streams.lost("lost block")
                 case Anew(sequence, due):
-                    text = f"the digitizer numbers anew: block {sequence} came, {due} was due"
+                    text = f"the digitizer restarted its numbering: block {sequence}, not {due}"
                     found.append(Event(self._name, EventKind.RESET, text, at))
                     self.streams.lost("digitizer restarted")
                 case Skipped(n_bytes, start):
@@ -157,7 +157,7 @@ class ScreamDecoder:
             self._missing.clear()
             self._next = (sequence + 1) % 65536
             self.streams.lost("server restarted")
-            text = f"the server numbers anew: packet {sequence} came, {due} was due"
+            text = f"the server restarted its numbering: packet {sequence}, not {due}"
             yield Event(self._name, EventKind.RESET, text, at)
         elif ahead < 32768:
             yield from self._advance(due, ahead, at)

@@ -11,8 +11,9 @@ One flat map of 16-bit registers, big-endian, read by functions 3 and 4, written
 
 The T7 keeps its calibration in internal flash from 0x3C4000: for the high-speed converter at gain
 1, 10, 100 and 1000, then for the high-resolution one, {positive slope, negative slope, centre,
-offset} as FLOAT32. Streams come from the high-speed converter. The T8's calibration is not public:
-its stream is recorded as it comes.
+offset} as FLOAT32. Streams come from the high-speed converter. The T8 keeps such a set for each of
+its eight inputs and eleven ranges, from 64 bytes after 0x687000 (T-series datasheet 20.0.2:
+``ain[input][range]``).
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ STREAM_EXTERNAL_CLOCK_DIVISOR = 4022
 STREAM_TRIGGER_INDEX = 4024
 STREAM_START_TIME_STAMP = 4026
 STREAM_SCANLIST = 4100  # + 2 k
+STREAM_SCANRATE_HZ_ACTUAL = 4494
+"""Of a T8, from the start of the stream on."""
 STREAM_DATA_CR = 4500
 STREAM_DATA_CAPTURE_16 = 4899
 STREAM_ENABLE = 4990
@@ -66,6 +69,8 @@ TARGET_COMMAND_RESPONSE = 16
 TEST_VALUE = 0x00112233
 CALIBRATION_ADDRESS = 0x3C4000
 N_CALIBRATION_VALUES = 41
+T8_CALIBRATION_ADDRESS = 0x687000
+T8_CALIBRATION_HEADER = 64
 CORE_HZ = 40_000_000
 SYSTEM_HZ = 20
 STREAM_NOT_RUNNING = 2620
@@ -84,6 +89,14 @@ def ain(number: int) -> int:
 def actual_scan_rate(wanted: float) -> float:
     """Return the scan rate a T7 makes of ``wanted`` (Hz): its interval is a multiple of 100 ns."""
     return 1e7 / max(1, round(1e7 / wanted)) if wanted > 152.588 else _slow_rate(wanted)
+
+
+def actual_t8_scan_rate(wanted: float) -> float:
+    """Return the scan rate a simulated T8 makes of ``wanted``, in Hz: 40 MHz divided.
+
+    What divides a T8's clock is not published; a driver reads the rate and assumes nothing.
+    """
+    return CORE_HZ / max(1, round(CORE_HZ / wanted))
 
 
 def _slow_rate(wanted: float) -> float:
@@ -238,6 +251,46 @@ class Calibration:
 
 GAINS = {10.0: 1, 1.0: 10, 0.1: 100, 0.01: 1000}
 """Gain of each range in volts."""
+
+
+T8_RANGES = (11.0, 9.6, 4.8, 2.4, 1.2, 0.6, 0.3, 0.15, 0.075, 0.036, 0.018)
+"""In volts, peak; in the order of the T8's calibration."""
+T8_SPANS = (11.0, 9.768, 4.884, 2.442, 1.221, 0.611, 0.305, 0.153, 0.076, 0.038, 0.019)
+"""What the converter spans in each of them, in volts, peak (T-series datasheet 20.0.2)."""
+T8_INPUTS = 8
+_SET = 4  # values of a calibration
+
+
+def t8_calibration_address(number: int, range_: float) -> int:
+    """Return where the flash of a T8 holds the calibration of an input in a range."""
+    index = number * len(T8_RANGES) + T8_RANGES.index(range_)
+    return T8_CALIBRATION_ADDRESS + T8_CALIBRATION_HEADER + 4 * _SET * index
+
+
+def nominal_t8_calibrations() -> tuple[Calibration, ...]:
+    """Return the calibration of every input and range of a T8 as if it had no errors.
+
+    That a stream holds the upper 16 bits of the converter's 24, and 0 V is in their middle, is
+    assumed.
+    """
+    at_input = tuple(Calibration(span / 32768, -span / 32768, 32768.0, -span) for span in T8_SPANS)
+    return at_input * T8_INPUTS
+
+
+def encode_t8_calibrations(calibrations: Sequence[Calibration]) -> bytes:
+    """Write the flash of a T8, from its header to the last input."""
+    sets = [
+        struct.pack(f">{_SET}f", one.positive_slope, one.negative_slope, one.center, one.offset)
+        for one in calibrations
+    ]
+    return bytes(T8_CALIBRATION_HEADER) + b"".join(sets)
+
+
+def decode_calibration(flash: bytes) -> Calibration:
+    """Read one calibration of four values."""
+    if len(flash) != 4 * _SET:
+        raise RemoteProtocolError(f"{len(flash)} bytes of calibration; expected {4 * _SET}")
+    return Calibration(*struct.unpack(f">{_SET}f", flash))
 
 
 def nominal_calibrations() -> tuple[Calibration, ...]:

@@ -202,7 +202,7 @@ class StreamDecoder:
         self._n_columns = len(scan_list)
         self._timed = tuple(scan_list[:2]) == TIMER_ADDRESSES
         self._rate = scan_rate
-        self._ticks = round(CORE_HZ / scan_rate)
+        self._ticks = CORE_HZ / scan_rate  # a whole number of a T7
         self._finder = PacketFinder()
         self._next_row = self._end_row = 0  # expected, as far as is known; after the last scan
         self._flags = BlockFlag.CLOCK_RESTART
@@ -370,16 +370,16 @@ class StreamDecoder:
         if not self._timed or not len(scans):
             return 0
         first, last = _timer(scans[0]), _timer(scans[-1])
-        before, n_repeated = self._newest, 0
-        if (last - first) % _WRAP == (len(scans) - 1) * self._ticks:  # else it is no timer
-            self._newest = last
-        if before is not None and (at.monotonic_ns - self._newest_ns) * 1e-9 < MOST_DOUBT:
+        before, before_ns, n_repeated = self._newest, self._newest_ns, 0
+        # The timer may jitter; what is off by more is no timer.
+        if abs((last - first) % _WRAP - (len(scans) - 1) * self._ticks) < self._ticks / 2:
+            self._newest, self._newest_ns = last, at.monotonic_ns
+        if before is not None and (at.monotonic_ns - before_ns) * 1e-9 < MOST_DOUBT:
             behind = (before - first) % _WRAP
             if behind < REPEATED * CORE_HZ:
-                n_repeated = min(behind // self._ticks + 1, len(scans))
+                n_repeated = min(round(behind / self._ticks) + 1, len(scans))
                 if n_repeated == len(scans):
-                    self._newest = before
-        self._newest_ns = at.monotonic_ns
+                    self._newest, self._newest_ns = before, before_ns
         return n_repeated
 
     def _place(self, scans: NDArray[np.uint16], at: HostTime) -> int | None:

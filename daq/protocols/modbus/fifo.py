@@ -108,6 +108,11 @@ class FifoDecoder:
         """Whether a reply is outstanding."""
         return self._finder.waiting
 
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the outstanding reply came, damaged."""
+        return self._finder.is_damaged
+
     def request(self) -> bytes:
         """Return the next request: for the level, with all the samples known to wait."""
         most = MAX_WORDS // self._n_channels * self._n_channels

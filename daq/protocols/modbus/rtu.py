@@ -91,9 +91,18 @@ class Reply:
 
 
 class ReplyFinder:
-    """The client's end: finds the reply to the one request that is waited for."""
+    """The client's end: finds the reply to the one request that is waited for.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    echo : bool
+        Whether the adapter is known to send back what is written. Otherwise it is recognised by the
+        first request to read that comes back.
+    """
+
+    def __init__(self, *, echo: bool = False) -> None:
+        self.echo = echo
+        self._request = b""
         self._buffer = bytearray()
         self._unit = 0
         self._function = 0
@@ -104,9 +113,21 @@ class ReplyFinder:
         """Wait for the reply to ``request``; whatever came before is forgotten."""
         self._buffer.clear()
         self._heard.clear()
+        self._request = request
         self._unit, self._function = request[0], request[1]
         reads = self._function in (READ_HOLDING, READ_INPUT)
         self._size = 5 + 2 * int.from_bytes(request[4:6], "big") if reads else 8
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether as many bytes as the reply has came, and are not the reply."""
+        return self.waiting and len(self._heard) == self._size
+
+    @property
+    def other_unit(self) -> int | None:
+        """Unit of an undamaged message that came and is no reply to the request; None if none."""
+        frame = _find_message(bytes(self._heard))
+        return None if frame is None else frame[0]
 
     @property
     def waiting(self) -> bool:
@@ -129,6 +150,8 @@ class ReplyFinder:
             return None
         self._buffer += received
         self._heard += received[: MAX_FRAME - len(self._heard)]
+        if not self._drop_echo():
+            return None
         buffer = bytes(self._buffer)
         head = bytes((self._unit,))
         here = 0
@@ -155,6 +178,20 @@ class ReplyFinder:
         del self._buffer[:here]
         return None
 
+    def _drop_echo(self) -> bool:
+        """Take an echo of the request off the bytes received; return False while it may go on."""
+        request = self._request
+        if not request or not (self.echo or self._function in (READ_HOLDING, READ_INPUT)):
+            return True
+        if request.startswith(self._heard) and len(self._heard) < len(request):
+            return not self.echo
+        if self._heard.startswith(request):
+            self.echo = True
+            del self._heard[: len(request)]
+            self._buffer = bytearray(self._heard)
+        self._request = b""
+        return True
+
     def _fits(self, frame: bytes) -> bool:
         """Whether the byte count of a reply with registers is the one that was asked for."""
         if frame[1] not in (READ_HOLDING, READ_INPUT):
@@ -164,6 +201,18 @@ class ReplyFinder:
 
 def describe(heard: bytes, unit: int) -> str:
     """Say what bytes are that came instead of a reply of ``unit``; empty if there are none."""
+    frame = _find_message(heard)
+    if frame is None:
+        return f"{len(heard)} bytes came that are no reply" if heard else ""
+    if frame[0] != unit:
+        return f"a reply of unit {frame[0]} came, of unit {unit} was asked"
+    if len(frame) > 8 or frame[1] in (READ_HOLDING, READ_INPUT):
+        return f"a reply with {frame[2] // 2} registers came, as many were not asked for"
+    return f"a reply to function {frame[1] & 0x7F} came, which was not asked for"
+
+
+def _find_message(heard: bytes) -> bytes | None:
+    """Return the first reply of any unit to any request."""
     for start in range(len(heard) - 4):
         function = heard[start + 1]
         size = 8
@@ -172,14 +221,9 @@ def describe(heard: bytes, unit: int) -> str:
         elif function in (READ_HOLDING, READ_INPUT):
             size = 5 + heard[start + 2]
         frame = heard[start : start + size]
-        if len(frame) < size or size > MAX_FRAME or not is_whole(frame):
-            continue
-        if frame[0] != unit:
-            return f"a reply of unit {frame[0]} came, of unit {unit} was asked"
-        if size > 8 or function in (READ_HOLDING, READ_INPUT):
-            return f"a reply with {frame[2] // 2} registers came, as many were not asked for"
-        return f"a reply to function {function & 0x7F} came, which was not asked for"
-    return f"{len(heard)} bytes came that are no reply" if heard else ""
+        if len(frame) == size <= MAX_FRAME and is_whole(frame):
+            return frame
+    return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,16 @@ Theory of operation
 Bytes are cut at the terminator, and each piece, without white space at its ends, is one *message*:
 ``prefix``, fields with the delimiter between, ``suffix``, and with a checksum ``*hh``, the XOR of
 all characters between the prefix and the asterisk in hexadecimal (NMEA 0183). Fields may be padded
-with spaces or quoted. Two layouts:
+with spaces or quoted. Four layouts:
 
 row
     ``LILY,2013/06/24 23:22:00,-236.026,  25.666,194.25, 26.01,11.96,N9655``
     One sample of every channel; ``columns`` says in which fields. A row may carry a time, or a
     counter that goes up by one.
+labelled
+    ``t:1200 X:-12 Y:40 Z:16384``: as a row, each field with its name.
+json
+    ``{"t": 1200, "acc": [-12, 40, 16384]}``: as a row; names are ``t``, ``acc.0`` and so on.
 channel
     ``{'EHZ', 1582315130.292, 14168, 14927, …}``
     The channel, the time of the first sample in seconds since 1970, then samples. Packets of one
@@ -25,6 +29,7 @@ is missing, and bytes that were lost altogether are not noticed.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,11 +40,14 @@ from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.sample_counter import SampleCounter
 from daq.protocols.sample_times import Place, SampleTimes
 from daq.protocols.text.format import (
+    LABELLED,
     MAX_MESSAGE,
     MessageFinder,
     TextFormat,
     decode_time,
+    flatten,
     nmea_checksum,
+    read_hexadecimal,
 )
 from daq.protocols.text.packet_order import Group, Packets
 
@@ -49,6 +57,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _ANNOUNCED = 200
+_FIRST_ROWS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +104,11 @@ class TextDecoder:
         self._n_known = self._n_unreadable = self._n_given_up = 0
         self._finest_ns: int | None = None  # how finely times are written
         self._delimiter = format_.delimiter.strip() or None  # None: any white space
+        if "\t" in format_.delimiter:
+            self._delimiter = "\t"
+        self.first_rows: list[bytes] = []
+        """The first messages, as long as none of them could be read."""
+        self._has_read = False
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Take bytes of a line or connection, cut anywhere."""
@@ -133,10 +147,14 @@ class TextDecoder:
                     found += self._packet(fields, at)
                 else:
                     rows.append(self._row(fields, message))
+                self._has_read = True
+                self.first_rows.clear()
             except RemoteProtocolError as error:
                 found += self._rows(rows, at)
                 rows = []
                 self._n_unreadable += 1
+                if not self._has_read and len(self.first_rows) < _FIRST_ROWS:
+                    self.first_rows.append(message)
                 text = f"{_cut(str(error), 160)} ({self._n_unreadable} unreadable so far)"
                 found.append(Event(self._sensor, EventKind.CHECKSUM, _cut(text), at))
                 self._unreadable()
@@ -153,6 +171,8 @@ class TextDecoder:
         """Return the fields of a message, None if it is another kind."""
         format_ = self._format
         text = message.decode("ascii", "replace")
+        if format_.layout in {"labelled", "json"}:
+            return [text]
         if not text.startswith(format_.prefix):
             raise RemoteProtocolError(f"no {format_.prefix!r} at the start of {text[:80]!r}")
         text = text[len(format_.prefix) :]
@@ -175,12 +195,13 @@ class TextDecoder:
         format_ = self._format
         time_ns = resolution_ns = counter = 0
         try:
-            values = _numbers([fields[i] for i in format_.columns], format_)
+            by_key = _by_key(fields, format_)
+            values = _numbers([by_key[key] for key in format_.channel_keys], format_)
             if format_.time_column is not None:
-                time_ns, resolution_ns = self._time(fields[format_.time_column])
+                time_ns, resolution_ns = self._time(by_key[format_.time_column])
             if format_.counter_column is not None:
-                counter = int(fields[format_.counter_column]) % format_.counter_modulus
-        except (ValueError, IndexError, OverflowError) as error:
+                counter = int(by_key[format_.counter_column]) % format_.counter_modulus
+        except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
             text = format_.delimiter.join(fields)[:80]
             raise RemoteProtocolError(f"not a row of this format: {text!r}") from error
         return _Row(values, message, counter, time_ns, resolution_ns)
@@ -212,7 +233,7 @@ class TextDecoder:
                 self._reason = "counter"
             if run.restarted:
                 self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-                yield Event(self._sensor, EventKind.RESET, "the counter began anew", at)
+                yield Event(self._sensor, EventKind.RESET, "the counter restarted", at)
             self._next = run.first_sample
             device = rows[run.start].time_ns if self._format.device_time else run.counter
             yield self._block(counts[run.start : run.stop], device, at)
@@ -220,7 +241,7 @@ class TextDecoder:
     def _unreadable(self) -> None:
         """Count a message that could not be read, where nothing else tells that it is missing."""
         format_ = self._format
-        if format_.layout == "row" and format_.counter_column is format_.time_column is None:
+        if format_.layout != "channel" and format_.counter_column is format_.time_column is None:
             self._skip(1, "unreadable row", is_exact=False)
 
     # --- packets -----------------------------------------------------------------------------
@@ -318,8 +339,23 @@ class TextDecoder:
         return Block(self._sensor, first, counts, at, device, flags, reason)
 
 
+def _by_key(fields: list[str], format_: TextFormat) -> dict[int | str, str]:
+    """Return the fields of a row by their number or name."""
+    if format_.layout == "labelled":
+        return {name: value for name, value in LABELLED.findall(fields[0])}  # noqa: C416 -- keys of either type
+    if format_.layout == "json":
+        return {path: value for path, value in flatten(json.loads(fields[0])).items()}  # noqa: C416
+    return {n: field for n, field in enumerate(fields)}  # noqa: C416
+
+
 def _numbers(fields: list[str], format_: TextFormat) -> NDArray[Any]:
-    values = np.array(fields, dtype=np.float64) if fields else np.empty(0)
+    if format_.hexadecimal_bits is not None:
+        n_bits = format_.hexadecimal_bits
+        values = np.array([read_hexadecimal(field, n_bits) for field in fields], np.float64)
+    else:
+        if format_.decimal_comma:
+            fields = [field.replace(",", ".") for field in fields]
+        values = np.array(fields, dtype=np.float64) if fields else np.empty(0)
     if not np.isfinite(values).all():
         raise ValueError(fields)
     if not format_.whole:

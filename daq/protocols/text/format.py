@@ -5,6 +5,8 @@ See :mod:`daq.protocols.text.decoder` for what messages are made of.
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import reduce
@@ -14,11 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 MAX_MESSAGE = 16_384
 """Bytes without a terminator after which a message is given up."""
 _NS = 1_000_000_000
+SINCE_START = {"millis": 1_000_000, "micros": 1000}
+"""Units, in ns, of times that count since the device was started."""
 _EPOCH = datetime.fromtimestamp(0, UTC)
 _LATEST_S = 9e9  # in ns it still fits 64 bits
 
@@ -30,13 +34,20 @@ class TextFormat:
     Attributes
     ----------
     columns : tuple of int
-        Field of each channel, counted from 0 after the tag included (layout "row").
+        Field of each channel, counted from 0, the tag included (layout "row").
     channel_names : tuple of str
-        As in the messages, in the order of the channels (layout "channel").
-    time_column, time_format : int or None, str
-        Field of the time: seconds since 1970 (``"epoch"``), or as ``strptime`` has it, in UTC.
-    counter_column, counter_modulus : int or None, int
-        Field of a counter that goes up by one a row and starts anew at the modulus.
+        As in the messages, in the order of the channels (the other layouts). In layout "json" a
+        name may be a path, such as ``acceleration.0``.
+    time_column, time_format : int, str or None, str
+        Field of the time, by its number or its name: seconds since 1970 (``"epoch"``), as
+        ``strptime`` has it, in UTC, or ms or µs since the device was started (``"millis"``,
+        ``"micros"``).
+    counter_column, counter_modulus : int, str or None, int
+        Field of a counter that goes up by one a row and starts again at the modulus.
+    decimal_comma : bool
+        Whether numbers are written ``1,5``.
+    hexadecimal_bits : int or None
+        Of samples in hexadecimal, two's complement.
     tag : str
         What the first field must be; rows of other tags are skipped.
     whole : bool
@@ -45,7 +56,7 @@ class TextFormat:
         Whether the device's time is to be trusted more than arrival (NTP, GPS).
     """
 
-    layout: Literal["row", "channel"] = "row"
+    layout: Literal["row", "labelled", "json", "channel"] = "row"
     delimiter: str = ","
     terminator: str = "\n"
     prefix: str = ""
@@ -53,13 +64,20 @@ class TextFormat:
     tag: str = ""
     columns: tuple[int, ...] = ()
     channel_names: tuple[str, ...] = ()
-    time_column: int | None = None
+    time_column: int | str | None = None
     time_format: str = "epoch"
-    counter_column: int | None = None
+    counter_column: int | str | None = None
     counter_modulus: int = 1 << 16
     nmea_checksum: bool = False
     whole: bool = False
     device_time: bool = False
+    decimal_comma: bool = False
+    hexadecimal_bits: int | None = None
+
+    @property
+    def channel_keys(self) -> tuple[int, ...] | tuple[str, ...]:
+        """Field of each channel: its number in layout "row", its name in the others."""
+        return self.columns if self.layout == "row" else self.channel_names
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -94,8 +112,63 @@ def encode_fields(fields: Sequence[str], format_: TextFormat) -> bytes:
     return (format_.prefix + body + format_.terminator).encode("ascii")
 
 
+LABELLED = re.compile(r"([A-Za-z_]\w*)\s*[:=]\s*([^\s,;]+)")
+"""A field of layout "labelled": ``X:1`` or ``X = 1``."""
+
+
+def read_number(text: str) -> float:
+    """Read a decimal number; raises ValueError."""
+    if "_" in text:  # which Python allows
+        raise ValueError(text)
+    return float(text)
+
+
+def read_hexadecimal(text: str, n_bits: int) -> float:
+    """Read a hexadecimal number in two's complement; raises ValueError."""
+    value = int(text, 16)
+    if "_" in text or not 0 <= value < 1 << n_bits:
+        raise ValueError(text)
+    return float(value - (value >> (n_bits - 1) << n_bits))
+
+
+def flatten(value: object, path: str = "") -> dict[str, str]:
+    """Return the numbers and texts in a JSON object by their path.
+
+    Raises
+    ------
+    TypeError
+        It is no object.
+    """
+    if isinstance(value, dict):
+        inner = value.items()
+    elif isinstance(value, list) and path:
+        inner = dict(enumerate(value)).items()
+    elif path:
+        return {path: value if isinstance(value, str) else json.dumps(value)}
+    else:
+        raise TypeError(value)
+    found: dict[str, str] = {}
+    for key, below in inner:
+        found |= flatten(below, f"{path}.{key}" if path else str(key))
+    return found
+
+
+def encode_row(values: Mapping[int | str, str], format_: TextFormat) -> bytes:
+    """Write one row of layout "row", "labelled" or "json", from the text of each field."""
+    if format_.layout == "row":
+        return encode_fields(
+            [values.get(n, "0") for n in range(1 + max(k for k in values if isinstance(k, int)))],
+            format_,
+        )
+    pairs = (f'"{k}": {v}' if format_.layout == "json" else f"{k}:{v}" for k, v in values.items())
+    text = f"{{{', '.join(pairs)}}}" if format_.layout == "json" else " ".join(pairs)
+    return (text + format_.terminator).encode("ascii")
+
+
 def encode_time(utc_ns: int, format_: TextFormat) -> str:
-    """Write a time as the format has it."""
+    """Write a time as the format has it; ``utc_ns`` since the start for those that count it."""
+    if format_.time_format in SINCE_START:
+        return str(utc_ns // SINCE_START[format_.time_format] % (1 << 32))
     if format_.time_format == "epoch":
         return f"{utc_ns / _NS:.3f}"
     return (_EPOCH + timedelta(microseconds=utc_ns // 1000)).strftime(format_.time_format)
@@ -109,6 +182,9 @@ def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
     ValueError, OverflowError
         It is none.
     """
+    if format_.time_format in SINCE_START:
+        resolution_ns = SINCE_START[format_.time_format]
+        return int(text) * resolution_ns, resolution_ns
     if format_.time_format == "epoch":
         seconds = float(text)
         resolution_ns = 10 ** max(0, 9 - len(text.partition(".")[2]))

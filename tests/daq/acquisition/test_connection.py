@@ -16,7 +16,8 @@ from daq.acquisition.connection import (
     SensorLate,
     SensorLost,
 )
-from daq.errors import NoAnswerError
+from daq.drivers.interface import DEFAULT_PATIENCE
+from daq.errors import NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Event
 from tests.scripted_driver import (
@@ -118,6 +119,117 @@ async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> No
     running.cancel()
     await asyncio.wait([running])
     assert np.diff(opened) == pytest.approx([0.2, 0.4, 0.8])
+
+
+class Patient(PlayedDriver):
+    """Its sessions state how long their device may be silent."""
+
+    patience = 3.0
+
+    @contextlib.asynccontextmanager
+    async def open(
+        self, sensors: Sequence[Sensor], clock: HostClock
+    ) -> AsyncIterator[PlayedSession]:
+        """Open a session."""
+        async with super().open(sensors, clock) as session:
+            session.patience = self.patience
+            yield session
+
+
+def driver_with(device: PlayedDevice, patience: float | None) -> PlayedDriver:
+    if patience is None:
+        return PlayedDriver({"A": device})
+    driver = Patient({"A": device})
+    driver.patience = patience
+    return driver
+
+
+async def kinds_of(
+    driver: PlayedDriver, device: PlayedDevice, clock: ManualClock, pauses: Sequence[float]
+) -> list[str]:
+    """Return what is said of a device that sends a block after each pause, connected or not."""
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    await device.opened.wait()
+    for n, pause in enumerate(pauses):
+        await asyncio.sleep(pause)
+        clock.advance(pause)
+        device.items.put_nowait(block("A", 10 * n, 10, clock.now()))
+    await asyncio.sleep(0.01)
+    running.cancel()
+    await asyncio.wait([running])
+    return [kind for item in iter_queue(queue) for kind in _kind(item)]
+
+
+def iter_queue(queue: asyncio.Queue[Item]) -> list[Item]:
+    return [queue.get_nowait() for _ in range(queue.qsize())]
+
+
+@pytest.mark.parametrize("pause", [0.4, 1.0, 2.0, 2.9])
+async def test_a_pause_within_the_patience_of_the_session_ends_nothing(pause: float) -> None:
+    """A buffer of 3 s in the device: it pauses and loses nothing."""
+    device = PlayedDevice()
+    kinds = await kinds_of(driver_with(device, 3.0), device, ManualClock(), [0.1, pause, 0.1])
+    assert kinds == ["connected", "late"]
+    assert device.n_sessions == 1
+
+
+async def test_lost_is_said_once_the_patience_of_the_session_is_over() -> None:
+    device = PlayedDevice()
+    kinds = await kinds_of(driver_with(device, 3.0), device, ManualClock(), [0.1, 3.5])
+    assert kinds == ["connected", "late", "stalled", "connected"]
+
+
+async def test_a_session_that_states_nothing_has_the_patience_of_the_contract() -> None:
+    device = PlayedDevice()
+    driver = driver_with(device, None)
+    kinds = await kinds_of(driver, device, ManualClock(), [0.1, 0.9 * DEFAULT_PATIENCE, 0.1])
+    assert kinds == ["connected", "late"]
+
+
+@pytest.mark.parametrize("interval", [3.0, 4.0, 25.0])
+async def test_a_logger_that_writes_now_and_then_is_not_reconnected_for_ever(
+    interval: float,
+) -> None:
+    """A tenth of a second comes at once, the next much later: its interval is learned."""
+    device = PlayedDevice()
+    pauses = [0.1, *[interval] * 40]
+    kinds = await kinds_of(driver_with(device, 1.0), device, ManualClock(), pauses)
+    assert kinds.count("stalled") <= 5
+    n_first = len(kinds) - kinds[::-1].index("stalled")
+    assert "stalled" not in kinds[n_first:]
+    assert device.n_sessions == 1 + kinds.count("stalled")
+    assert len(kinds[n_first:]) > 10  # late, and on time again: it goes on
+
+
+async def test_what_one_session_learned_the_next_one_knows() -> None:
+    device = PlayedDevice()
+    driver = driver_with(device, 1.0)
+    clock = ManualClock()
+    connection = Connection(cast("DriverType", driver), bench("A").sensors, clock)
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    n_blocks = 0
+    for pause in (0.1, 0.9, 0.9, 0.9):
+        await asyncio.sleep(pause)
+        device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
+        n_blocks += 1
+    await asyncio.sleep(0.01)
+    device.items.put_nowait(NotConnectedError("cable"))
+    await asyncio.sleep(1.0)
+    for pause in (0.1, 1.7, 0.1):  # twice the interval before, beyond what the session states
+        await asyncio.sleep(pause)
+        device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
+        n_blocks += 1
+    await asyncio.sleep(0.01)
+    running.cancel()
+    await asyncio.wait([running])
+    assert device.n_sessions == 2
 
 
 @pytest.mark.parametrize("counter", [None, 20])

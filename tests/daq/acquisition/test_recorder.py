@@ -423,7 +423,7 @@ async def test_commands_from_outside(tmp_path: Path) -> None:
         assert address is not None
         port, token = address
         with pytest.raises(ControlRefusedError, match="wrong token"):
-            await asyncio.to_thread(ask, (port, "guess"), "stop")
+            await asyncio.to_thread(ask, (port, "0" * 32), "stop")
         with pytest.raises(ControlRefusedError, match="unknown command 'dance'"):
             await asyncio.to_thread(ask, (port, token), "dance")
         await asyncio.to_thread(ask, run.path, "stop")
@@ -581,3 +581,18 @@ def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
 def test_the_usual_path() -> None:
     path = recording_path(bench("a"), ManualClock(0).now())
     assert path.as_posix() == "recordings/played-bench-20010909T014640Z.h5"
+
+
+async def test_swapped_adapters_are_named(tmp_path: Path) -> None:
+    run = Run(tmp_path / "r.h5", "a", "b")
+    sensors = tuple(
+        sensor.model_copy(update={"serial_number": {"a": "1", "b": "2"}[sensor.name]})
+        for sensor in run.bench.sensors
+    )
+    run.bench = run.bench.model_copy(update={"sensors": sensors})
+    run.device("a").serial_number, run.device("b").serial_number = "2", "1"
+    with pytest.RaisesGroup(
+        pytest.RaisesExc(WrongDeviceError, match="'a' on a: .*that is sensor 'b' of port b: the p"),
+        pytest.RaisesExc(WrongDeviceError, match="'b' on b: .*that is sensor 'a' of port a: the p"),
+    ):
+        await run.record()

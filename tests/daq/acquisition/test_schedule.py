@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import pathlib
 from datetime import UTC, datetime, timedelta
 from itertools import islice
-from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from daq.acquisition.schedule import (
@@ -17,18 +14,10 @@ from daq.acquisition.schedule import (
     RunNotice,
     RunState,
     due_times,
-    remove_old,
     serve,
 )
-from daq.bench.loading import parse
-from daq.bench.model import Channel, Schedule
-from daq.errors import NoAnswerError, NotConnectedError, RecordingError
-from daq.protocols.block import HostTime
-from daq.recording.file_format import SensorLayout
-from daq.recording.writer import RecordingWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from daq.bench.model import Schedule
+from daq.errors import NoAnswerError, NotConnectedError
 
 START = datetime(2026, 11, 21, 12, 0, 30, tzinfo=UTC)
 
@@ -66,7 +55,7 @@ def test_no_lines_no_runs() -> None:
 class Night:
     """A clock that goes when somebody sleeps or runs, and what was said."""
 
-    def __init__(self, *durations: timedelta | Exception) -> None:
+    def __init__(self, *durations: timedelta | Exception | RunState) -> None:
         self.time = START
         self.said: list[tuple[str, str]] = []
         self.texts: list[str] = []
@@ -77,15 +66,18 @@ class Night:
         """Let time go by."""
         self.time += timedelta(seconds=seconds)
 
-    async def run(self, due: datetime) -> None:
-        """Take as long as the test says, or fail, and stop after the last."""
+    async def run(self, due: datetime) -> RunNotice | None:
+        """Take as long as the test says, end in a state, or fail, and stop after the last."""
         assert abs(self.time - due) < timedelta(seconds=1)
         what = self._durations.pop(0)
         if not self._durations:
             self.stop.set()
         if isinstance(what, Exception):
             raise what
+        if isinstance(what, RunState):
+            return RunNotice(what, due, "night.h5")
         self.time += what
+        return None
 
     def notice(self, notice: RunNotice) -> None:
         """Take note."""
@@ -127,6 +119,17 @@ async def test_a_run_that_overlaps_is_refused() -> None:
         ("started", "12:40"),
         ("finished", "12:40"),
     ]
+
+
+async def test_a_run_says_how_it_ended() -> None:
+    """A limit that is not met is neither a failure of the run nor a run that finished well."""
+    night = Night(RunState.LIMIT_NOT_MET, RunState.NOT_DECIDED)
+    await night.serve("0 * * * *")
+    assert [kind for kind, _ in night.said] == [
+        *("started", "ended: FAIL"),
+        *("started", "ended: NOT DECIDED"),
+    ]
+    assert night.texts[1] == "night.h5"
 
 
 async def test_a_failed_run_does_not_end_the_service() -> None:
@@ -223,63 +226,3 @@ async def test_trouble_of_the_system_fails_one_run() -> None:
     await night.serve("0 * * * *")
     assert [kind for kind, _ in night.said] == ["started", "failed", "started", "finished"]
     assert "No space left" in night.texts[1]
-
-
-BENCH = """
-name = "{name}"
-sampling_rate = 10.0
-
-[[sensors]]
-name = "a"
-driver = "epson"
-port = "x"
-channels = [{{name = "x", sensitivity = 1.0}}]
-"""
-
-
-def test_only_old_closed_recordings_of_the_bench_are_removed(tmp_path: Path) -> None:
-    def make(name: str, age_days: float, *, bench: str | None = "mine") -> RecordingWriter:
-        utc_ns = round((START.timestamp() - age_days * 86400) * 1e9)
-        sensor = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 10.0, np.dtype("i4"))
-        return RecordingWriter.create(
-            tmp_path / name,
-            parse(BENCH.format(name=bench), "bench.toml") if bench else None,
-            sensors=[sensor],
-            created=HostTime(0, utc_ns),
-        )
-
-    make("old.h5", 31).close()
-    make("new.h5", 29).close()
-    make("other.h5", 31, bench="other").close()
-    make("imported.h5", 31, bench=None).close()
-    make("killed.h5", 31).abandon()
-    (tmp_path / "foreign.h5").write_text("mine", encoding="utf-8")
-    running = make("running.h5", 31)
-    removed = remove_old(tmp_path, 30 * 86400, bench="mine", now=START)
-    running.close()
-    assert removed == [tmp_path / "old.h5"]
-    kept = ["foreign.h5", "imported.h5", "killed.h5", "new.h5", "other.h5", "running.h5"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == kept
-
-
-def test_one_that_cannot_be_removed_does_not_keep_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    utc_ns = round((START.timestamp() - 31 * 86400) * 1e9)
-    sensor = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 10.0, np.dtype("i4"))
-    bench = parse(BENCH.format(name="mine"), "bench.toml")
-    for name in ("1.h5", "2.h5"):
-        RecordingWriter.create(
-            tmp_path / name, bench, sensors=[sensor], created=HostTime(0, utc_ns)
-        ).close()
-    unlink = pathlib.Path.unlink
-
-    def refuse(path: Path) -> None:
-        if path.name == "1.h5":  # a superuser's test cannot take itself the right
-            raise PermissionError(13, "Permission denied")
-        unlink(path)
-
-    monkeypatch.setattr(pathlib.Path, "unlink", refuse)
-    with pytest.raises(RecordingError, match=r"1\.h5: cannot be removed: Permission denied"):
-        remove_old(tmp_path, 30 * 86400, bench="mine", now=START)
-    assert [path.name for path in tmp_path.iterdir()] == ["1.h5"]

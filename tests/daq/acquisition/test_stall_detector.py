@@ -9,11 +9,11 @@ import pytest
 
 from daq.acquisition.stall_detector import (
     MIN_LATE_AFTER,
-    MIN_STALLED_AFTER,
     STALL_MARGIN,
     BlockInterval,
     StallDetector,
 )
+from daq.drivers.interface import DEFAULT_PATIENCE
 from daq.protocols.block import Block, HostTime
 from tests.virtual_time import VirtualTimeLoop
 
@@ -70,7 +70,7 @@ async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -
     ((sensor, stage, after),) = said.items
     assert (sensor, stage) == ("a", "late")
     assert after == pytest.approx(0.4)
-    assert asyncio.get_running_loop().time() == pytest.approx(0.4 + STALL_MARGIN)
+    assert asyncio.get_running_loop().time() == pytest.approx(DEFAULT_PATIENCE)
 
 
 async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
@@ -136,20 +136,20 @@ async def test_a_device_that_recovers_is_late_and_not_lost(
             with watch.waiting():
                 await asyncio.Event().wait()
 
-    recovering = StallDetector(rates, said, is_recovering=lambda: True)
+    recovering = StallDetector(rates, said, patience=0.5, is_recovering=lambda: True)
     with pytest.raises(TimeoutError):
         await wait(recovering)
     assert recovering.seconds == pytest.approx(1.0)  # not for ever
     assert sorted(item[:2] for item in said.items) == [("a", "late"), ("b", "late")]
-    stalled = StallDetector(rates, said, is_recovering=lambda: False)
+    stalled = StallDetector(rates, said, patience=0.5, is_recovering=lambda: False)
     with pytest.raises(TimeoutError):
         await wait(stalled)
-    assert stalled.seconds == pytest.approx(MIN_STALLED_AFTER)
+    assert stalled.seconds == pytest.approx(0.5)
 
 
 def test_one_lost_block_is_no_stall() -> None:
     """The next of a second each comes two seconds after the last, and a little: no sooner."""
-    patience = BlockInterval(0.0, 10.0)
+    patience = BlockInterval(0.0, 10.0, patience=0.5)
     assert patience.stalled_after == 10.0
     for second in range(1, 6):
         patience.block_received(float(second), 1.0)
@@ -158,12 +158,22 @@ def test_one_lost_block_is_no_stall() -> None:
 
 
 def test_patience_follows_the_blocks() -> None:
-    patience = BlockInterval(0.0, 10.0)
+    patience = BlockInterval(0.0, 10.0, patience=0.5)
     patience.block_received(1.0, 0.01)
     assert patience.late_after == MIN_LATE_AFTER
     patience.block_received(2.0, 0.2)  # it came late, which is no reason to wait longer with a word
     assert patience.late_after == pytest.approx(0.4)
     assert patience.stalled_after == pytest.approx(2.0 + STALL_MARGIN)
-    for k in range(200):
+    for k in range(300):
         patience.block_received(2.0 + 0.1 * (k + 1), 0.1)
     assert patience.late_after == pytest.approx(0.2)
+    assert patience.stalled_after == pytest.approx(0.5, abs=0.01)
+
+
+def test_many_blocks_at_once_do_not_shorten_the_patience() -> None:
+    """A logger writes 3 s of rows at once, which arrive in fifty pieces."""
+    patience = BlockInterval(0.0, 10.0, patience=0.5)
+    for second in range(0, 30, 3):
+        for piece in range(50):
+            patience.block_received(second + 1e-3 * piece, 0.06)
+    assert patience.stalled_after > 5.0

@@ -111,3 +111,50 @@ def counts(n_samples: int, n_channels: int, seed: int) -> NDArray[np.int32]:
     """White integers."""
     rng = np.random.default_rng(seed)
     return rng.integers(-10_000, 10_000, (n_samples, n_channels), dtype=np.int32)
+
+
+def write_polled(path: Path, lost: dict[str, NDArray[np.bool_]], *, rate: float = 50.0) -> Path:
+    """Write polled sensors of one motion, without the samples that are lost, by name.
+
+    Every stretch between gaps comes in blocks of half a second; the first one after a gap says
+    that the number of missing samples is estimated, as the register driver does.
+    """
+    rng = np.random.default_rng(4)
+    motion = rng.standard_normal((len(next(iter(lost.values()))), 3))
+    layouts = [
+        SensorLayout(
+            name,
+            tuple(Channel(name=axis, sensitivity=1e3) for axis in "xyz"),
+            rate,
+            np.dtype(np.int16),
+        )
+        for name in lost
+    ]
+    found = []
+    for name, gone in lost.items():
+        n_samples = len(gone)
+        noise = rng.standard_normal((n_samples, 3))
+        samples = np.round(1e3 * (motion + 0.1 * noise)).astype(np.int16)
+        seconds = np.arange(n_samples) / rate + 1e-4 * rng.random(n_samples)
+        instants = ORIGIN.monotonic_ns + np.round(1e9 * seconds).astype(np.int64)
+        edges = np.flatnonzero(np.diff(gone, prepend=True, append=True)).reshape(-1, 2)
+        for low, high in edges.tolist():
+            for first in range(low, high, round(rate / 2)):
+                end = min(first + round(rate / 2), high)
+                flags = BlockFlag.MISSING_ESTIMATED if first == low else BlockFlag.NONE
+                arrival = round(1e9 * seconds[end - 1]) + 1_000_000
+                found.append(
+                    Block(
+                        name,
+                        first,
+                        samples[first:end],
+                        HostTime(ORIGIN.monotonic_ns + arrival, ORIGIN.utc_ns + arrival),
+                        flags=flags if first else BlockFlag.CLOCK_RESTART,
+                        instants_ns=instants[first:end],
+                    )
+                )
+    writer = RecordingWriter.create(path, sensors=layouts, created=ORIGIN)
+    for block in sorted(found, key=lambda block: block.received.monotonic_ns):
+        writer.append(block)
+    writer.close()
+    return path

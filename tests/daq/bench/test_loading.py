@@ -148,7 +148,10 @@ psd = [[1, 2], [3, 4]]
             'sensors["d"].port = "": expected a port, such as /dev/ttyUSB0',
         ),
         ('[estimate]\nwindow = "han"\n', "(did you mean 'hann'?)"),
-        ('[estimate]\nwindow = "kaiser"\n', "its parameter as well, above 0, as in kaiser,0.5"),
+        (
+            '[estimate]\nwindow = "kaiser"\n',
+            "expected the window with a parameter above 0, such as kaiser,0.5",
+        ),
         ('[estimate]\nmethod = "three_sensor"\n', "(did you mean 'three-sensor'?)"),
         (
             '[estimate]\nsegmnt = "1s"\n',
@@ -160,7 +163,7 @@ psd = [[1, 2], [3, 4]]
         ),
         (
             "[estimate]\nband = [0.01, 50]\n",
-            "estimate.band = [0.01, 50.0]: expected [low, high] Hz from 0.1",
+            "estimate.band = [0.01, 50.0]: expected [low, high] in Hz from 0.1",
         ),
         (
             '[estimate]\nreject = "yes"\n',
@@ -173,7 +176,7 @@ psd = [[1, 2], [3, 4]]
         ),
         (
             '[estimate]\nmethod = "maximum-likelihood"\ndimension = 4\n',
-            'estimate.dimension = "4": expected at most 3: 6 channels cannot tell more dimensions',
+            'estimate.dimension = "4": expected at most 3: 6 channels cannot separate more',
         ),
         (
             "[estimate]\ndimension = 2\n",
@@ -197,7 +200,7 @@ psd = [[1, 2], [3, 4]]
         ),
         (
             '[recording]\nduration = "19s"\n',
-            '"19s": expected at least 20s: fewer than 3 segments of 10s allow no estimate',
+            '"19s": expected at least 20s: an estimate needs 3 segments of 10s',
         ),
         (
             '[schedule]\ncron = ["every day"]\n',
@@ -207,7 +210,7 @@ psd = [[1, 2], [3, 4]]
         ("[simulation]\nspeed = 0\n", "simulation.speed = 0: expected a positive number"),
         (
             '[[limits]]\nname = "n"\nfrequency = [2, 1]\npsd = [1, 1]\n',
-            'limits["n"].frequency = [2.0, 1.0]: expected rising',
+            'limits["n"].frequency = [2.0, 1.0]: expected increasing',
         ),
         (
             '[[limits]]\nname = "n"\nfrequency = [1, 2]\npsd = [1, 1]\nsensors=["d"]\n',
@@ -230,7 +233,10 @@ psd = [[1, 2], [3, 4]]
             sensor_text("d", extra="settings = {mood = 1}"),
             "mood = 1: unknown key; expected one of baud_rate, mode (did you mean 'mode'?)",
         ),
-        (sensor_text("d", extra="sampling_rate = 100"), "expected at least the bench's 200 Hz"),
+        (
+            sensor_text("d", extra="sampling_rate = 100"),
+            "expected at least 200 Hz, the rate of the bench",
+        ),
         (
             sensor_text("d") + "[[sensors.channels]]\nname='z'\nsensitivity=1.0\n",
             'sensors["d"].channels = "3 channels": expected 2',
@@ -364,3 +370,24 @@ def test_poles_and_zeros_are_one_at_their_frequency() -> None:
     # Two zeros at the origin over a pair of poles: 12 dB an octave well below the corner.
     low = np.abs(response.at(np.array([1e-4, 2e-4])))
     assert low[1] / low[0] == pytest.approx(4.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (".".join(["a"] * 20_000) + " = 1", "a key of more than 64 parts"),
+        ("x = {" + ' . "a"'.join(['"a"'] * 100) + " = 1}", "a key of more than 64 parts"),
+        ("a = " + "[" * 20_000 + "]" * 20_000, "nested too deeply"),
+        ("# " + "x" * (1 << 20), "expected at most 1048576"),
+    ],
+)
+def test_a_file_that_would_take_for_ever_is_refused(text: str, said: str) -> None:
+    with pytest.raises(BenchFileError, match=said):
+        parse(text)
+
+
+def test_long_lists_of_numbers_are_no_such_file() -> None:
+    numbers = ", ".join(f"{n}.5" for n in range(1, 400))
+    with pytest.raises(BenchFileError) as refused:
+        parse(f"psd = [{numbers}]\nnote = '''{'.' * 200} 1.2.3'''")
+    assert "parts" not in str(refused.value)

@@ -32,6 +32,15 @@ if TYPE_CHECKING:
 RATE = 200.0
 XYZ = ("x", "y", "z")
 POLLED: dict[str, Any] = {"driver": "registers", "sampling_rate": 20.0}
+SEEDLINK: dict[str, Any] = {"driver": "seedlink", "port": "tcp"}
+STATION: dict[str, Any] = {
+    "network": "XX",
+    "station": "S1",
+    "location": "00",
+    "channels": ["HNZ", "HNN", "HNE"],
+    "late": 4.0,
+    "patience": 20.0,
+}
 LABJACK: dict[str, Any] = {"driver": "labjack", "port": "tcp"}
 CASES: dict[str, dict[str, Any]] = {
     "epson": {"driver": "epson", "sensitivity": commands.COUNTS_PER_UNIT, "settings": {}},
@@ -47,6 +56,11 @@ CASES: dict[str, dict[str, Any]] = {
         "settings": {"link": "scream", "patience": 2.0},
     },
     "fifo": {"driver": "fifo", "settings": {}},
+    "seedlink 4": {**SEEDLINK, "settings": {**STATION}},
+    "seedlink 3": {
+        **SEEDLINK,
+        "settings": {**STATION, "station": "S2", "protocol": "3", "channels": ["HN?"]},
+    },
     "text serial": {
         "driver": "text",
         "settings": {
@@ -141,7 +155,7 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
         rate = described.sampling_rate
         world = Scenario.from_dict(self._world["scenario"], sampling_rate=rate)
         source = Source(world, described)
-        if described.driver == "guralp":  # on whole seconds of UTC
+        if described.driver in {"guralp", "seedlink"}:  # on whole seconds of UTC
             source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
         end = (
             WorldClock(self._world["epoch_ns"], self._world["speed"], paced_clock().now_ns).now()

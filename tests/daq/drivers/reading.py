@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from typing import TYPE_CHECKING, cast
 
+from daq.acquisition.connection import patience_of
+from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
 from tests.devices import host_clock
 
@@ -12,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 
     from daq.bench.model import Sensor
-    from daq.drivers.interface import DriverType
+    from daq.drivers.interface import DriverType, Session
 
 
 @contextlib.asynccontextmanager
@@ -22,9 +25,30 @@ async def reading(
     """Open a session and its reading; both are closed on exit."""
     async with (
         driver.open(sensors, host_clock(speed)) as session,
-        contextlib.aclosing(cast("AsyncGenerator[Block | Event]", session.read())) as items,
+        contextlib.aclosing(_patiently(session, speed)) as items,
     ):
         yield items
+
+
+async def _patiently(session: Session, speed: float) -> AsyncGenerator[Block | Event]:
+    """Yield what the session yields, until nothing has come for as long as it states."""
+    patience = patience_of(session) / speed
+    loop = asyncio.get_running_loop()
+    async with contextlib.aclosing(cast("AsyncGenerator[Block | Event]", session.read())) as items:
+        deadline = loop.time() + patience
+        while True:
+            try:
+                async with asyncio.timeout_at(deadline):
+                    item = await anext(items)
+            except TimeoutError as error:
+                if isinstance(error, NoAnswerError):
+                    raise
+                hint = getattr(session, "hint", "")
+                sensor = session.information[0].sensor
+                raise NoAnswerError(f"{sensor!r}: nothing for {patience:g} s; {hint}") from error
+            if isinstance(item, Block):
+                deadline = loop.time() + patience
+            yield item
 
 
 async def record(

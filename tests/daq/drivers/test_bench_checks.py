@@ -115,6 +115,6 @@ def test_what_devices_cannot_do(
 def test_a_time_format_that_gives_no_time_is_named(time_format: str) -> None:
     settings = f'time_column = 0\ntime_format = "{time_format}"'
     with pytest.raises(
-        BenchFileError, match=r"settings.time_format = .*: expected \"epoch\", or date"
+        BenchFileError, match=r"settings.time_format = .*: expected \"epoch\", \"millis\""
     ):
         parse(bench("text", settings))

@@ -88,7 +88,8 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
 @pytest.mark.parametrize("mode", CASES)
 async def test_a_port_that_is_not_there_is_named(served: Served, mode: str) -> None:
     scheme = served.device(mode).port.partition("://")[0]
-    port = f"{scheme}://127.0.0.1:1" if scheme in {"modbus-tcp", "udp"} else "socket://127.0.0.1:1"
+    known = scheme in {"modbus-tcp", "seedlink", "udp"}
+    port = f"{scheme}://127.0.0.1:1" if known else "socket://127.0.0.1:1"
     if mode == "text udp":  # listens itself, at an address that is not this computer's
         port = "udp://192.0.2.1:8888"
     chosen = served.sensors(mode, port=port)
@@ -121,7 +122,7 @@ async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, in
     """Return how reading ends within a few seconds, and how many blocks came until then."""
     kind, n_blocks = driver_type(CASES[mode]["driver"]), 0
     try:
-        async with asyncio.timeout(4), reading(kind, chosen, speed=SPEED) as items:
+        async with asyncio.timeout(12), reading(kind, chosen, speed=SPEED) as items:
             async for item in items:
                 n_blocks += isinstance(item, Block)
     except (DeviceError, RemoteProtocolError, TimeoutError) as error:
@@ -129,15 +130,17 @@ async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, in
     return None, n_blocks
 
 
+def _scheme(port: str) -> str:
+    scheme = port.partition("://")[0]
+    return scheme if scheme in {"modbus-tcp", "seedlink"} else "socket"
+
+
 @pytest.mark.parametrize("garbage", [b"", bytes(range(256)) * 3], ids=["silence", "garbage"])
 async def test_strangers_are_no_devices(served: Served, garbage: bytes) -> None:
     modes = [mode for mode in CASES if not served.device(mode).port.startswith("udp")]
     async with stranger(garbage) as number:
         ports = {
-            mode: f"modbus-tcp://127.0.0.1:{number}"
-            if served.device(mode).port.startswith("modbus-tcp")
-            else f"socket://127.0.0.1:{number}"
-            for mode in modes
+            mode: f"{_scheme(served.device(mode).port)}://127.0.0.1:{number}" for mode in modes
         }
         outcomes = await asyncio.gather(
             *(outcome(mode, served.sensors(mode, port=ports[mode])) for mode in modes)

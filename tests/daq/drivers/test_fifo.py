@@ -178,7 +178,12 @@ async def test_a_lost_reply_is_no_slow_link(monkeypatch: pytest.MonkeyPatch) -> 
     decoder = FifoDecoder("A", RATE, n_channels=3, header="size", unit=1, capacity=None)
     stream = cast("ByteStream", Backlog())
     session = FifoSession(
-        stream, settings, decoder, information=DeviceInformation("A"), clock=host_clock()
+        stream,
+        settings,
+        decoder,
+        information=DeviceInformation("A"),
+        clock=host_clock(),
+        patience=10.0,
     )
     items = []
     async with asyncio.timeout(30):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
+from daq.drivers.labjack.driver import LabJackDriver
 from daq.drivers.registry import driver_type
 from daq.errors import (
     BenchFileError,
@@ -59,6 +60,7 @@ def running() -> Iterator[tuple[RunningDevice, ...]]:
     tables = [
         table(serial_number="470001234"),
         table(["F"], settings={"ends_with": 2945, "ends_after": 400}),
+        table(["T"], model="T8", sampling_rate=RATE),
     ]
     with serving(spec(*tables, speed=SPEED, sampling_rate=RATE)) as devices:
         yield devices
@@ -186,6 +188,62 @@ async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, .
     }
 
 
+async def test_a_t8_has_its_own_ranges_calibration_and_rate(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    """Its rate is told after the start only; each of its inputs has a calibration of its own."""
+    own: dict[str, Any] = {"settings": {"range": 4.8, "inputs": ["AIN0", "AIN1", "AIN7"]}}
+    some = bench(running[2], sampling_rate=333.0, **own)
+    async with DRIVER.open(some, host_clock(SPEED)) as session:
+        (information,) = session.information
+    assert information.model == "LabJack T8"
+    assert information.sampling_rate == pytest.approx(40e6 / 120_120, rel=1e-7)
+    details = information.details
+    assert details["range"] == "±4.8 V"
+    counts_per_volt = [float(details[f"counts per volt of AIN{n}"]) for n in (0, 1, 7)]
+    nominal = 32768 / 4.884
+    np.testing.assert_allclose(
+        counts_per_volt, [nominal, nominal / 1.0001, nominal / 1.0007], rtol=1e-6
+    )
+
+
+async def test_a_t8_streams(running: tuple[RunningDevice, ...]) -> None:
+    found, events = await record(bench(running[2]), 400)
+    assert not events
+    blocks = found["T"]
+    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
+    truth = World(scenario([*NAMES, "F", "T"], sampling_rate=RATE)).samples("T", 0, 20_000) * COUNTS
+    counts = joined(blocks).astype(float) - CENTER
+    start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
+    assert np.abs(truth[start : start + len(counts)] - counts).max() <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("index", "settings", "said"),
+    [
+        (2, {"range": 10.0}, "range = 10.0: expected one of 11, 9.6, 4.8, 2.4"),
+        (0, {"range": 9.6}, "range = 9.6: expected one of 10, 1, 0.1, 0.01 V, as a T7 has"),
+        (2, {"inputs": [0, 1, 8]}, "a T8 has AIN0 to AIN7"),
+        (2, {"negative_inputs": [3, 4, 5]}, "its own negative terminal"),
+    ],
+)
+async def test_what_the_product_does_not_have_is_named(
+    running: tuple[RunningDevice, ...], index: int, settings: dict[str, Any], said: str
+) -> None:
+    own = {NAMES[0] if index == 0 else "T": settings}
+    with pytest.raises(WrongDeviceError, match=said):
+        async with DRIVER.open(bench(running[index], own=own), host_clock(SPEED)):
+            pass
+
+
+def test_a_bench_file_that_names_the_product_is_checked_without_it(
+    running: tuple[RunningDevice, ...],
+) -> None:
+    some = bench(running[2], settings={"range": 10.0}, model="LabJack T8")
+    with pytest.raises(BenchFileError, match=r'sensors\["T"\].settings.range = 10.0: expected one'):
+        LabJackDriver().check(some)
+
+
 async def test_a_stream_that_breaks_off_is_started_anew(running: tuple[RunningDevice, ...]) -> None:
     found, events = await record(bench(running[1]), 1200)
     blocks = found["F"]
@@ -254,7 +312,12 @@ async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
         ),
         ({"settings": {"stream_port": 1}}, {}, NotConnectedError, "nothing listens there"),
         ({"sampling_rate": 20_000.0}, {}, DeviceError, "does not go on: scan overlap"),
-        ({"settings": {"trigger_index": 1 << 31}}, {}, NoAnswerError, "no samples"),
+        (
+            {"settings": {"trigger_index": 1 << 31}},
+            {},
+            NoAnswerError,
+            "expected samples from socket",
+        ),
     ],
 )
 async def test_what_cannot_be_is_named(

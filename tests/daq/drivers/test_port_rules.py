@@ -97,6 +97,7 @@ def bench(driver: str, port: str, settings: Sequence[dict[str, Any]]) -> str:
             "settings.baud_rate = 9600: expected 115200, as of 'A'",
         ),
         ("registers", BUS, [{"address": 0}, {"address": 0, "parity": "E"}], '"E": expected "N"'),
+        ("registers", "spy:///dev/null?file=x", [{"address": 0}], "expected a device such as"),
         (
             "registers",
             "modbus-tcp://10.0.0.7:99999",

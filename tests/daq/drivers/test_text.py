@@ -133,7 +133,7 @@ async def test_another_device_on_the_same_port_is_left_out(
 
 
 async def test_a_quiet_device_is_started_and_stopped(running: tuple[RunningDevice, ...]) -> None:
-    with pytest.raises(NoAnswerError, match=r"no samples for 2\.5 s; check cable"):
+    with pytest.raises(NoAnswerError, match=r"nothing for 0\.125 s; check cable"):
         await record(sensor(running, 2, settings={"start": "", "patience": 0.5}), 2)
     assert (await record(sensor(running, 2), 2))[0]
 

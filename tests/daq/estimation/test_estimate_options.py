@@ -16,7 +16,7 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import BlockFlag
-from estimator.diagnostics.advice import Copies, Gain, NoSignal
+from estimator.diagnostics.advice import Copies, Gain, NoSharedMotion, NoSignal, SwappedChannels
 from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 from estimator.methods import Flag, self_noise
@@ -73,12 +73,41 @@ def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snap
             if number % 60 == 59:
                 writer.commit()
                 live.update()
-                growing = live.snapshot().diagnostics
-                assert growing.diagnosis is None  # only of a finished estimate
-                assert growing.untested is Untested.UNFINISHED
+                growing = live.snapshot()
+                found = growing.diagnostics.diagnosis
+                assert found is None or len(found.per_frequency.snr) == len(growing.frequency)
         writer.close()
         live.update()
         return live.finish()
+
+
+def test_what_is_wrong_is_said_within_a_minute_while_recording(tmp_path: Path) -> None:
+    """A sensor on another floor, swapped channels, a dead one and a clipped one."""
+    sensors = bench((3, 3, 3, 3, 3), n_samples=6000)
+    rng = np.random.default_rng(8)
+    sensors["a"].counts[:] = np.rint(1e4 * rng.standard_normal((6000, 3)))
+    sensors["b"].counts[:] = sensors["b"].counts[:, [1, 0, 2]]
+    sensors["c"].counts[:, 2] = 0
+    np.clip(sensors["d"].counts[:, 0], -15000, 15000, out=sensors["d"].counts[:, 0])
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            writer.append(block)
+    writer.commit()
+    with Estimation([tmp_path / "r.h5"], SETTINGS) as live:
+        live.update()
+        snapshot = live.snapshot()
+    writer.close()
+    assert not snapshot.closed
+    (stranger,) = [a for a in snapshot.diagnostics.advice if isinstance(a, NoSharedMotion)]
+    assert stranger.sensors == (0,)
+    assert stranger.share < 0.05
+    (dead,) = [a for a in snapshot.diagnostics.advice if isinstance(a, NoSignal)]
+    assert dead.channels == (8,)
+    swapped = [a for a in snapshot.diagnostics.advice if isinstance(a, SwappedChannels)]
+    assert swapped
+    assert all(1 in each.sensors for each in swapped)
+    assert list(snapshot.diagnostics.clipped) == [9]
 
 
 @pytest.mark.parametrize(

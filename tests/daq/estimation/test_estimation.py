@@ -246,15 +246,6 @@ def test_velocity_becomes_acceleration_by_omega_and_responses_are_taken_out(
         estimate([path], replace(SETTINGS, unit="V"))
 
 
-def test_time_left_is_what_the_rest_takes(tmp_path: Path) -> None:
-    path = write(tmp_path / "r.h5", huddle())
-    now = estimate([path], SETTINGS)
-    cov = np.nanmax(np.nanmedian(now.results["three-sensor"].cov[1:46], axis=0))
-    left = estimate([path], replace(SETTINGS, target_cov=cov / 2)).time_left
-    assert left == pytest.approx(3 * now.elapsed, rel=0.02)  # four times as long in all
-    assert estimate([path], replace(SETTINGS, target_cov=2 * cov)).time_left == 0.0
-
-
 def test_too_little_is_said_with_what_there_is_and_what_is_needed(tmp_path: Path) -> None:
     path = write(tmp_path / "r.h5", huddle(150))
     with pytest.raises(InsufficientDataError, match=r"1\.5 s with all sensors.*takes 10 s"):

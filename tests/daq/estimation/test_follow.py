@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -162,6 +163,28 @@ def test_states_of_sensors_are_those_of_blocks_and_events(tmp_path: Path) -> Non
         assert states == {"A": "ended", "B": "ended", "C": "disconnected"}
 
 
+def test_time_goes_on_when_every_sensor_is_lost(tmp_path: Path) -> None:
+    path, clock = tmp_path / "run.h5", [100.0]
+    with growing(path) as writer, Recording.open(path) as recording:
+        bench, monitor = Bench(writer), RecordingMonitor(recording, now=lambda: clock[0])
+        bench.send("ABC", 6)
+        recording.refresh()
+        before = monitor.status()
+        clock[0] += 7.0
+        assert monitor.status().elapsed == before.elapsed  # they may send, and commits come later
+        for sensor in "ABC":
+            bench.say(sensor, "disconnected", 6.5, "the port is gone")
+        recording.refresh()
+        lost = monitor.status()
+        clock[0] += 60.0
+        speed = 1.0 if recording.bench is None else recording.bench.speed
+        later = monitor.status()
+        assert later.elapsed == pytest.approx(lost.elapsed + 60 * speed)
+        assert [s.overdue_for for s in later.sensors] == pytest.approx(
+            [s.overdue_for + 60 * speed for s in lost.sensors]
+        )
+
+
 @pytest.mark.parametrize("duration", [60.0, None])
 def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -> None:
     path = tmp_path / "run.h5"
@@ -277,6 +300,18 @@ def test_a_remote_recorder_that_has_ended_is_found_by_its_silence(tmp_path: Path
     noted = Noted()
     with pytest.raises(RecordingLeftOpenError, match=f"huddle repair {path}"):
         follow(path, None, noted, cancelled=noted.cancelled, silence=0.0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks are seen there")
+def test_a_remote_recorder_that_was_killed_is_noticed_at_once(tmp_path: Path) -> None:
+    """By the lock that ends with it: not after seconds of silence."""
+    path = tmp_path / "killed.h5"
+    with growing(path) as writer:
+        Bench(writer).send("ABC", 6)
+    noted = Noted()
+    with pytest.raises(RecordingLeftOpenError, match="huddle repair"):
+        follow(path, None, noted, cancelled=noted.cancelled, silence=1e9)
+    assert "snapshot" not in noted.told
 
 
 def test_a_process_that_ends_without_closing_its_recording_is_an_error(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +16,6 @@ from daq.formats.miniseed import read_waveforms
 from daq.formats.npz import read_mat, read_npz
 
 if TYPE_CHECKING:
-    from pathlib import Path
     from typing import Any
 
 RATE = 200.0
@@ -103,6 +104,25 @@ def test_miniseed_what_obspy_cannot_read_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"nothing of the kind")
     with pytest.raises(ImportFormatError, match=r"notes\.mseed"):
         read_waveforms([path])
+
+
+class _Runs:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, made: Path) -> None:
+        self.made = made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.made,)
+
+
+def test_a_pickle_named_as_a_waveform_is_not_run(tmp_path: Path) -> None:
+    pytest.importorskip("obspy", reason="ObsPy is an extra")
+    evil, made = tmp_path / "evil.mseed", tmp_path / "made"
+    evil.write_bytes(pickle.dumps(("obspy.core.stream", _Runs(made))))
+    with pytest.raises(ImportFormatError, match="unknown format; expected one of MSEED"):
+        read_waveforms([evil])
+    assert not made.exists()
 
 
 def test_npz_one_array_a_sensor(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_a_digitizer_that_was_restarted_numbers_anew(due: int) -> None:
     counts, blocks_found, events = joined(found)
     np.testing.assert_array_equal(counts, expected(0, 6000))
     assert not any(block.reason for block in blocks_found)
-    said = f"the digitizer numbers anew: block 0 came, {due} was due"
+    said = f"the digitizer restarted its numbering: block 0, not {due}"
     assert [e.text for e in events if e.kind == "reset"] == [said]
 
 
@@ -470,5 +470,5 @@ def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
         if number == 20_012:
             assert decoder.missing == (20_009,)
     _, _, events = joined(found)
-    said = f"the server numbers anew: packet 20000 came, {before + 45} was due"
+    said = f"the server restarted its numbering: packet 20000, not {before + 45}"
     assert [e.text for e in events if e.kind == "reset"] == [said]

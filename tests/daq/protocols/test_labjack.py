@@ -325,6 +325,20 @@ def test_calibration() -> None:
     np.testing.assert_allclose(found.volts([30001, 29999]), [1e-3, -2e-3], rtol=1e-6)
 
 
+def test_t8_calibration_of_the_datasheet() -> None:
+    """T-series datasheet 20.0.2: ``Cal_Set ain[8][11]`` 64 bytes after 0x687000."""
+    first = registers.t8_calibration_address(0, 11.0)
+    assert first == 0x687000 + 64
+    assert registers.t8_calibration_address(0, 0.018) == first + 16 * 10
+    assert registers.t8_calibration_address(1, 11.0) == first + 16 * 11
+    assert registers.t8_calibration_address(7, 0.018) == 0x687000 + 1472 - 16  # then temp[8]
+    flash = registers.encode_t8_calibrations(registers.nominal_t8_calibrations())
+    assert len(flash) == 1472
+    at = registers.t8_calibration_address(3, 9.6) - 0x687000
+    found = registers.decode_calibration(flash[at : at + 16])
+    np.testing.assert_allclose(found.volts([0, 32768, 65535]), [-9.768, 0, 9.768], atol=3.1e-4)
+
+
 @pytest.mark.parametrize(
     ("wanted", "actual"),
     [
@@ -420,6 +434,25 @@ def test_a_packet_that_comes_again_late_is_known_by_its_timer() -> None:
         found = decoder.receive(stream.encode_packet(packet), at)
         blocks += [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 20), (20, 20), (40, 20)]
+
+
+@pytest.mark.parametrize("jitter", [1, 400, 4000])
+def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
+    """Ticks of 25 ns, over more than two wraps: what was long ago is not what was just now."""
+    rng = np.random.default_rng(1)
+    receiver = decoder()
+    n_scans, n_packets = 100, 2500
+    indices_found: list[int] = []
+    for k in range(n_packets):
+        rows = scans(k * n_scans, n_scans)
+        clock = rows[:, 0].astype(np.int64) | rows[:, 1].astype(np.int64) << 16
+        clock = (clock + rng.integers(-jitter, jitter, n_scans, endpoint=True)) % (1 << 32)
+        rows[:, 0], rows[:, 1] = clock & 0xFFFF, clock >> 16
+        packet = encode_packet(Packet(rows.ravel()[:510], transaction=2 * k % 65536))
+        rest = encode_packet(Packet(rows.ravel()[510:], transaction=(2 * k + 1) % 65536))
+        when = at((k + 1) * n_scans / RATE)
+        indices_found += indices(of("A", receiver.receive(packet + rest, when))[1])
+    assert indices_found == list(range(n_scans * n_packets))
 
 
 @pytest.mark.parametrize("together", [True, False])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,8 +97,11 @@ def test_a_recording_is_not_there_before_it_is_complete(tmp_path: Path) -> None:
     with ArrayWriter(path, sensors=[LAYOUT], created=CREATED) as writer:
         writer.samples("A", COUNTS)
         assert not path.exists()
-        with pytest.raises(RecordingError, match="another process is writing it"):
-            ArrayWriter(path, sensors=[LAYOUT], created=CREATED)
+        other = ArrayWriter(path, sensors=[LAYOUT], created=CREATED)
+    first = path.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"), other:
+        pass
+    assert path.read_bytes() == first
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
@@ -129,6 +133,8 @@ def test_a_file_of_that_name_is_never_replaced(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_left_does_not_stand_in_the_way(tmp_path: Path) -> None:
-    (tmp_path / ".r.h5.new").write_bytes(b"half of it")
+    leftover = tmp_path / ".r.h5.0123.new"
+    leftover.write_bytes(b"half of it")
+    os.utime(leftover, (0, 0))
     written(tmp_path / "r.h5", 1000)
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]

@@ -19,7 +19,7 @@ from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import repair, verify, write_results
-from daq.recording.superblock import lookup3
+from daq.recording.storage.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ from daq.bench.model import Channel
 from daq.errors import RecordingError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
-from daq.recording.superblock import lookup3
+from daq.recording.storage.superblock import lookup3
 from daq.recording.writer import RecordingWriter
 path, limit = sys.argv[1], int(sys.argv[2])
 if limit:

@@ -17,8 +17,8 @@ from daq.bench.model import Channel, PolesZeros
 from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
-from daq.recording.locking import is_being_written
 from daq.recording.reader import Recording
+from daq.recording.storage.locking import is_being_written
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -238,6 +238,20 @@ def test_it_can_be_followed_within_one_process(tmp_path: Path) -> None:
         writer.close()
         assert recording.refresh()
         assert recording.closed
+
+
+def test_two_readers_of_a_file_at_rest_do_not_disturb_each_other(tmp_path: Path) -> None:
+    """HDF5 shares its state of the file between them."""
+    path = tmp_path / "r.h5"
+    writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
+    for first in range(0, 60_000, 100):
+        writer.append(block("a", first, 100))
+    writer.close()
+    with Recording.open(path) as first_reader:
+        for _ in range(3):
+            with Recording.open(path) as second:
+                np.testing.assert_array_equal(second.sensors[0].counts(0), samples(0, 60_000))
+                np.testing.assert_array_equal(first_reader.sensors[0].counts(0), samples(0, 60_000))
 
 
 def test_refuses_to_overwrite(tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
+import struct
 import threading
 import tty
 from contextlib import asynccontextmanager
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Channel, Sensor
-from daq.drivers.epson.device import Configuration
+from daq.drivers.epson.device import Configuration, Device
 from daq.drivers.epson.driver import EpsonSession
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.registry import driver_type
@@ -22,11 +24,13 @@ from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block
 from daq.protocols.epson import commands
+from daq.transport import address
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
 
 
 class _Far:
@@ -97,6 +101,8 @@ async def _tcp() -> AsyncIterator[tuple[str, _Far]]:
         await asyncio.gather(*(writer.wait_closed() for writer in writers))
 
 
+TIOCGEXCL = 0x80045440
+"""Of Linux; Python's termios does not name it."""
 KINDS = {"pseudo-terminal": _pseudo_terminal, "TCP": _tcp}
 
 
@@ -134,8 +140,27 @@ async def test_a_hang_up_ends_the_stream_after_its_last_bytes(kind: str) -> None
                 await stream.write(b"?")
 
 
-async def test_a_port_without_descriptor_is_read_by_a_thread() -> None:
-    async with open_port("loop://", SystemClock()) as stream:
+@pytest.mark.parametrize("port", ["spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class=os"])
+async def test_a_url_that_is_no_device_is_refused_and_nothing_done(
+    port: str, tmp_path: Path
+) -> None:
+    kept = tmp_path / "kept"
+    kept.write_text("mine")
+    with pytest.raises(NotConnectedError, match="is no port; expected a device"):
+        async with open_port(port.format(kept), SystemClock()):
+            pass
+    assert kept.read_text() == "mine"
+
+
+@pytest.fixture
+def loop_port(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Pyserial's port without a descriptor, which is refused outside of tests."""
+    monkeypatch.setattr(address, "SERIAL_SCHEMES", ("loop://",))
+    return "loop://"
+
+
+async def test_a_port_without_descriptor_is_read_by_a_thread(loop_port: str) -> None:
+    async with open_port(loop_port, SystemClock()) as stream:
         await stream.write(b"round")
         received = b""
         while received != b"round":
@@ -200,7 +225,10 @@ async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() 
     cut = 7
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         decoder = configuration.decoder("A")
-        session = EpsonSession(stream, configuration, DeviceInformation("A"), decoder)
+        device = Device(sensor, stream)
+        session = EpsonSession(
+            device, configuration, DeviceInformation("A"), decoder, SystemClock()
+        )
         items = session.read()
 
         async def block() -> Block:
@@ -220,8 +248,10 @@ async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() 
         assert (second.first_sample, second.n_samples, decoder.begun) == (4, 5, 0)
 
 
-async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience() -> None:
-    async with open_port("loop://", SystemClock()) as stream:
+async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience(
+    loop_port: str,
+) -> None:
+    async with open_port(loop_port, SystemClock()) as stream:
         stream.expect(10)
         await stream.write(bytes(1))  # for the read that is under way
         await stream.read()
@@ -250,7 +280,7 @@ async def test_a_busy_port_is_named() -> None:
 @pytest.mark.parametrize(
     ("port", "reason"),
     [
-        ("/dev/ttyNotThere", "there is no such port; serial ports here: "),
+        ("/dev/ttyNotThere", "port does not exist; serial ports of this computer: "),
         ("/dev/null", "not a serial port|Inappropriate ioctl"),
         ("socket://127.0.0.1:1", "nothing listens there"),
         ("socket://127.0.0.1", "expected socket://host:port"),
@@ -273,3 +303,24 @@ def test_addresses() -> None:
 def test_an_unknown_driver_is_told_which_there_are() -> None:
     with pytest.raises(ValueError, match=r"'seismo'; expected one of .*epson"):
         driver_type("seismo")
+
+
+async def test_a_serial_port_is_opened_exclusively() -> None:
+    """For programs that know no lock; TIOCGEXCL tells what the kernel would say to them."""
+
+    def is_exclusive(port: str) -> bool:
+        descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
+        try:
+            return bool(struct.unpack("i", fcntl.ioctl(descriptor, TIOCGEXCL, bytes(4)))[0])
+        finally:
+            os.close(descriptor)
+
+    async with _pseudo_terminal() as (port, _):
+        if os.geteuid() != 0:
+            async with open_port(port, SystemClock()):
+                with pytest.raises(OSError, match="busy"):
+                    is_exclusive(port)
+        else:  # root is let in
+            async with open_port(port, SystemClock()):
+                assert is_exclusive(port)
+        assert not is_exclusive(port)

@@ -18,6 +18,7 @@ from estimator.diagnostics.advice import (
     ModelMisfit,
     MotionAcross,
     MotionLeftIn,
+    NoSharedMotion,
     NoSignal,
     NotOrthogonal,
     ReversedPolarity,
@@ -79,6 +80,55 @@ def test_a_good_bench_gets_no_warning() -> None:
     assert np.median(found.coherence) == pytest.approx((80 / 81) ** 2, abs=0.005)
     assert found.condition.max() < 1.5
     assert [band.test.p_value > 0.001 for band in found.bands].count(False) == 0
+
+
+def elsewhere(sensor: int, *, n_sensors: int = 3, snr: float = 100.0) -> ComplexArray:
+    """Sensors on one floor, but for one that stands on another and moves as much."""
+    csm = snr * np.kron(np.ones((n_sensors, n_sensors)), np.diag([1.0, 1.5, 0.8]))
+    apart = np.arange(3 * n_sensors) // 3 == sensor
+    csm[apart[:, None] != apart] = 0.0
+    return np.asarray(csm + np.eye(3 * n_sensors), np.complex128)
+
+
+@pytest.mark.parametrize("n", [10, 1080])
+@pytest.mark.parametrize("n_sensors", [3, 5])
+def test_a_sensor_on_another_floor_is_named(n_sensors: int, n: int) -> None:
+    """Without advice that contradicts it, such as to record longer."""
+    for sensor in range(3):
+        averaged = averages(elsewhere(sensor, n_sensors=n_sensors), n=max(n, 3 * n_sensors))
+        found = of(averaged, dims=(3,) * n_sensors, n=max(n, 3 * n_sensors))
+        (advice,) = [each for each in found.advice if each.level is not Level.NOTE]
+        assert isinstance(advice, NoSharedMotion)
+        assert advice.sensors == (sensor,)
+        assert advice.partners == tuple(i for i in range(n_sensors) if i != sensor)
+        assert advice.level is Level.PROBLEM
+        assert advice.share < 0.05
+        assert advice.share_of_partners > 0.9
+        assert advice.band == (1.0, 20.0)
+        kinds = {each.kind for each in found.advice}
+        assert not kinds & {AdviceKind.MOTION_LEFT_IN, AdviceKind.WEAK_MOTION}
+
+
+def test_sensors_that_share_little_or_none_are_not_called_strangers() -> None:
+    """Where no two agree, where all do, and where one shares a part of the motion."""
+    weak = bench(np.eye(3), np.eye(3), np.eye(3), motion=0.05 * np.eye(3))
+    assert advice_of(NoSharedMotion, of(averages(weak))) == []
+    assert advice_of(NoSharedMotion, of(averages(weak, n=12), n=12)) == []
+    noisy = bench(np.eye(3), np.eye(3), np.eye(3)) + np.diag([100.0] * 3 + [0.0] * 6)
+    assert advice_of(NoSharedMotion, of(averages(noisy))) == []
+    pairs = np.kron(np.kron(np.eye(2), np.ones((2, 2))), 100 * np.eye(3)) + np.eye(12)
+    found = of(averages(pairs.astype(np.complex128)), dims=(3,) * 4)
+    assert advice_of(NoSharedMotion, found) == []  # who of the two pairs is elsewhere?
+
+
+def test_a_sensor_that_shares_low_frequencies_alone_is_named_above() -> None:
+    together, apart = (averages(each) for each in (elsewhere(9), elsewhere(1)))
+    csm = np.where((FREQUENCY < 5)[:, None, None], together, apart)
+    (advice,) = advice_of(NoSharedMotion, of(csm))
+    assert advice.sensors == (1,)
+    assert advice.band is not None
+    assert advice.band[0] == pytest.approx(5, abs=1)
+    assert advice.band[1] == 20.0
 
 
 def test_rotated_sensors_are_found_with_their_angle() -> None:

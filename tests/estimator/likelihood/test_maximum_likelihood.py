@@ -273,7 +273,7 @@ def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
 def test_motion_that_the_averages_cannot_find_costs_a_few_percent(
     dims: tuple[int, ...], snr: float
 ) -> None:
-    """No estimate is unbiased there (decision 33); factors fitted to scatter cost 16 to 23 %."""
+    """No estimate is unbiased there (decision 10); factors fitted to scatter cost 16 to 23 %."""
     n_draws = 600 if sum(dims) == 3 else 200
     draws = wishart(
         equal_noise(18, dims=dims, snr=snr), 20, np.random.default_rng(27), n_draws=n_draws

@@ -14,6 +14,7 @@ from estimator.self_noise.band_means import (
     band_means,
     bin_correlation,
     log_edges,
+    median_of_columns,
 )
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tui.output.results import result_table, result_title
@@ -77,7 +78,7 @@ def test_a_band_ends_where_nothing_can_be_said(asked: tuple[float, float] | None
     assert band_of(settings, snapshot)[1] == 80
     title = result_title(snapshot, settings)
     assert "to 80 Hz" in title
-    assert ("(98 was asked for)" in title) == (asked is not None)
+    assert ("(98 requested)" in title) == (asked is not None)
     assert "?" not in list(result_table(snapshot, settings).columns[2].cells)
 
 
@@ -85,3 +86,18 @@ def test_a_band_of_which_nothing_is_known_stays_what_it_is() -> None:
     snapshot = made_snapshot()
     snapshot.csm[snapshot.frequency > 80] = np.nan
     assert band_of(replace(SETTINGS, band=(85.0, 95.0)), snapshot) == (85.0, 95.0)
+
+
+def test_median_of_columns_is_that_of_numpy() -> None:
+    rng = np.random.default_rng(2)
+    for n_rows in (1, 2, 7, 8):
+        values = rng.normal(size=(n_rows, 5))
+        values[rng.random(values.shape) < 0.3] = np.nan
+        values[0, 0] = 1.0  # columns 0 and 1 have a number and none
+        values[:, 1] = np.nan
+        found = median_of_columns(values)
+        for column, median in zip(values.T, found, strict=True):
+            known = column[~np.isnan(column)]
+            np.testing.assert_array_equal(median, np.median(known) if known.size else np.nan)
+        assert np.isnan(found[1])
+    assert np.isnan(median_of_columns(np.empty((0, 3)))).all()

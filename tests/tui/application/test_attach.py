@@ -16,6 +16,7 @@ from daq.estimation.settings import Settings
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from tests.tui.application.screen_text import screen_text
+from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.commands.tui import BenchControls
 from tui.simulation.devices import simulated
@@ -40,8 +41,8 @@ def bench(tmp_path: Path) -> Iterator[Path]:
 
 
 async def until(pilot: Pilot[None], reached: Callable[[], bool]) -> None:
-    """Let the application run until something is the case, for half a minute at most."""
-    deadline = time.monotonic() + 30
+    """Let the application run until something is the case."""
+    deadline = time.monotonic() + limit()
     while not reached():
         assert time.monotonic() < deadline, screen_text(pilot.app)
         await pilot.pause(0.05)
@@ -64,7 +65,7 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
         await until(pilot, lambda: second.snapshot is not None)
         await pilot.press("m", *"here", "enter")
         await until(pilot, lambda: all(w.group != "control" for w in second.workers))
-        await pilot.press("x", "x")
+        await pilot.press("x", "x", "enter", "y")
         await until(pilot, lambda: second.snapshot is not None and second.snapshot.closed)
         snapshot = second.snapshot
         assert snapshot is not None

@@ -17,7 +17,7 @@ CHOICE = Choice(methods=("three-sensor",))
 
 def filled(since: dict[str, float]) -> int:
     """Return the full cells of the bar once sensors have sent for so many seconds since."""
-    snapshot = replace(made_snapshot(n_effective=100), time_left=300.0)
+    snapshot = made_snapshot(n_effective=100)
     before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
     now = made_now(elapsed=100 + max(since.values()))
     now = replace(
@@ -26,7 +26,8 @@ def filled(since: dict[str, float]) -> int:
             replace(s, n_samples=before[s.name] + round(RATE * since[s.name])) for s in now.sensors
         ),
     )
-    return progress_line(now, snapshot, SETTINGS, CHOICE, width=150).plain.count("━")
+    settings = replace(SETTINGS, target_cov=0.15)
+    return progress_line(now, snapshot, settings, width=150).plain.count("━")
 
 
 def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -> None:
@@ -37,7 +38,7 @@ def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -
 
 @pytest.mark.parametrize(
     ("reject", "said"),
-    [(None, "are left out"), (True, "are left out"), (False, "are kept: do not")],
+    [(None, "are excluded"), (True, "are excluded"), (False, "are kept: do not")],
 )
 def test_what_becomes_of_clipped_segments_is_as_the_settings_say(
     reject: bool | None, said: str

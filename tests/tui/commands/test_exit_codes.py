@@ -10,7 +10,7 @@ import pytest
 import daq.errors
 import estimator.errors
 import sim_devices.errors
-from daq.errors import BenchFileError, DeviceError, HuddleError, WrongSettingError
+from daq.errors import ArrayError, BenchFileError, DeviceError, HuddleError, WrongSettingError
 from estimator.errors import BandError, EstimatorError, UnknownMethodError
 from sim_devices.errors import ScenarioError, ServeError, SimulationError
 from tui.cli.main import exit_code, messages
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 USAGE_ERRORS = {
+    ArrayError,
     BenchFileError,
     WrongSettingError,
     BandError,

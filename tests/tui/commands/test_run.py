@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from daq.drivers.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
+from tests.waiting import finish, wait_until
 from tui.cli.main import app
 from tui.simulation.devices import simulated
 
@@ -52,24 +52,20 @@ def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     )
 
 
-def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """Wait for a command; return exit code, standard output and standard error."""
-    out, err = process.communicate(timeout=110)
-    return process.returncode, out, err
-
-
-def wait_for_samples(path: Path, n_samples: int) -> None:
+def wait_for_samples(process: subprocess.Popen[str], path: Path, n_samples: int) -> None:
     """Return when this many samples of every sensor are committed to a file, or to one below."""
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
+
+    def are_committed() -> bool:
+        if process.poll() is not None:
+            pytest.fail(f"it ended before that: {process.communicate()}")
         for file in path.rglob("*.h5") if path.is_dir() else (path,):
-            if not file.exists():
-                continue
-            with Recording.open(file) as recording:
-                if min(sensor.n_samples for sensor in recording.sensors) >= n_samples:
-                    return
-        os.sched_yield()
-    pytest.fail(f"{path}: fewer than {n_samples} samples after 30 s")
+            if file.exists():
+                with Recording.open(file) as recording:
+                    if min(sensor.n_samples for sensor in recording.sensors) >= n_samples:
+                        return True
+        return False
+
+    wait_until(are_committed, f"{n_samples} samples of every sensor in {path}")
 
 
 def estimate(path: Path, *options: str) -> dict[str, Any]:
@@ -83,7 +79,7 @@ def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> Non
     out = tmp_path / "run.h5"
     pdf = tmp_path / "run.pdf"
     wanted = ("--duration", "14s", "--out", str(out), "--json", "-", "--report", str(pdf))
-    code, said, err = finished(start("run", str(bench), *wanted))
+    code, said, err = finish(start("run", str(bench), *wanted))
     assert code == 0, err
     assert pdf.read_bytes().startswith(b"%PDF-")
     assert f"{pdf} written" in err
@@ -102,17 +98,32 @@ def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> Non
         np.testing.assert_allclose(arrays["noise_psd"], noise, rtol=1e-9)
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")  # noqa: PTH110
+def test_a_result_that_cannot_be_written_elsewhere_is_in_the_recording(
+    bench: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "r.h5"
+    with start(
+        "run", str(bench), "--duration", "60s", "--out", str(out), "--json", "/dev/full"
+    ) as run:
+        code, _, err = finish(run)
+    assert code == 3
+    assert "/dev/full" in err
+    with Recording.open(out) as recording:
+        assert recording.results()
+
+
 def test_kill_in_the_middle_loses_nothing_that_was_acknowledged(
     bench: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "killed.h5"
     process = start("run", str(bench), "--out", str(out), "--duration", "10min")
-    wait_for_samples(out, 2500)
+    wait_for_samples(process, out, 2500)
     with Recording.open(out) as recording:
         acknowledged = [sensor.n_samples for sensor in recording.sensors]
     (child,) = children_of(process.pid)
     os.kill(child, signal.SIGKILL)
-    code, said, err = finished(process)
+    code, said, err = finish(process)
     assert code == 3
     assert "three-sensor" in said  # the result of what was recorded is shown all the same
     said_of_it = " ".join(err.split())
@@ -126,12 +137,28 @@ def test_kill_in_the_middle_loses_nothing_that_was_acknowledged(
     assert estimate(out)["segments"] >= 8
 
 
+def test_a_fault_of_the_estimate_does_not_end_the_recording(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tui.commands.run.follow", fail)
+    out = tmp_path / "r.h5"
+    done = CliRunner().invoke(app, ["run", str(bench), "--duration", "60s", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    with Recording.open(out) as recording:
+        assert recording.events[-1].text == "duration reached"
+        assert min(sensor.n_samples for sensor in recording.sensors) >= 60 * 190
+        assert recording.results()
+
+
 def test_ctrl_c_stops_the_recorder_and_still_prints_the_result(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped.h5"
     process = start("run", str(bench), "--out", str(out), "--duration", "10min")
-    wait_for_samples(out, 2500)
+    wait_for_samples(process, out, 2500)
     process.send_signal(signal.SIGINT)
-    code, said, err = finished(process)
+    code, said, err = finish(process)
     assert code == 130, err
     assert "three-sensor" in said
     with Recording.open(out) as recording:
@@ -145,7 +172,7 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     text = bench.read_text(encoding="utf-8")
     with_report.write_text(text.replace("[recording]", '[recording]\nreport = "html"'), "utf-8")
     process = start("run", str(with_report), "--out", str(out), "--until-cov", "0.4", "--json", "-")
-    code, said, err = finished(process)
+    code, said, err = finish(process)
     assert code == 0, err
     document = json.loads(said)
     inside = slice(4, 41)  # 2 to 20 Hz
@@ -159,7 +186,7 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
 
 def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "record.h5"
-    code, said, err = finished(
+    code, said, err = finish(
         start("record", str(bench), "--duration", "5s", "--out", str(out), "--json", "-")
     )
     assert code == 0, err
@@ -169,7 +196,7 @@ def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
         assert status["sensors"][name]["samples"] >= 900  # connecting takes part of the duration
     with Recording.open(out) as recording:
         assert recording.duration == 5
-    code, _, err = finished(start("record", str(bench), "--duration", "5s", "--out", str(out)))
+    code, _, err = finish(start("record", str(bench), "--duration", "5s", "--out", str(out)))
     assert code == 3
     assert "exists already" in err
 
@@ -203,7 +230,7 @@ def test_ports_that_are_not_there_are_named_and_exit_3(bench: Path, tmp_path: Pa
     )
     path = tmp_path / "broken.toml"
     path.write_text(dump(broken.model_copy(update={"sensors": sensors})), encoding="utf-8")
-    code, _, err = finished(start("run", str(path), "--out", str(tmp_path / "none.h5")))
+    code, _, err = finish(start("run", str(path), "--out", str(tmp_path / "none.h5")))
     assert code == 3
     for name in "ABC":
         assert f"none-{name}" in err
@@ -219,7 +246,7 @@ def children_of(pid: int) -> list[int]:
 
 def test_check_finds_what_is_on_a_port(bench: Path) -> None:
     port = parse(bench.read_text(encoding="utf-8")).sensors[0].port
-    code, said, err = finished(start("check", "--port", port, "--json", "-"))
+    code, said, err = finish(start("check", "--port", port, "--json", "-"))
     assert code == 0, err
     (device,) = json.loads(said)["devices"]
     assert device["driver"] == "epson"
@@ -228,15 +255,15 @@ def test_check_finds_what_is_on_a_port(bench: Path) -> None:
 
 def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> None:
     process = start("demo", "--speed", "8", "--json", "-", TMPDIR=str(tmp_path))
-    wait_for_samples(tmp_path, 2500)
+    wait_for_samples(process, tmp_path, 2500)
     process.send_signal(signal.SIGINT)
-    code, said, err = finished(process)
+    code, said, err = finish(process)
     assert code == 130, err
     assert len(json.loads(said)["channels"]) == 18
 
 
 def test_demo_shows_which_estimate_is_right() -> None:
-    code, said, err = finished(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
+    code, said, err = finish(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
     assert code == 0, err
     channels = json.loads(said)["channels"]
     covers = {

@@ -6,6 +6,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from rich.table import Table
+from rich.text import Text
 from typer.testing import CliRunner
 
 from daq.acquisition.block_writer import SensorProgress
@@ -14,7 +16,7 @@ from daq.python_process import python_command
 from daq.recording.sensor_state import SensorState
 from tui.cli.main import app
 from tui.commands.record import progress_line
-from tui.output.console import notices, progress, reserve_standard_error, write_text
+from tui.output.console import console, notices, progress, reserve_standard_error, write_text
 
 FULL = Path("/dev/full")
 
@@ -111,3 +113,17 @@ def test_the_application_without_a_file_says_what_there_is(
     assert result.exit_code == 2
     assert "lab.toml" in result.output
     assert "huddle init" in result.output
+
+
+def test_escapes_in_names_reach_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A name of a sensor in somebody's file must not set the title of a terminal, or worse."""
+    table = Table("sensor")
+    table.add_row("\x1b]0;owned\x07red")
+    table.add_row(Text("\x9b31mtext"))
+    console().print(table)
+    console().print("plain \x1b[31m", "two\nlines")
+    written = capsys.readouterr().out
+    assert "\x1b" not in written
+    assert "\x9b" not in written
+    assert "\\x1b]0;owne" in written  # cut by the table, which counts the raw name
+    assert "two\nlines" in written

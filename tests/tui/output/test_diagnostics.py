@@ -14,7 +14,8 @@ from rich.console import Console
 from scipy.linalg import block_diag
 
 from daq.estimation.snapshot import Octave, SnapshotDiagnostics
-from estimator.diagnostics.kinds import Untested
+from estimator.diagnostics.advice import NoSharedMotion
+from estimator.diagnostics.kinds import Level, Untested
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot, rotation
@@ -108,7 +109,7 @@ def shown(parts: Sequence[RenderableType]) -> str:
 
 def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> None:
     text = shown(details(diagnosed()))
-    legend = "Model test: its statistic over the expectation, 1 where one common motion"
+    legend = "Model test: its statistic over its expectation, 1 if one common motion"
     assert legend in " ".join(text.split())
     assert "Orientation, gain and delay" in text
     assert "e+0" not in text
@@ -125,7 +126,7 @@ def test_octaves_say_what_each_has_left_out() -> None:
         Octave(20.1, 100.0, 10.0, 100, 94.0, {Reason.GAP: 2, Reason.TRANSIENT: 3}),
     )
     snapshot = replace(diagnosed(), octaves=octaves)
-    assert "disturbed segments left out: 3 at 20.1–100 Hz" in remarks(snapshot)
+    assert "segments with transients excluded: 3 at 20.1–100 Hz" in remarks(snapshot)
     text = " ".join(shown(details(snapshot)).split())
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
     alone = remarks(replace(snapshot, octaves=octaves[1:]))
@@ -150,17 +151,17 @@ def test_clipped_channels_are_named() -> None:
     clipped = replace(snapshot.diagnostics, clipped={3: 0.046})
     assert any("Clipped: B.X (4.6 %)" in x for x in remarks(replace(snapshot, diagnostics=clipped)))
     still = replace(snapshot.diagnostics, stood_still={4: 30.0})
-    (line,) = [x for x in remarks(replace(snapshot, diagnostics=still)) if "Dead for a while" in x]
+    (line,) = [x for x in remarks(replace(snapshot, diagnostics=still)) if "Temporarily dead" in x]
     assert "B.Y (for 30 s)" in line
     assert "--reject" in line
 
 
 def test_too_few_averages_for_the_model_test_are_said() -> None:
     early = diagnosed(n_effective=9.0)
-    expected = "The model test takes more averages (9 now) than channels (9)."
+    expected = "The model test needs more averages (9 so far) than channels (9)."
     assert expected in summary(early)
     assert "nan" not in shown(details(early))
-    assert not any("takes more averages" in line for line in summary(diagnosed()))
+    assert not any("needs more averages" in line for line in summary(diagnosed()))
 
 
 def test_the_model_that_is_tested_is_the_one_that_gave_the_numbers() -> None:
@@ -184,12 +185,34 @@ def test_too_few_channels_for_the_model_test_are_no_too_few_averages() -> None:
 
 @pytest.mark.parametrize("why", Untested)
 def test_why_there_is_no_diagnosis_is_said(why: Untested) -> None:
-    """Whatever the reason, and of two sensors not that the recording must end first."""
+    """Whatever the reason, and of two sensors not that there is too little yet."""
     snapshot = replace(made_snapshot(), diagnostics=SnapshotDiagnostics(untested=why))
     (only,) = details(snapshot)
     assert str(only).endswith(".")
-    assert ("has ended" in str(only)) == (why is Untested.UNFINISHED)
+    assert ("first segments" in str(only)) == (why is Untested.UNFINISHED)
     assert summary(snapshot) == []
+
+
+def test_a_sensor_elsewhere_has_no_noise_level_and_nothing_contradicts_it() -> None:
+    snapshot = diagnosed()
+    stranger = NoSharedMotion(
+        level=Level.PROBLEM,
+        sensors=(0,),
+        band=(0.5, 100.0),
+        partners=(1, 2),
+        share=0.001,
+        share_of_partners=0.99,
+    )
+    assert snapshot.diagnostics.diagnosis is not None
+    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(stranger,))
+    snapshot = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
+    table = shown([result_table(snapshot, SETTINGS)])
+    assert table.count("no shared motion") == 3 * len(snapshot.results)
+    assert table.count("no third sensor") == 6 * len(snapshot.results)
+    said = " ".join([*summary(snapshot), *remarks(snapshot)])
+    assert "Sensor A records none of the motion that B and C share" in said
+    assert "model test passes" not in said
+    assert "ecord longer" not in said
 
 
 def test_a_channel_without_signal_has_no_level() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import subprocess
 import sys
 from importlib import resources
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from daq.acquisition.schedule import RunState
 from daq.bench.loading import dump
+from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from daq.recording.reader import Recording
 from tui.commands.serve import run_once
@@ -77,17 +80,22 @@ def test_simulators_and_the_recorder_run_none(record: Path) -> None:
 def test_runs_of_a_service_execute_none(record: Path) -> None:
     with simulated(parse(demo_bench()), speed=8.0) as reachable:
         bench = reachable.model_copy(
-            update={"recording": reachable.recording.model_copy(update={"duration": 12.0})}
+            update={
+                "recording": reachable.recording.model_copy(update={"duration": 12.0}),
+                "limits": (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),),
+            }
         )
         Path("bench.toml").write_text(dump(bench), encoding="utf-8")
         placed = parse(dump(bench), "bench.toml")
         placed.recording_directory.mkdir(parents=True, exist_ok=True)
         options = ["--method", "three-channel"]
-        asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event(), options))
-    (path,) = placed.recording_directory.glob("*.json")
+        state, out = asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event(), options))
+    assert state is RunState.NOT_DECIDED  # 12 s are too short for the limit
+    path = out.with_suffix(".json")
     result = json.loads(path.read_text(encoding="utf-8"))
     assert result["segments"] >= 5
     assert result["method"] == "three-channel"
+    assert result["verdict"] == "not-decided"
     assert not record.exists()
 
 
@@ -105,11 +113,24 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
     assert not record.exists()
 
 
+STARTS = re.compile(r"\b(Popen|subprocess\.(run|call|check_\w+)|create_subprocess_\w+)\(")
+OTHER_STARTS = re.compile(r"\bos\.(exec|spawn|posix_spawn|system|popen)|\bmultiprocessing\b|runpy")
+
+
 def test_no_process_of_python_is_started_in_any_other_way() -> None:
-    starts = [
-        str(path.relative_to(ROOT))
-        for package in ("daq", "estimator", "sim_devices", "tui")
+    sources = {
+        str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
+        for package in PACKAGES
         for path in (ROOT / package).rglob("*.py")
-        if "sys.executable" in path.read_text(encoding="utf-8")
-    ]
-    assert starts == [str(Path("daq", "python_process.py"))]
+    } | {"huddle.py": (ROOT / "huddle.py").read_text(encoding="utf-8")}
+    interpreters = [name for name, text in sources.items() if "sys.executable" in text]
+    assert interpreters == [str(Path("daq", "python_process.py"))]
+    assert not [name for name, text in sources.items() if OTHER_STARTS.search(text)]
+    # Each has its own test above: simulated devices, the recorder, and runs of a service.
+    starts = {name for name, text in sources.items() if STARTS.search(text)}
+    assert starts == {
+        str(Path("sim_devices", "server", "launch.py")),
+        str(Path("tui", "runs", "recorder_process.py")),
+        str(Path("tui", "commands", "serve.py")),
+    }
+    assert all("python_command(" in sources[name] for name in starts)

@@ -48,6 +48,6 @@ def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
     bench = parse(text)
     assert (bench.recording.duration, bench.speed) == (300.0, 4.0)
     said = " ".join(CliRunner().invoke(app, ["demo", "--help"]).output.replace("│", " ").split())
-    assert "5min where not given" in said
-    assert "4 where not given" in said
+    assert "(default 5min)" in said
+    assert "real time (default 4)" in said
     assert "bench file" not in said

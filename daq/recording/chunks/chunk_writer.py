@@ -1,0 +1,275 @@
+"""Buffers the rows of one sensor: samples become whole chunks, small blocks are merged."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.recording import file_format
+from daq.recording.storage.retries import repeated, report
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.typing import NDArray
+
+    from daq.protocols.block import Block, HostTime
+    from daq.recording.file_format import SensorLayout
+
+_NO_FILTER = 0b111  # as a mask: shuffle, gzip and fletcher32 are skipped
+_MERGED_SECONDS = 0.1
+"""Length of merged blocks in seconds."""
+
+
+class TableBuffer:
+    """Appends rows to a table; the dataset is unfiltered, so that rows are written in place."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._waiting: list[NDArray[np.void]] = []
+        self.n_rows = 0
+        self.written = b""
+        """What the last `write` wrote."""
+
+    def add(self, row: NDArray[np.void]) -> None:
+        """Buffer a row until the next `write`."""
+        self._waiting.append(row)
+
+    def write(self) -> None:
+        """Write the buffered rows."""
+        self.written = b""
+        if not self._waiting:
+            return
+        rows = np.concatenate(self._waiting)
+        repeated(lambda: self._dataset.resize(self.n_rows + len(rows), axis=0))
+        repeated(lambda: self._assign(rows))
+        self.n_rows += len(rows)
+        self.written = rows.tobytes()
+        self._waiting.clear()
+
+    def _assign(self, rows: NDArray[np.void]) -> None:
+        self._dataset[self.n_rows :] = rows
+
+
+class ChunkBuffer:
+    """Appends rows to a dataset in whole chunks; the rows of an incomplete chunk are buffered."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self.dataset = dataset
+        self._buffer = np.empty(dataset.chunks, dataset.dtype)
+        self._filled = 0
+        self._unsafe: list[tuple[int, NDArray[Any]]] = []
+        self.n_written = 0
+
+    def write_again(self) -> None:
+        """Write the chunks that are not safe yet once more, around HDF5's cache.
+
+        HDF5 forgets a chunk that it could not write, or keeps a wrong one. Here the chunks go
+        into the file as they are, past all filters, and are read back.
+
+        Raises
+        ------
+        OSError, RuntimeError
+            If the disk refuses again.
+        """
+        length, *columns = self.dataset.chunks
+        corner = (0,) * len(columns)
+        for begin, rows in self._unsafe:
+            for first in range(0, len(rows), length):
+                chunk = np.zeros(self.dataset.chunks, self.dataset.dtype)
+                part = rows[first : first + length]
+                chunk[: len(part)] = part
+                place = (begin + first, *corner)
+                self.dataset.id.write_direct_chunk(place, chunk.tobytes(), _NO_FILTER)
+                if bytes(self.dataset.id.read_direct_chunk(place)[1]) != chunk.tobytes():
+                    raise OSError(f"{self.dataset.name}: a chunk was not stored as written")
+
+    def are_safe(self) -> None:
+        """Forget what has been written: the file has been flushed."""
+        self._unsafe.clear()
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Add rows, and write the chunks that are complete."""
+        length = len(self._buffer)
+        taken = min(len(rows), length - self._filled) if self._filled else 0
+        if taken:
+            self._buffer[self._filled : self._filled + taken] = rows[:taken]
+            self._filled += taken
+            if self._filled == length:
+                self._filled = 0
+                self._write(self._buffer)
+        whole = taken + (len(rows) - taken) // length * length
+        if whole > taken:
+            self._write(rows[taken:whole])
+        rest = rows[whole:]
+        if len(rest):
+            self._buffer[: len(rest)] = rest
+            self._filled = len(rest)
+
+    def finish(self) -> None:
+        """Write the buffered rows as a last, partial chunk."""
+        rest, self._filled = self._filled, 0
+        if rest:
+            self._write(self._buffer[:rest])
+
+    def _write(self, rows: NDArray[Any]) -> None:
+        repeated(lambda: self.dataset.resize(self.n_written + len(rows), axis=0))
+        self._unsafe.append((self.n_written, rows.copy()))
+        try:
+            self.dataset[self.n_written :] = rows
+        except (OSError, RuntimeError) as error:
+            report(error)
+            repeated(self.write_again)
+        self.n_written += len(rows)
+
+
+@dataclass(slots=True)
+class _OpenBlock:
+    """A block to which further samples may be added."""
+
+    first_sample: int
+    first_row: int
+    n_samples: int
+    received: HostTime
+    device_counter: int
+    flags: int
+
+    def array(self) -> NDArray[np.void]:
+        """Return the block's row without its checksum."""
+        at = self.received.monotonic_ns, self.received.utc_ns
+        begin = self.first_sample, self.first_row, self.n_samples
+        return np.array(
+            [(*begin, *at, self.device_counter, self.flags, 0)], file_format.BLOCK_DTYPE
+        )
+
+
+class SensorRows:
+    """Buffers samples, blocks and gaps of one sensor.
+
+    Small contiguous blocks are merged into one row of ``blocks`` of up to a tenth of a second: at
+    200 Hz a serial port delivers three or four samples at a time, which take less space than a row.
+    """
+
+    def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
+        self.samples = ChunkBuffer(group["samples"])
+        self.instants = ChunkBuffer(group["instants"])
+        self._polled: bool | None = None
+        self.blocks = TableBuffer(group["blocks"])
+        self.gaps = TableBuffer(group["gaps"])
+        self._layout = sensor
+        self._merged_length = max(1, round(sensor.sampling_rate * _MERGED_SECONDS))
+        self._current: _OpenBlock | None = None
+        self._crc32 = 0
+        self._finished: list[NDArray[np.void]] = []
+        self._n_rows = 0
+
+    def append(self, block: Block) -> None:
+        """Add a block.
+
+        Raises
+        ------
+        RecordingError
+            If its shape or type is not that of the sensor.
+        """
+        counts = self._converted(block)
+        if self._polled is None:
+            self._polled = block.instants_ns is not None
+        elif self._polled != (block.instants_ns is not None):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: some blocks have sample times, others do not"
+            )
+        merged = self._merge(block)
+        self._crc32 = zlib.crc32(counts.data, self._crc32 if merged else 0)
+        self._n_rows += block.n_samples
+        self.samples.add(counts)
+        if block.instants_ns is not None:
+            self.instants.add(block.instants_ns)
+
+    def collect(self) -> None:
+        """Add the blocks whose samples are all written to the table of blocks."""
+        written = self.samples.n_written
+        if self._polled:
+            written = min(written, self.instants.n_written)
+        if self._n_rows == written:
+            self._end_current()
+        done = 0
+        for row in self._finished:
+            if row["first_row"][0] + row["n_samples"][0] > written:
+                break
+            self.blocks.add(row)
+            done += 1
+        del self._finished[:done]
+
+    def write_again(self) -> None:
+        """Write the samples that are not safe yet once more."""
+        self.samples.write_again()
+        self.instants.write_again()
+
+    def are_safe(self) -> None:
+        """Forget the samples that have been written."""
+        self.samples.are_safe()
+        self.instants.are_safe()
+
+    def finish(self) -> None:
+        """End the current block and write all buffered samples."""
+        self._end_current()
+        self.samples.finish()
+        self.instants.finish()
+
+    @property
+    def committable_rows(self) -> int:
+        """Number of rows of samples in the blocks that are in their table."""
+        if self._finished:
+            return int(self._finished[0]["first_row"][0])
+        return self._n_rows if self._current is None else self._current.first_row
+
+    def _merge(self, block: Block) -> bool:
+        """Add a block to the current one and return True, or begin another one."""
+        current = self._current
+        if (
+            current is not None
+            and block.first_sample == current.first_sample + current.n_samples
+            and int(block.flags) == current.flags
+            and not block.reason
+            and current.n_samples + block.n_samples <= self._merged_length
+        ):
+            current.n_samples += block.n_samples
+            current.received = block.received
+            return True
+        self._end_current()
+        counter = file_format.NO_COUNTER if block.device_counter is None else block.device_counter
+        self._current = _OpenBlock(
+            block.first_sample,
+            self._n_rows,
+            block.n_samples,
+            block.received,
+            counter,
+            int(block.flags),
+        )
+        return False
+
+    def _end_current(self) -> None:
+        if self._current is not None:
+            row = self._current.array()
+            row["crc32"] = file_format.block_crc32(row, self._crc32)
+            self._finished.append(row)
+            self._current = None
+
+    def _converted(self, block: Block) -> NDArray[Any]:
+        expected = len(self._layout.channels)
+        if block.counts.ndim != 2 or block.counts.shape[1] != expected:
+            raise RecordingError(
+                f"sensor {block.sensor!r}: a block of shape {block.counts.shape};"
+                f" expected (n_samples, {expected})"
+            )
+        counts: NDArray[Any] = np.ascontiguousarray(block.counts, self._layout.dtype)
+        safe = np.can_cast(block.counts.dtype, self._layout.dtype, "safe")
+        if not safe and not np.array_equal(counts, block.counts):
+            raise RecordingError(
+                f"sensor {block.sensor!r}: counts of type {block.counts.dtype} do not fit"
+                f" {self._layout.dtype}"
+            )
+        return counts

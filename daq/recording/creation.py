@@ -1,0 +1,103 @@
+"""What a new recording holds: its attributes, and the datasets that grow."""
+
+from __future__ import annotations
+
+import uuid
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.recording import file_format
+from daq.recording.description import make_checksums
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import h5py
+
+    from daq.bench.model import Bench
+    from daq.protocols.block import HostTime
+    from daq.recording.file_format import SensorLayout
+
+_MIN_CHUNK_ROWS = 64
+
+
+def write_attributes(
+    file: h5py.File,
+    bench: Bench | None,
+    created: HostTime,
+    control: tuple[int, str] | None,
+    attributes: dict[str, str | float],
+) -> None:
+    """Write what is known of the run when it starts."""
+    utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
+    try:
+        software = f"huddle {version('huddle-bench')}"
+    except PackageNotFoundError:
+        software = "huddle"
+    file.attrs.update(
+        {
+            "format": file_format.FORMAT,
+            "format_version": file_format.FORMAT_VERSION,
+            "run_id": uuid.uuid4().hex,
+            "created": utc.isoformat(timespec="microseconds"),
+            "created_utc_ns": created.utc_ns,
+            "created_monotonic_ns": created.monotonic_ns,
+            "software": software,
+            "bench": "" if bench is None else bench.text,
+            "operator": "" if bench is None else bench.operator,
+            "location": "" if bench is None else bench.location,
+        }
+        | attributes
+    )
+    if control is not None:
+        file.attrs["control_port"], file.attrs["control_token"] = control
+
+
+def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
+    """Make the datasets of all sensors, events, and ``/committed``, all of them empty."""
+    groups = file.create_group("sensors")
+    for sensor in sensors:
+        group = groups.create_group(sensor.name)
+        for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
+            group.attrs[key] = getattr(sensor, key)
+        n_channels = len(sensor.channels)
+        # Reading a chunk takes at least 10 µs, so at low rates a chunk has two seconds.
+        min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))
+        n_rows = max(4, min_rows, round(sensor.sampling_rate * chunk_seconds))
+        filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+        samples = group.create_dataset(
+            "samples",
+            shape=(0, n_channels),
+            maxshape=(None, n_channels),
+            chunks=(n_rows, n_channels),
+            dtype=sensor.dtype.newbyteorder("<"),
+            fletcher32=True,
+            **filters,
+        )
+        samples.attrs.update(file_format.channel_attributes(sensor.channels))
+        # Remains empty unless the sensor is polled.
+        instants = group.create_dataset(
+            "instants",
+            shape=(0,),
+            maxshape=(None,),
+            chunks=(n_rows,),
+            dtype="<i8",
+            fletcher32=True,
+            **filters,
+        )
+        instants.attrs["unit"] = "ns"
+        _make_table(group, "blocks", file_format.BLOCK_DTYPE, file_format.BLOCKS_PER_CHUNK)
+        _make_table(group, "gaps", file_format.GAP_DTYPE, file_format.GAPS_PER_CHUNK)
+    _make_table(file, "events", file_format.EVENT_DTYPE, file_format.EVENTS_PER_CHUNK)
+    make_checksums(file, len(sensors))
+    committed = file.create_dataset("committed", data=np.zeros((len(sensors) + 1, 3), "<i8"))
+    committed.attrs["sensors"] = [sensor.name for sensor in sensors]
+    committed.attrs["columns"] = ["rows", "blocks", "gaps"]
+    committed.attrs["last_row"] = ["events", "closed", "unused"]
+
+
+def _make_table(group: h5py.Group, name: str, dtype: np.dtype[Any], n_rows: int) -> None:
+    group.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(n_rows,), dtype=dtype)

@@ -1,0 +1,127 @@
+"""Checksums of what has none in HDF5: attributes, gaps, events, and ``/committed``.
+
+``/checksums`` has the rows of ``/committed``: a CRC-32 of the description of a sensor (its
+attributes), of its gaps, and of its row of ``/committed``; in the last row those of the file's
+attributes, of the events, and of the last row. It is written when the recording is closed; zeros
+mean that it was not. Older recordings have no such dataset.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import NotARecordingError
+from daq.recording.storage.refusals import dataset
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    import h5py
+
+    from daq.recording.sensor_record import CommittedRows
+
+CHECKSUMS = "checksums"
+_DESCRIPTION, _TABLE, _COUNTS = range(3)
+_FILE = (
+    *("format", "format_version", "run_id", "created", "created_utc_ns", "created_monotonic_ns"),
+    *("software", "bench", "operator", "location", "duration", "origin"),
+)
+_SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate")
+_SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "response")
+
+
+def write_checksums(file: h5py.File) -> None:
+    """Write ``/checksums`` of a recording that is complete."""
+    if CHECKSUMS in file:
+        names = list(file["committed"].attrs["sensors"])
+        tables = [file["sensors"][name]["gaps"][...].tobytes() for name in names]
+        file[CHECKSUMS][...] = _checksums(file, [*tables, file["events"][...].tobytes()])
+
+
+def damaged_tables(
+    path: Path, file: h5py.File, gaps: dict[str, CommittedRows], events: CommittedRows
+) -> Iterator[str]:
+    """Yield the names of tables that do not have their checksums.
+
+    Parameters
+    ----------
+    path : Path
+    file : h5py.File
+        The recording.
+    gaps : dict
+        Of each sensor, by name.
+    events : CommittedRows
+
+    Raises
+    ------
+    NotARecordingError
+        If a description or ``/committed`` is damaged: nothing else would mean anything.
+    """
+    if CHECKSUMS not in file:
+        return
+    stored = dataset(file, CHECKSUMS, np.dtype("<u4"))[...]
+    if not stored.any():
+        return
+    tables = [rows.rows().tobytes() for rows in (*gaps.values(), events)]
+    found = _checksums(file, tables)
+    if found.shape != stored.shape:
+        raise NotARecordingError(f"{path}: damaged: /{CHECKSUMS} of shape {stored.shape}")
+    names = [*(f"sensor {name!r}" for name in gaps), "the file"]
+    for name, own, expected in zip(names, found, stored, strict=True):
+        for column, what in ((_DESCRIPTION, "description"), (_COUNTS, "row of /committed")):
+            if own[column] != expected[column]:
+                raise NotARecordingError(
+                    f"{path}: damaged: the {what} of {name} has a wrong checksum"
+                )
+        if own[_TABLE] != expected[_TABLE]:
+            yield "events" if name == names[-1] else f"gaps of {name}"
+
+
+def result_crc32(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> int:
+    """Return the checksum of a stored result."""
+    about = [[name, _plain(attributes[name])] for name in sorted(attributes)]
+    crc32 = zlib.crc32(json.dumps(about).encode())
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        crc32 = zlib.crc32(values.tobytes(), zlib.crc32(f"{name}{values.shape}".encode(), crc32))
+    return crc32
+
+
+def _checksums(file: h5py.File, tables: list[bytes]) -> np.ndarray[Any, np.dtype[np.uint32]]:
+    committed = file["committed"]
+    names = list(committed.attrs["sensors"])
+    groups = [file["sensors"][name] for name in names]
+    described = [_described_sensor(group) for group in groups]
+    described.append(_text(file.attrs, _FILE) + json.dumps(names))
+    rows = zip(described, tables, committed[...].astype("<i8"), strict=True)
+    return np.array(
+        [[zlib.crc32(a.encode()), zlib.crc32(b), zlib.crc32(c.tobytes())] for a, b, c in rows],
+        np.uint32,
+    )
+
+
+def _described_sensor(group: h5py.Group) -> str:
+    samples = group["samples"]
+    of_group, of_samples = _text(group.attrs, _SENSOR), _text(samples.attrs, _SAMPLES)
+    return f"{of_group}{of_samples}{samples.dtype.str}"
+
+
+def _text(attributes: h5py.AttributeManager, names: tuple[str, ...]) -> str:
+    return json.dumps([[name, _plain(attributes[name])] for name in names if name in attributes])
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - any attribute
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    return value
+
+
+def make_checksums(file: h5py.File, n_sensors: int) -> None:
+    """Make ``/checksums`` of a new recording."""
+    file.create_dataset(CHECKSUMS, data=np.zeros((n_sensors + 1, 3), "<u4"))
+    file[CHECKSUMS].attrs["columns"] = ["description", "gaps or events", "committed"]

@@ -1,0 +1,1 @@
+"""How a recording lies on the disk: superblock, locks, and how its file is opened."""

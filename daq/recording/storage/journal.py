@@ -1,0 +1,303 @@
+"""The journal beside a growing recording, from which the recording can be built again.
+
+Theory of operation
+-------------------
+HDF5 rewrites its metadata in place: object headers, chunk indexes, the last chunk of a table. A
+power cut can leave such a block half old and half new; its checksum is then wrong, and HDF5 refuses
+the whole file. The stored chunks of samples, however, are written once and never touched again.
+
+So what a commit acknowledges is also appended to ``<recording>.journal``: where each new chunk lies
+in the recording, the new rows of the tables, and how many rows are safe. The journal begins with
+the recording as it was created. From it, and from the chunks in the damaged file,
+:func:`rebuild` makes the recording again. A clean close removes the journal.
+
+A journal is a line, ``huddle-journal 1``, and frames: length and CRC-32 of a payload, and the
+payload, deflated. It is only appended to and fsynced after each frame; reading ends at the first
+frame that is not whole.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from daq.recording import file_format
+from daq.recording.storage.retries import repeated
+from daq.recording.storage.superblock import Superblock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+_MAGIC = b"huddle-journal 1\n"
+_FRAME = struct.Struct("<II")
+_MAX_FRAME = 1 << 30
+_WINDOW = 1 << 20
+"""Bytes before the end of a recording, as it was, in which HDF5 may still place a chunk."""
+CHUNKED = ("samples", "instants")
+TABLES = ("blocks", "gaps")
+
+
+def journal_path(recording: Path) -> Path:
+    """Return where the journal of a recording is."""
+    return recording.with_name(f"{recording.name}.journal")
+
+
+class Journal:
+    """Appends to the journal of a recording that is being written.
+
+    Parameters
+    ----------
+    path : Path
+        Of the recording, which has been created and flushed.
+    file : h5py.File
+        The recording.
+    mode : int
+        Permissions.
+    """
+
+    def __init__(self, path: Path, file: h5py.File, mode: int) -> None:
+        self.path = journal_path(path)
+        self._source = file.id.get_vfd_handle()
+        self._searched = os.fstat(self._source).st_size
+        self._n_chunks: dict[h5py.Dataset, int] = {}
+        # A journal that is there already belongs to a recording that is not there any more.
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+        self._handle = os.open(self.path, flags, mode)
+        try:
+            os.write(self._handle, _MAGIC)
+            self._append(os.pread(self._source, self._searched, 0))
+        except BaseException:
+            self.remove()
+            raise
+
+    def commit(
+        self,
+        chunked: Mapping[str, Sequence[h5py.Dataset]],
+        tables: Mapping[str, Sequence[bytes]],
+        counts: np.ndarray[Any, np.dtype[np.int64]],
+    ) -> None:
+        """Append what is safe in the recording since the last commit, and fsync.
+
+        Parameters
+        ----------
+        chunked : mapping
+            By sensor: its datasets `CHUNKED`.
+        tables : mapping
+            By sensor: its new rows of `TABLES`; by ``""``: the new rows of the events.
+        counts : int64, shape (n_sensors + 1, 3)
+            The new ``/committed``.
+        """
+        stored: dict[str, list[list[list[int]]]] = {}
+        contents: list[bytes] = []
+        new = [
+            (sensor, kind, chunk)
+            for sensor, datasets in chunked.items()
+            for kind, dataset in enumerate(datasets)
+            for chunk in self._new_chunks(dataset)
+        ]
+        window = _Window(self._source, self._searched) if new else None
+        for sensor, kind, (mask, content) in new:
+            offset = window.find(content) if window is not None else -1
+            if offset < 0:  # nowhere near the end: kept here
+                contents.append(content)
+            entry = stored.setdefault(sensor, [[] for _ in CHUNKED])
+            entry[kind].append([offset, len(content), mask])
+        if window is not None:
+            self._searched = window.end
+        lengths = {name: [len(rows) for rows in all_rows] for name, all_rows in tables.items()}
+        head = json.dumps({"counts": counts.tolist(), "stored": stored, "tables": lengths})
+        rows = [rows for all_rows in tables.values() for rows in all_rows]
+        self._append(b"\n".join([head.encode(), b"".join([*contents, *rows])]))
+
+    def _new_chunks(self, dataset: h5py.Dataset) -> Iterator[tuple[int, bytes]]:
+        """Yield filter mask and bytes of the chunks stored since the last call."""
+        length = dataset.chunks[0]
+        corner = (0,) * (dataset.ndim - 1)
+        first = self._n_chunks.get(dataset, 0)
+        n_chunks = -(-dataset.shape[0] // length)
+        for number in range(first, n_chunks):
+            mask, content = dataset.id.read_direct_chunk((number * length, *corner))
+            yield int(mask), bytes(content)
+        self._n_chunks[dataset] = n_chunks
+
+    def _append(self, payload: bytes) -> None:
+        packed = zlib.compress(payload, 1)
+        frame = _FRAME.pack(len(packed), zlib.crc32(packed)) + packed
+        end = os.fstat(self._handle).st_size
+        repeated(lambda: self._write_at_end(end, frame))
+        os.fsync(self._handle)
+
+    def _write_at_end(self, end: int, frame: bytes) -> None:
+        os.ftruncate(self._handle, end)  # of what a failed write has left
+        while frame:
+            frame = frame[os.write(self._handle, frame) :]
+
+    def close(self) -> None:
+        """Close the journal and leave it where it is; may be called again."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+    def remove(self) -> None:
+        """Remove the journal: the recording is closed and safe."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+class _Window:
+    """The end of a recording, where new chunks lie."""
+
+    def __init__(self, handle: int, searched: int) -> None:
+        self.end = os.fstat(handle).st_size
+        self._first = max(0, searched - _WINDOW)
+        self._content = os.pread(handle, self.end - self._first, self._first)
+        self._next = 0
+
+    def find(self, content: bytes) -> int:
+        """Return where in the recording these bytes are, or -1."""
+        at = self._content.find(content, self._next)
+        if at < 0:
+            at = self._content.find(content)
+        if at < 0:
+            return -1
+        self._next = at + len(content)
+        return self._first + at
+
+
+@dataclass(slots=True)
+class JournalContents:
+    """What a journal holds.
+
+    Attributes
+    ----------
+    created : bytes
+        The recording as it was created, as a closed file.
+    counts : int64, shape (n_sensors + 1, 3)
+        The last ``/committed``.
+    chunks : dict
+        By (sensor, dataset): offset, size, filter mask, and bytes where the offset is negative.
+    tables : dict
+        By (sensor, dataset), or ("", "events"): all rows.
+    """
+
+    created: bytes
+    counts: np.ndarray[Any, np.dtype[np.int64]] | None = None
+    chunks: dict[tuple[str, str], list[tuple[int, int, int, bytes]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    tables: dict[tuple[str, str], bytearray] = field(default_factory=lambda: defaultdict(bytearray))
+
+
+def read_journal(recording: Path) -> JournalContents | None:
+    """Return what the journal of a recording holds; None if there is none that is usable."""
+    found: JournalContents | None = None
+    for payload in _frames(journal_path(recording)):
+        if found is None:
+            found = JournalContents(Superblock(payload, len(payload)).cleared_file())
+        else:
+            _add(found, payload)
+    return found
+
+
+def _frames(path: Path) -> Iterator[bytes]:
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                return
+            while len(head := file.read(_FRAME.size)) == _FRAME.size:
+                length, crc32 = _FRAME.unpack(head)
+                packed = file.read(min(length, _MAX_FRAME))
+                if len(packed) < length or zlib.crc32(packed) != crc32:
+                    return
+                yield zlib.decompress(packed)
+    except (FileNotFoundError, zlib.error):
+        return
+
+
+def _add(found: JournalContents, payload: bytes) -> None:
+    head, _, rest = payload.partition(b"\n")
+    described = json.loads(head)
+    found.counts = np.array(described["counts"], np.int64)
+    at = 0
+    for sensor, kinds in described["stored"].items():
+        for name, chunks in zip(CHUNKED, kinds, strict=True):
+            for offset, size, mask in chunks:
+                kept = b"" if offset >= 0 else rest[at : at + size]
+                at += len(kept)
+                found.chunks[sensor, name].append((offset, size, mask, kept))
+    for sensor, lengths in described["tables"].items():
+        names = TABLES if sensor else ("events",)
+        for name, length in zip(names, lengths, strict=True):
+            found.tables[sensor, name] += rest[at : at + length]
+            at += length
+
+
+def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
+    """Write a recording anew from its journal and from the chunks in the damaged file.
+
+    Parameters
+    ----------
+    damaged : Path
+        The recording as it is; not changed.
+    contents : JournalContents
+    copy : Path
+        File to write.
+    """
+    copy.write_bytes(contents.created)
+    counts = contents.counts
+    with (
+        h5py.File(copy, "r+", libver=file_format.LIBVER, locking=False) as file,
+        damaged.open("rb") as source,
+    ):
+        names = list(file["committed"].attrs["sensors"])
+        if counts is None:
+            return
+        for name, row in zip(names, counts, strict=False):
+            group = file["sensors"][name]
+            n_rows = int(row[file_format.ROWS])
+            for kind in CHUNKED:
+                stored = contents.chunks.get((name, kind), [])
+                _put_chunks(group[kind], stored, n_rows, source)
+            for kind, n in zip(TABLES, row[[file_format.BLOCKS, file_format.GAPS]], strict=True):
+                _put_rows(group[kind], contents.tables.get((name, kind), b""), int(n))
+        events = contents.tables.get(("", "events"), b"")
+        _put_rows(file["events"], events, int(counts[-1, file_format.EVENTS]))
+        file["committed"][...] = counts
+
+
+def _put_chunks(
+    dataset: h5py.Dataset,
+    stored: Sequence[tuple[int, int, int, bytes]],
+    n_rows: int,
+    source: Any,  # noqa: ANN401 - a binary file
+) -> None:
+    length = dataset.chunks[0]
+    corner = (0,) * (dataset.ndim - 1)
+    if not stored:
+        return
+    dataset.resize(min(len(stored) * length, -(-n_rows // length) * length), axis=0)
+    for number, (offset, size, mask, kept) in enumerate(stored):
+        if number * length >= n_rows:
+            break
+        content = kept
+        if offset >= 0:
+            source.seek(offset)
+            content = source.read(size)
+        dataset.id.write_direct_chunk((number * length, *corner), content, mask)
+    dataset.resize(min(n_rows, dataset.shape[0]), axis=0)
+
+
+def _put_rows(dataset: h5py.Dataset, content: bytes | bytearray, n_rows: int) -> None:
+    rows = np.frombuffer(bytes(content), dataset.dtype)[:n_rows]
+    dataset.resize(len(rows), axis=0)
+    if len(rows):
+        dataset[...] = rows

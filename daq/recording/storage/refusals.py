@@ -1,0 +1,142 @@
+"""Refuses what a recording never holds: links, external storage, objects, impossible lengths.
+
+A file from elsewhere must not make its reader follow a link, open another file, load a filter, or
+allocate more than the file can fill.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from daq.errors import NotARecordingError, RecordingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+MAX_CHUNK = 1 << 28
+"""Bytes of a chunk."""
+_MAX_INFLATION = 1100
+"""No deflated byte becomes more bytes: 1032, and some for what surrounds them."""
+_FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}
+_DAMAGE = (AttributeError, IndexError, KeyError, MemoryError, OSError, RuntimeError, TypeError)
+
+
+@contextlib.contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Convert whatever h5py raises on a damaged file to NotARecordingError."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except (*_DAMAGE, ValueError, OverflowError) as error:
+        reason = str(error) or type(error).__name__
+        raise NotARecordingError(f"{path}: the recording is damaged: {reason}") from error
+
+
+def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyped
+    """Return a group or dataset that lies in the file itself."""
+    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
+    if "/" in name or name in {"", ".", ".."}:
+        raise NotARecordingError(f"{where}: not a name")
+    link = group.get(name, getlink=True)
+    if link is None:
+        raise KeyError(f"{group.name.rstrip('/')}/{name} is missing")
+    if not isinstance(link, h5py.HardLink):
+        raise NotARecordingError(f"{where}: a link; a recording has none, and it is not followed")
+    return group[name]
+
+
+def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) -> h5py.Dataset:
+    """Return a dataset of numbers that lie in the file itself.
+
+    Raises
+    ------
+    NotARecordingError
+        If it is a link, stored elsewhere, filtered otherwise than a recording is, of another type
+        than expected, or longer than the file could hold.
+    """
+    found = member(group, name)
+    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
+    if not isinstance(found, h5py.Dataset):
+        raise NotARecordingError(f"{where}: not a dataset")
+    created = found.id.get_create_plist()
+    if created.get_external_count() or found.is_virtual:
+        raise NotARecordingError(f"{where}: stored in other files; they are not opened")
+    filters = {created.get_filter(number)[0] for number in range(created.get_nfilters())}
+    if not filters <= _FILTERS:
+        raise NotARecordingError(f"{where}: filters {sorted(filters)}; expected gzip")
+    found_type = found.dtype
+    kinds = {found_type[n].kind for n in found_type.names} if found_type.names else found_type.kind
+    if found_type.hasobject or not set(kinds) <= set("iufS"):
+        raise NotARecordingError(f"{where}: of type {found_type}; expected numbers")
+    if dtype is not None and found_type != dtype:
+        raise NotARecordingError(f"{where}: of type {found_type}; expected {dtype}")
+    if found.chunks and np.prod(found.chunks, dtype=float) * found_type.itemsize > MAX_CHUNK:
+        raise NotARecordingError(f"{where}: chunks of shape {found.chunks}; expected smaller ones")
+    check_length(found)
+    return found
+
+
+def check_length(found: h5py.Dataset) -> None:
+    """Refuse a dataset that is longer than its file could hold.
+
+    Raises
+    ------
+    NotARecordingError
+        If it is.
+    """
+    n_bytes = float(np.prod(found.shape, dtype=float)) * found.dtype.itemsize
+    held = _n_bytes(found.file)
+    room = held * (_MAX_INFLATION if found.compression else 1)
+    if found.chunks:
+        room += float(np.prod(found.chunks, dtype=float)) * found.dtype.itemsize
+    if n_bytes > room:
+        raise NotARecordingError(
+            f"{found.file.filename}: {found.name}: {found.shape[0]} rows, more than a file of"
+            f" {held} bytes can hold"
+        )
+
+
+def _n_bytes(file: h5py.File) -> int:
+    if file.driver == "fileobj":
+        return int(file.id.get_filesize())
+    return os.fstat(file.id.get_vfd_handle()).st_size  # of a growing file, the present one
+
+
+def check_counts(counts: np.ndarray[Any, np.dtype[Any]], n_sensors: int) -> None:
+    """Refuse numbers of ``/committed`` that cannot be.
+
+    Raises
+    ------
+    ValueError
+        Saying what was expected.
+    """
+    if counts.shape != (n_sensors + 1, 3) or counts.dtype != np.int64:
+        raise ValueError(
+            f"/committed is {counts.dtype} of shape {counts.shape}; expected int64 of shape"
+            f" {(n_sensors + 1, 3)}"
+        )
+    if counts.min() < 0:
+        raise ValueError(f"/committed counts {counts.min()} rows; expected none below 0")
+
+
+def text(attributes: h5py.AttributeManager, name: str) -> str:
+    """Return an attribute that is a text."""
+    found = attributes[name]
+    if not isinstance(found, str):
+        raise TypeError(f"attribute {name} is {type(found).__name__}; expected a text")
+    return found
+
+
+def number(attributes: h5py.AttributeManager, name: str) -> float:
+    """Return an attribute that is one finite number."""
+    found = attributes[name]
+    if not isinstance(found, (float, int, np.floating, np.integer)) or not np.isfinite(found):
+        raise TypeError(f"attribute {name} is {found!r}; expected a number")
+    return found  # type: ignore[return-value]  # integers stay exact

@@ -1,0 +1,250 @@
+"""Noise of every channel as parameters: terms, Allan deviation, quantisation, data sheet."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.units import canonical, conversion
+from daq.results.band_summary import band_of, correlation_of, judged_method
+from estimator.errors import InsufficientDataError
+from estimator.noise_parameters.allan import AllanDeviation, allan_deviation
+from estimator.noise_parameters.fit import NoiseParameters, fit
+from estimator.self_noise.band_means import band_edges, band_means
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench, DataSheet
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from estimator.types import FloatArray
+
+MOSTLY = 0.5
+"""Share of the noise from which on it is said that most of it is quantisation."""
+THIRD = 2 ** (1 / 6)
+"""Half a third of an octave: a density is the mean over so much to either side."""
+
+
+class Quantity(enum.StrEnum):
+    """What a data sheet states."""
+
+    NOISE_DENSITY = "noise-density"
+    """In unit/√Hz, at a frequency."""
+    INTEGRATED_NOISE = "integrated-noise"
+    """In unit rms, in a band."""
+    DYNAMIC_RANGE = "dynamic-range"
+    """In dB, of a sine of full scale above the noise in a band."""
+
+
+class Outcome(enum.StrEnum):
+    """A measured value beside the data sheet's."""
+
+    MEETS = "meets"
+    """The whole interval is as good as stated, or better."""
+    FALLS_SHORT = "falls-short"
+    """The whole interval is worse than stated."""
+    NOT_DECIDED = "not-decided"
+    """The interval holds the stated value."""
+    UNKNOWN = "unknown"
+    """There is no estimate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One value of a data sheet.
+
+    Attributes
+    ----------
+    quantity : Quantity
+    low_hz, high_hz : float
+        Band in which it was measured.
+    unit : str
+        Of the values.
+    stated, measured, low, high : float
+        Of the data sheet, of the estimate, and its 95 % interval.
+    outcome : Outcome
+    """
+
+    quantity: Quantity
+    low_hz: float
+    high_hz: float
+    unit: str
+    stated: float
+    measured: float
+    low: float
+    high: float
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelNoise:
+    """The noise of one channel as parameters.
+
+    Attributes
+    ----------
+    label : ChannelLabel
+    parameters : NoiseParameters or None
+        None where there are too few frequencies with an estimate; `refused` says why.
+    allan : AllanDeviation or None
+    refused : str
+    quantisation_psd : float
+        Mean over the band, in unit**2/Hz; NaN where samples are not whole numbers.
+    quantisation_share : float
+        Of the mean noise in the band; NaN where either is not known.
+    comparisons : tuple of Comparison
+        With the data sheet in the bench file.
+    """
+
+    label: ChannelLabel
+    parameters: NoiseParameters | None
+    allan: AllanDeviation | None
+    refused: str
+    quantisation_psd: float
+    quantisation_share: float
+    comparisons: tuple[Comparison, ...]
+
+
+def noise_parameters(
+    snapshot: Snapshot, settings: Settings, bench: Bench | None = None
+) -> tuple[ChannelNoise, ...]:
+    """Return the noise of every channel as parameters, by the method that judges.
+
+    They are fitted to the whole usable spectrum: slopes show over decades, not in a band. None of
+    a snapshot in which that method has no result.
+    """
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None:
+        return ()
+    frequency, correlation = snapshot.frequency, correlation_of(settings)
+    band = band_of(replace(settings, band=None), snapshot)
+    shares = quantisation_shares(snapshot, settings)
+    found = []
+    for column, label in enumerate(snapshot.channels):
+        psd, cov = noise.noise_psd[:, column], noise.cov[:, column]
+        parameters = allan = None
+        refused = ""
+        try:
+            parameters = fit(frequency, psd, cov, correlation, band=band)
+            allan = allan_deviation(frequency, psd, cov, correlation, parameters)
+        except InsufficientDataError as error:
+            refused = str(error)
+        sheet = _data_sheet(bench, label)
+        found.append(
+            ChannelNoise(
+                label,
+                parameters,
+                allan,
+                refused,
+                *shares[column],
+                ()
+                if sheet is None
+                else tuple(_compared(sheet, label, frequency, (psd, cov), correlation)),
+            )
+        )
+    return tuple(found)
+
+
+def quantisation_shares(snapshot: Snapshot, settings: Settings) -> list[tuple[float, float]]:
+    """Return each channel's mean quantisation noise in the band, and its share of the noise."""
+    noise = snapshot.results.get(judged_method(snapshot, settings))
+    if noise is None or snapshot.quantisation_psd is None:
+        return [(math.nan, math.nan)] * len(snapshot.channels)
+    inside = slice(*band_edges(snapshot.frequency, band_of(settings, snapshot)))
+    width = np.gradient(snapshot.frequency)[inside]
+    shares = []
+    for column in range(len(snapshot.channels)):
+        step, psd = snapshot.quantisation_psd[inside, column], noise.noise_psd[inside, column]
+        known = np.isfinite(step) & np.isfinite(psd)
+        if not known.any():
+            shares.append((math.nan, math.nan))
+            continue
+        level = float(np.average(step[known], weights=width[known]))
+        whole = float(np.average(psd[known], weights=width[known]))
+        shares.append((level, level / whole if whole > 0 else math.nan))
+    return shares
+
+
+def _data_sheet(bench: Bench | None, label: ChannelLabel) -> DataSheet | None:
+    sensor = (
+        None if bench is None else next((s for s in bench.sensors if s.name == label.sensor), None)
+    )
+    sheet = None if sensor is None else sensor.data_sheet
+    if sensor is None or sheet is None or (sheet.channels and label.channel not in sheet.channels):
+        return None
+    if sheet.unit is not None:
+        return sheet
+    unit = next((c.unit for c in sensor.channels if c.name == label.channel), label.unit)
+    return sheet.model_copy(update={"unit": unit})
+
+
+def _compared(
+    sheet: DataSheet,
+    label: ChannelLabel,
+    frequency: FloatArray,
+    estimate: tuple[FloatArray, FloatArray],
+    correlation: FloatArray,
+) -> list[Comparison]:
+    unit = canonical(sheet.unit or label.unit)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        psd = estimate[0] * np.abs(conversion(label.unit, unit, frequency)) ** 2
+
+    def mean(low: float, high: float) -> tuple[float, float, float]:
+        edges = np.searchsorted(frequency, (low, high), side="left")
+        edges = np.array([edges[0], max(edges[1], edges[0] + 1)])
+        if low < frequency[1] / 2 or high > frequency[-1] or edges[1] >= len(frequency):
+            return math.nan, math.nan, math.nan
+        if not np.isfinite(psd[edges[0] : edges[1]]).all():
+            return math.nan, math.nan, math.nan
+        found = band_means(psd, estimate[1], edges, correlation, weights=np.gradient(frequency))
+        return float(found.mean[0]), float(found.low[0]), float(found.high[0])
+
+    rows = []
+    for at, stated in sheet.noise_density:
+        band = (at / THIRD, at * THIRD)
+        values = tuple(_root(value) for value in mean(*band))
+        rows.append(_beside(Quantity.NOISE_DENSITY, band, f"({unit})/√Hz", stated, values))
+    for low, high, stated in sheet.integrated_noise:
+        values = tuple(_root(value * (high - low)) for value in mean(low, high))
+        rows.append(_beside(Quantity.INTEGRATED_NOISE, (low, high), unit, stated, values))
+    for low, high, stated in sheet.dynamic_range:
+        rms = [_root(value * (high - low)) for value in mean(low, high)]
+        sine = (sheet.full_scale or math.nan) / math.sqrt(2)
+        middle, worst, best = (
+            20 * math.log10(sine / v) if v > 0 else math.inf if v == 0 else math.nan
+            for v in (rms[0], rms[2], rms[1])
+        )
+        rows.append(
+            _beside(Quantity.DYNAMIC_RANGE, (low, high), "dB", stated, (middle, worst, best))
+        )
+    return rows
+
+
+def _root(power: float) -> float:
+    return math.sqrt(max(power, 0.0)) if math.isfinite(power) else math.nan
+
+
+def _beside(
+    quantity: Quantity,
+    band: tuple[float, float],
+    unit: str,
+    stated: float,
+    values: tuple[float, ...],
+) -> Comparison:
+    measured, low, high = values
+    if quantity is Quantity.DYNAMIC_RANGE:
+        falls_short, meets = high < stated, low >= stated
+    else:
+        falls_short, meets = low > stated, high <= stated
+    outcome = (
+        Outcome.UNKNOWN
+        if math.isnan(measured)
+        else Outcome.FALLS_SHORT
+        if falls_short
+        else Outcome.MEETS
+        if meets
+        else Outcome.NOT_DECIDED
+    )
+    return Comparison(quantity, *band, unit, stated, measured, low, high, outcome)

@@ -1,0 +1,73 @@
+"""How well the noise is known, and how long the precision that is wanted still takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.results.band_summary import band_of, judged_method
+from estimator.self_noise.band_means import median_of_columns
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+
+
+@dataclass(frozen=True, slots=True)
+class Precision:
+    """Scatter of the noise at one frequency, beside the scatter that is wanted.
+
+    Attributes
+    ----------
+    cov : float
+        Median over the band, of the worst channel that has an estimate; NaN where there is none.
+    target : float or None
+    seconds_left : float or None
+        Until the target is reached, at the pace so far; None without a target or an estimate.
+    total : float or None
+        Length of the recording that reaches the target, in seconds.
+    """
+
+    cov: float
+    target: float | None
+    seconds_left: float | None
+    total: float | None
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether there is a target, and it is reached."""
+        return self.target is not None and self.cov <= self.target
+
+
+def precision(snapshot: Snapshot, settings: Settings) -> Precision:
+    """Return the c.o.v. of the method that judges, and when it reaches its target.
+
+    The c.o.v. falls with the root of the averages, and averages come at a steady pace.
+    """
+    known = [cov for cov in channel_covs(snapshot, settings) if math.isfinite(cov)]
+    cov, target = max(known, default=math.nan), settings.target_cov
+    left = total = None
+    if target is not None and known:
+        hop = settings.segment * (1 - settings.overlap)
+        taken = (snapshot.n_segments + snapshot.n_dropped) * hop
+        left = taken * max(0.0, (cov / target) ** 2 - 1)
+        total = snapshot.elapsed + left
+    return Precision(cov=cov, target=target, seconds_left=left, total=total)
+
+
+def channel_covs(snapshot: Snapshot, settings: Settings, method: str | None = None) -> list[float]:
+    """Return the c.o.v. of every channel at one frequency, median in the band.
+
+    By the method that judges, if none is given; NaN where there is no estimate.
+    """
+    noise = snapshot.results.get(method or judged_method(snapshot, settings))
+    if noise is None:
+        return [math.nan] * len(snapshot.channels)
+    low, high = band_of(settings, snapshot)
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    cov = noise.cov[inside]
+    medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
+    return [float(median) for median in medians]

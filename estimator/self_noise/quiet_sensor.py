@@ -1,0 +1,134 @@
+"""Noise of a quiet sensor among noisy ones, constant over a band, from its partners' residuals.
+
+Where the other sensors are far noisier than the target, single frequencies show no noise of the
+target at all, and the mean of estimates that are kept above zero is too high. Together the
+frequencies of a band show it. Sensor j, regressed on the target q,
+
+    ``X_j = B_j X_q + e_j``,   ``B_j = S_jq inv(S_qq)``,
+
+leaves residuals in which the noise of q, psi, is what sensors j and k have in common:
+
+    ``E[e_j e_k^*] = (1 - d / n) B_j psi B_k^*``
+
+but for a factor ``1 + psi / motion in q``, which is taken off at the end. B and the residuals are
+independent, so the weighted least squares of psi on the residuals of all pairs and frequencies have
+no bias once the scatter of B, ``d_j inv(S_qq) / n``, is taken off the normal matrix: also where the
+partners' motion is far below their noise. The result is a sum over many frequencies: normal, and
+negative where it comes out so.
+
+For targets far quieter than their partners only: the scatter of psi itself is not in the interval.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.self_noise.band_means import NORMAL_95
+from estimator.self_noise.coherency import check_averages
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+LEAST = 0.9
+"""Of the power: the most that an estimate can be below zero."""
+QUIETER = 0.2
+"""Share of the second-best partner's residuals that the target's noise may be, at most."""
+SMALLEST = 1e-12
+"""Of the largest eigenvalue of the normal matrix: below it nothing can be said."""
+
+
+def quiet_sensor_noise(
+    csm: ComplexArray,
+    *,
+    dims: tuple[int, ...],
+    sensor: int,
+    n_effective: FloatArray | float,
+    correlation: FloatArray,
+    quantile: float = NORMAL_95,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean noise of a sensor's channels over a band, and its interval.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix of the band in unit**2/Hz; frequencies that are not finite
+        are left out.
+    dims : tuple of int
+        Channels of each sensor. The target must have as many as the motion has dimensions.
+    sensor : int
+        The target.
+    n_effective : float64, shape (n_freqs,) or float
+        Independent averages.
+    correlation : float64, shape (n_lags,)
+        Of neighbouring frequencies, `estimator.self_noise.band_means.bin_correlation`.
+    quantile : float
+        Standard deviations to either end of the interval: 95 % unless given.
+
+    Returns
+    -------
+    noise, low, high : float64, shape (dims[sensor],)
+        Estimate and ends of its interval in unit**2/Hz; NaN where nothing can be said, or where
+        the target is not far quieter than its partners.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the averages are no more than the target's channels.
+    """
+    first = np.cumsum([0, *dims])
+    own = np.arange(first[sensor], first[sensor + 1])
+    others = [np.arange(first[j], first[j + 1]) for j in range(len(dims)) if j != sensor]
+    d = len(own)
+    unknown = np.full(d, np.nan)
+    good = np.isfinite(csm).all(axis=(1, 2)) & (np.einsum("fpp->fp", csm).real > 0).all(axis=1)
+    if len(others) < 2 or not good.any():
+        return unknown, unknown, unknown
+    n = np.broadcast_to(np.asarray(n_effective, dtype=np.float64), (len(csm),))[good]
+    check_averages(float(n.min()), d)
+    S = csm[good]
+    scale = np.sqrt(np.einsum("fpp->fp", S[:, own][:, :, own]).real.mean(axis=0))
+    motion = S[:, own[:, None], own] / np.outer(scale, scale)
+    left = n / (n - d)  # what the regression takes from the residuals
+    inverse = np.linalg.pinv(motion, hermitian=True)
+    transfer, power, seen, free = [], [], [], []
+    for other in others:
+        B = S[:, other[:, None], own] / scale @ inverse
+        total = np.einsum("fcc->fc", S[:, other[:, None], other]).real
+        taken = np.einsum("fcq,fcq->fc", B @ motion, B.conj()).real
+        rest = np.maximum(total - taken, np.finfo(np.float64).eps * total) * left[:, None]
+        B = B / np.sqrt(rest)[:, :, None]
+        transfer.append(B)
+        power.append(1 / np.sqrt(rest))
+        seen.append(B.conj().swapaxes(1, 2) @ B)
+        free.append(seen[-1] - len(other) * inverse / n[:, None, None])
+    normal, score = np.zeros((d, d)), np.zeros(d)
+    spread = np.zeros((len(S), d, d))
+    for j, k in itertools.combinations(range(len(others)), 2):
+        cross = S[:, others[j][:, None], others[k]] * power[j][:, :, None] * power[k][:, None, :]
+        rest_jk = cross - transfer[j] @ motion @ transfer[k].conj().swapaxes(1, 2)
+        rest_jk *= left[:, None, None]
+        found = np.einsum("fai,fab,fbi->fi", transfer[j].conj(), rest_jk, transfer[k]).real
+        score += found.sum(axis=0)
+        normal += (free[j] * free[k].swapaxes(1, 2)).real.sum(axis=0)
+        spread += (seen[j] * seen[k].swapaxes(1, 2)).real / (2 * (n - d))[:, None, None]
+    w = np.linalg.eigvalsh(normal)
+    if not w[0] > SMALLEST * abs(w[-1]):
+        return unknown, unknown, unknown
+    regression = np.linalg.inv(normal)
+    inflation = 1 + 2 * float(
+        sum(r * max(0.0, 1 - lag / len(S)) for lag, r in enumerate(correlation[1:], start=1))
+    )
+    covariance = regression @ spread.sum(axis=0) @ regression.T * inflation
+    noise, error = regression @ score, np.sqrt(np.diag(covariance))
+    largest = np.maximum(noise + quantile * error, 0.0)
+    share = [float((each.real.diagonal(axis1=1, axis2=2) @ largest).mean()) for each in seen]
+    if sorted(s / len(other) for s, other in zip(share, others, strict=True))[1] > QUIETER:
+        return unknown, unknown, unknown
+    # psi (1 + psi / motion) was found; the motion is what is left of the power
+    level = 1 / np.einsum("fii->fi", inverse).real.mean(axis=0)
+    ends = (np.maximum(noise + z * error, -LEAST * level) for z in (0.0, -quantile, quantile))
+    middle, low, high = (scale**2 * end * level / (level + end) for end in ends)
+    return middle, low, high

@@ -1,0 +1,268 @@
+"""A simulated SeedLink server with the stations of a bench, in protocol versions 3 and 4.
+
+What it does: ``HELLO``, ``SLPROTO``, ``STATION``, ``SELECT``, ``DATA`` with a sequence number,
+``END``, ``INFO ID``, ``CAT``, ``BYE``; a ring of packets that goes on while nobody is connected and
+keeps the last ``keep`` seconds. Each sensor is a station; a record holds 100 samples of a channel.
+Records of a channel whose name is in ``delays`` come as many records later as said there. The fault
+``reset`` restarts the server: its ring is empty, and sequence numbers begin again at 1.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.protocols.seedlink.packets import (
+    LINE_END,
+    WRAP,
+    Packet,
+    Version,
+    encode_packet,
+)
+from daq.protocols.seedlink.records import WaveRecord, encode_log, encode_record
+from sim_devices.devices.interface import NEVER, Line
+from sim_devices.devices.sampling import Samples, whole
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sim_devices.devices.interface import DeviceSpec, Source
+
+RECORD_SAMPLES = 100
+KEEP = 600.0
+"""Seconds that the ring holds."""
+HELLO = "SeedLink v3.1 (simulated) :: SLPROTO:4.0 SLPROTO:3.1"
+_CAPABILITIES = ("multistation", "window-extraction", "info:id", "info:capabilities")
+_INFO = (
+    '<?xml version="1.0"?><seedlink software="SeedLink v3.1 (simulated)" organization="huddle">'
+    + "".join(f'<capability name="{name}"/>' for name in _CAPABILITIES)
+    + "</seedlink>"
+)
+_NS = 1_000_000_000
+
+
+class Station:
+    """One station: its records in the order in which they are sent."""
+
+    def __init__(self, device: DeviceSpec, source: Source, sensor: str) -> None:
+        settings = {**device.settings, **device.sensor_settings.get(sensor, {})}
+        self.network = str(settings.get("network", "XX"))
+        self.station = str(settings["station"])
+        location = str(settings.get("location", "00"))
+        self._location = "00" if location in {"*", "??"} else location.replace("--", "")
+        names = [c.name for c in device.channels[sensor] if not c.auxiliary]
+        codes = list(settings.get("channels") or names)
+        if len(codes) == 1 and len(names) > 1:
+            codes = [codes[0].replace("?", letter) for letter in "ZNE123"[: len(names)]]
+        self.channels = codes
+        delays = settings.get("delays", {})
+        self._delays = [int(delays.get(code, 0)) for code in codes]
+        self._rate = source.sampling_rate
+        offset = -device.utc_ns % _NS / _NS
+        self._source = source.disciplined(offset)
+        self._samples = Samples(self._source, [sensor])
+        self._utc_ns = device.utc_ns
+        self._keep = float(settings.get("keep", KEEP))
+        self._turn: int | None = None
+        self.began = 0
+        """First turn that the ring holds; each channel sends a record in each turn."""
+
+    @property
+    def n_channels(self) -> int:
+        """Packets of a turn."""
+        return len(self.channels)
+
+    def turn_at(self, now: float) -> int:
+        """Return the first turn that is not complete at world time ``now``."""
+        if self._turn is None:
+            self._turn = max(0, self._samples.first_after(now) // RECORD_SAMPLES - 1)
+        while self.due(self._turn) <= now:
+            self._turn += 1
+        return self._turn
+
+    def due(self, turn: int) -> float:
+        """World time at which a turn is complete."""
+        return self._samples.time((turn + 1) * RECORD_SAMPLES - 1)
+
+    def oldest(self, now: float) -> int:
+        """Return the oldest turn in the ring."""
+        kept = math.floor(self._keep * self._rate / RECORD_SAMPLES)
+        return max(self.began, self.turn_at(now) - kept)
+
+    def start(self, sequence: int | None, now: float, version: Version) -> int:
+        """Return the index of the packet to begin with, counted from the first turn of all."""
+        current = self.turn_at(now) * self.n_channels
+        if sequence is None:
+            return current
+        index = sequence - 1 + self.began * self.n_channels
+        if version == 3:
+            ahead = (index - current + WRAP // 2) % WRAP - WRAP // 2
+            index = current + ahead
+        oldest = self.oldest(now) * self.n_channels
+        return index if oldest <= index <= current else oldest
+
+    def packet(self, index: int) -> Packet | None:
+        """Return a packet; None where a delayed channel has not begun."""
+        turn, column = divmod(index, self.n_channels)
+        record = turn - self._delays[column]
+        if record < self.began:
+            return None
+        first = record * RECORD_SAMPLES
+        counts = whole(self._samples.counts(first, RECORD_SAMPLES), -(1 << 31), (1 << 31) - 1)
+        start_ns = self._utc_ns + round(self._samples.time(first) * _NS)
+        made = WaveRecord(
+            self.network,
+            self.station,
+            self._location,
+            self.channels[column],
+            start_ns // 1000 * 1000,
+            Fraction(self._rate).limit_denominator(1000),
+            counts[:, column].astype(np.int32),
+        )
+        (payload,) = encode_record(made)
+        sequence = index - self.began * self.n_channels + 1
+        return Packet(sequence, payload, f"{self.network}_{self.station}")
+
+    def is_selected(self, index: int, selectors: Sequence[str]) -> bool:
+        """Whether a packet's channel is among the selected ones."""
+        code = self.channels[index % self.n_channels]
+        wanted = [selector.replace("_", "") for selector in selectors]
+        return not wanted or any(
+            _alike(code, one[-3:]) and _alike(self._location, one[:-3] or "*") for one in wanted
+        )
+
+
+def _alike(code: str, pattern: str) -> bool:
+    if pattern == "*":
+        return True
+    return len(code) == len(pattern) and all(
+        p in {"?", c} for c, p in zip(code, pattern, strict=True)
+    )
+
+
+class SeedLinkServer:
+    """The server; an :class:`~sim_devices.devices.interface.Endpoint`."""
+
+    def __init__(self, device: DeviceSpec, source: Source) -> None:
+        self._stations = [Station(device, source, sensor) for sensor in device.sensors]
+        self._hello = HELLO if device.settings.get("offers_version_4", True) else HELLO[:24]
+        self._forget()
+
+    def _forget(self) -> None:
+        self._received = b""
+        self._version: Version = 3
+        self._chosen: Station | None = None
+        self._selectors: dict[int, list[str]] = {}
+        self._next: dict[int, int] = {}
+        self._sends = False
+
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Wait for commands."""
+        self._forget()
+        return ()
+
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+        """Send nothing."""
+        self._forget()
+
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+        """Restart with an empty ring."""
+        if kind == "reset":
+            for station in self._stations:
+                station.began = station.turn_at(now)
+                key = id(station)
+                if key in self._next:
+                    self._next[key] = station.began * station.n_channels
+        return ()
+
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:
+        """Answer commands."""
+        self._received += received
+        *lines, self._received = self._received.replace(b"\n", b"\r").split(b"\r")
+        answers: list[bytes] = []
+        for line in lines:
+            words = line.decode("ascii", "replace").split()
+            if words:
+                answers += self._command(words[0].upper(), words[1:], now)
+        return [*answers, *self.due(now)]
+
+    def _command(self, command: str, rest: list[str], now: float) -> list[bytes]:
+        if command == "HELLO":
+            return [(self._hello + "\r\nhuddle\r\n").encode()]
+        if command == "INFO":
+            return [self._info()]
+        if command == "END":
+            self._sends = True
+            return []
+        if command == "BYE":
+            self._sends = False
+            return []
+        accepted = self._configure(command, rest, now)
+        return [(b"OK" if accepted else b"ERROR") + LINE_END]
+
+    def _configure(self, command: str, rest: list[str], now: float) -> bool:
+        if command == "SLPROTO":
+            offered = "SLPROTO:4.0" in self._hello and rest == ["4.0"]
+            self._version = 4 if offered else self._version
+            return offered
+        if command == "STATION":
+            names = rest[0].split("_") if self._version == 4 and rest else rest[::-1]
+            self._chosen = next(
+                (s for s in self._stations if [s.network, s.station] == names), None
+            )
+            return self._chosen is not None
+        if self._chosen is None:
+            return command in {"BATCH", "CAPABILITIES", "USERAGENT"}
+        key = id(self._chosen)
+        if command == "SELECT" and rest:
+            self._selectors.setdefault(key, []).append(rest[0])
+            return True
+        if command == "DATA":
+            sequence = int(rest[0], 10 if self._version == 4 else 16) if rest else None
+            self._next[key] = self._chosen.start(sequence, now, self._version)
+            return True
+        return False
+
+    def _info(self) -> bytes:
+        text = _INFO
+        if self._version == 4:
+            return encode_packet(Packet(0, text.encode()), 4)
+        return encode_packet(Packet(None, encode_log(text)), 3)
+
+    def due(self, now: float) -> Sequence[bytes]:
+        """Return the packets that are complete."""
+        sent: list[bytes] = []
+        if not self._sends:
+            return sent
+        for station in self._stations:
+            key = id(station)
+            if key not in self._next:
+                continue
+            index = max(self._next[key], station.oldest(now) * station.n_channels)
+            end = station.turn_at(now) * station.n_channels
+            while index < end:
+                packet = station.packet(index)
+                if packet is not None and station.is_selected(index, self._selectors.get(key, [])):
+                    sent.append(encode_packet(packet, self._version))
+                index += 1
+            self._next[key] = index
+        return sent
+
+    def next_due(self) -> float:
+        """World time at which the next packet is complete."""
+        if not self._sends:
+            return NEVER
+        times = (
+            station.due(self._next[id(station)] // station.n_channels)
+            for station in self._stations
+            if id(station) in self._next
+        )
+        return min(times, default=NEVER)
+
+
+def create(device: DeviceSpec, source: Source) -> list[Line]:
+    """Return the server's one line."""
+    return [Line(SeedLinkServer(device, source), "tcp", scheme="seedlink")]

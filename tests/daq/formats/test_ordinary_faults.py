@@ -1,0 +1,94 @@
+"""What people's files have wrong is named, quickly, and never taken for a fault of the program."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from daq.errors import ImportFormatError
+from daq.formats.importer import import_files
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SAMPLES = np.arange(500)
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8", "utf-8-sig"])
+def test_a_csv_is_read_in_the_encoding_it_has(tmp_path: Path, encoding: str) -> None:
+    rows = "\n".join(f"{k / 100:.2f},{k % 7}" for k in range(200))
+    source = tmp_path / "a.csv"
+    source.write_text(f"time [s],A.X [m/s²]\n{rows}\n", encoding=encoding)
+    import_files([source], tmp_path / "a.h5")
+    with Recording.open(tmp_path / "a.h5") as recording:
+        (channel,) = recording.sensors[0].channels
+    assert (channel.name, channel.unit) == ("X", "m/s²")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"a/b": SAMPLES}, "sensor name 'a/b': expected a printable name without '/'"),
+        ({"x" * 80: SAMPLES}, "expected a name of 1 to 64 bytes"),
+        ({"\x1b[31mred": SAMPLES}, r"sensor name '\\x1b\[31mred': expected a printable name"),
+        ({"A": SAMPLES, "sampling_rate": np.inf}, "positive sampling_rate"),
+        ({"A": SAMPLES, "sampling_rate": 1e300}, r"of 1e\+300 Hz; expected 1e-06 to 1e\+07 Hz"),
+        ({"A": SAMPLES, "sampling_rate": 1e-300}, "of 1e-300 Hz"),
+        ({"A": np.zeros((3, 200_000))}, "200000 channels; expected at most 1000"),
+    ],
+)
+def test_what_an_archive_has_wrong_is_named(
+    tmp_path: Path, arrays: dict[str, Any], said: str
+) -> None:
+    np.savez(tmp_path / "a.npz", **{"sampling_rate": 100.0} | arrays)
+    with pytest.raises(ImportFormatError, match=said):
+        import_files([tmp_path / "a.npz"], tmp_path / "a.h5")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.npz"]
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    content = io.BytesIO()
+    described = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(content, described)
+    return content.getvalue()
+
+
+def test_an_archive_that_says_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("A.npy", header((1 << 40,)) + bytes(1000))
+    with pytest.raises(ImportFormatError, match=r"shape \(1099511627776,\) in 1128 bytes"):
+        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+
+
+def test_an_archive_that_inflates_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    with (
+        zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("A.npy", "w") as file,
+    ):
+        file.write(header((1 << 26,)))
+        for _ in range(1 << 6):
+            file.write(bytes(1 << 23))
+    with pytest.raises(ImportFormatError, match=r"A\.npy: \d+ bytes that become 536871040"):
+        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\x00\x01\x02" * 1000, "not a text; expected a CSV file"),
+        (",".join(f"A.c{k}" for k in range(200_000)).encode(), "200000 columns; expected one a"),
+        (b"time,A.X,A.X\n0.0,1,2\n0.1,1,2\n", "several channels are named 'X'"),
+        (b"time,A.X\n", "expected rows of 2 cells"),
+        (b"", "expected a first line that names every column"),
+    ],
+)
+def test_what_a_csv_has_wrong_is_named(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "a.csv").write_bytes(content)
+    with pytest.raises(ImportFormatError, match=said):
+        import_files([tmp_path / "a.csv"], tmp_path / "a.h5")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.csv"]

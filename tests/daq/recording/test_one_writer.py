@@ -1,0 +1,120 @@
+"""A recording has one writer, keeps its name, and is safe when it says that it is closed."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+from daq.bench.model import Channel
+from daq.errors import RecordingError
+from daq.protocols.block import Block, HostTime
+from daq.recording.creation import make_datasets
+from daq.recording.file_format import SensorLayout
+from daq.recording.reader import Recording
+from daq.recording.repair import repair, verify
+from daq.recording.storage.journal import journal_path
+from daq.recording.storage.superblock import Superblock, lookup3
+from daq.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOW = HostTime(1_000_000_000, 1_790_000_000_000_000_000)
+SENSOR = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 100.0, np.dtype("i4"))
+COUNTS = np.arange(200, dtype=np.int32)[:, None]
+
+
+def create(path: Path) -> RecordingWriter:
+    return RecordingWriter.create(path, sensors=[SENSOR], created=NOW)
+
+
+def record(path: Path) -> bytes:
+    writer = create(path)
+    writer.append(Block("a", 0, COUNTS, NOW))
+    writer.close()
+    return path.read_bytes()
+
+
+def test_of_two_recorders_with_one_name_the_later_fails_and_destroys_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one records and closes after this one has found the name free."""
+    path = tmp_path / "r.h5"
+    closed: list[bytes] = []
+
+    def make_later(file: h5py.File, sensors: list[SensorLayout], chunk_seconds: float) -> None:
+        if not closed:
+            closed.append(b"")
+            closed[0] = record(path)
+        make_datasets(file, sensors, chunk_seconds)
+
+    monkeypatch.setattr("daq.recording.writer.make_datasets", make_later)
+    with pytest.raises(RecordingError, match="exists already; expected a new file"):
+        create(path)
+    assert path.read_bytes() == closed[0]
+    assert verify(path).closed
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the names of open files")
+@pytest.mark.parametrize("replaced", [True, False])
+def test_a_recording_that_loses_its_name_ends(tmp_path: Path, *, replaced: bool) -> None:
+    path = tmp_path / "folder" / "r.h5"
+    writer = create(path)
+    writer.append(Block("a", 0, COUNTS, NOW))
+    writer.commit()
+    if replaced:
+        record(tmp_path / "other.h5")
+        (tmp_path / "other.h5").replace(path)
+        said = "replaced by another file while it was recorded"
+    else:
+        path.unlink()
+        said = "removed or renamed while it was recorded"
+    with pytest.raises(RecordingError, match=said):
+        writer.commit()
+    with pytest.raises(RecordingError):
+        writer.close()
+    if replaced:
+        assert verify(path).closed
+
+
+def test_a_recording_is_its_owner_s_alone(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = create(path)
+    writer.append(Block("a", 0, COUNTS, NOW))
+    writer.commit()
+    for file in (path, journal_path(path)):
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    writer.abandon()
+    repair(path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    path.chmod(0o640)
+    assert not journal_path(path).exists()
+
+
+def test_a_file_that_says_closed_and_does_not_open_plainly_is_mended(tmp_path: Path) -> None:
+    """The power failed between the last commit and the end of the close."""
+    path = tmp_path / "r.h5"
+    record(path)
+    head = bytearray(Superblock.of(path).head)
+    head[11] = 5  # open for SWMR writing
+    head[44:48] = lookup3(bytes(head[:44])).to_bytes(4, "little")
+    with path.open("r+b") as raw:
+        raw.write(head)
+    with pytest.raises(OSError, match="already open"):
+        h5py.File(path, "r", locking=False)
+    with Recording.open(path) as recording:
+        assert recording.closed
+    assert repair(path).intact
+    with h5py.File(path, "r") as file:
+        np.testing.assert_array_equal(file["sensors/a/samples"][:], COUNTS)
+
+
+def test_a_closed_recording_leaves_no_journal(tmp_path: Path) -> None:
+    record(tmp_path / "r.h5")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]

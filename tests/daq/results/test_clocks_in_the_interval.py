@@ -1,0 +1,77 @@
+"""What clocks may have added lowers the lower end of every interval, and nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.estimation.snapshot import MOST_ADDED
+from daq.results.band_summary import channel_means
+from daq.results.clock_effect import added_in_bands
+from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
+from tui.output.formatting import level_with_error
+from tui.output.results import result_table
+from tui.studies.clocks import Latency, free_running, synthesise
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+BAND = (5.0, 15.0)
+
+
+def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> None:
+    means = [
+        channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, BAND)
+        for snapshot in (made_snapshot(clock_share=0.0), made_snapshot(clock_share=0.01))
+    ]
+    for without, with_clocks in zip(*means, strict=True):
+        assert with_clocks.mean == without.mean
+        assert with_clocks.high == without.high
+        assert without.low - with_clocks.low == pytest.approx(0.04 * without.mean)
+    snapshot = made_snapshot(clock_share=0.01)
+    edges = np.array([10, 30])
+    for column in range(9):  # the verdict's number is the same
+        band = slice(10, 30)
+        noise = snapshot.results["three-sensor"].noise_psd[band, column]
+        assert added_in_bands(snapshot, SETTINGS, edges, column) == pytest.approx(
+            MOST_ADDED * 0.01 * noise.mean()
+        )
+
+
+def test_they_add_no_more_than_the_noise_itself_and_nothing_where_unknown() -> None:
+    snapshot = made_snapshot(clock_share=3.0)
+    added = snapshot.added_by_clocks
+    assert added is not None
+    np.testing.assert_allclose(added, np.abs(snapshot.results["three-sensor"].noise_psd))
+    assert empty_snapshot().added_by_clocks is None
+    unknown = made_snapshot(clock_share=float("nan")).added_by_clocks
+    assert unknown is not None
+    assert not unknown.any()
+
+
+def test_tables_show_both_halves_where_the_lower_one_is_wider() -> None:
+    assert level_with_error(1.0, 10**0.01, 10**-0.01) == "0.00 ±0.10"
+    assert level_with_error(1.0, 10**0.01, 10**-0.03) == "0.00 +0.10 −0.30"
+    assert level_with_error(1.0, 10**0.01, -1.0) == "0.00 ±0.10"
+    table = result_table(made_snapshot(clock_share=0.05), SETTINGS)
+    assert "+" in str(next(iter(table.columns[3].cells)))
+    table = result_table(made_snapshot(clock_share=0.0001), SETTINGS)
+    assert "±" in str(next(iter(table.columns[3].cells)))
+
+
+def test_curves_of_free_running_clocks_carry_it_at_every_frequency(tmp_path: Path) -> None:
+    """By arrival times alone, 1 ms late on the mean."""
+    path = synthesise(tmp_path / "a.h5", free_running(snr=1e3), duration=120.0, latency=Latency())
+    settings = Settings(segment=2.0, clocks="arrivals", methods=("three-sensor",))
+    snapshot = estimate([path], settings)
+    noise, added = snapshot.results["three-sensor"], snapshot.added_by_clocks
+    assert added is not None
+    known = np.isfinite(noise.low) & (added > 0)
+    usual = noise.low + added  # as scatter alone has it
+    assert np.all(usual[known] <= noise.noise_psd[known] + 1e-12 * np.abs(noise.noise_psd[known]))
+    rising = added[:, 2:] / np.abs(noise.noise_psd[:, 2:])
+    assert np.nanmedian(rising[150:170]) > 10 * np.nanmedian(rising[10:20])  # as f²

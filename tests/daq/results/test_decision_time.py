@@ -1,0 +1,77 @@
+"""The time to a decision, beside many draws of what a longer recording would show."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.results.decision_time import LIKELY, Margins, predict
+
+if TYPE_CHECKING:
+    from daq.results.verdict import Prediction
+
+QUANTILE = 3.5
+
+
+def prediction(
+    margin: float, *, cov: float = 0.1, n: int = 50, clocks: float = 0.0, can_fail: bool = True
+) -> Prediction:
+    """Return the prediction for channels that are all as far from the limit."""
+    margins = Margins(np.full(n, margin), np.full(n, cov), np.full(n, clocks), np.full(n, can_fail))
+    return predict(margins, quantile=QUANTILE, elapsed=100.0, averages=100.0, least=20.0)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_half_the_margin_takes_about_four_times_as_long(sign: int) -> None:
+    near, far = prediction(0.1 * sign).seconds, prediction(0.2 * sign).seconds
+    assert near is not None
+    assert far is not None
+    assert 100 < far < near
+    assert 2.5 < near / far < 7
+
+
+def test_on_the_limit_no_time_is_promised_and_what_is_left_is_said() -> None:
+    found = prediction(0.0, n=1)
+    assert found.seconds is None or found.seconds > 3600
+    many = prediction(0.0, cov=0.5)
+    assert many.longest == 86400.0
+    assert many.resolution_db == pytest.approx(
+        10 * math.log10(math.e) * QUANTILE * 0.5 * math.sqrt(100 / 86400), rel=0.1
+    )
+
+
+def test_what_clocks_may_have_added_does_not_fail_with_time() -> None:
+    assert prediction(-0.2).seconds is not None
+    assert prediction(-0.2, clocks=0.4).seconds is None
+    assert prediction(-0.2, can_fail=False).seconds is None
+
+
+def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
+    margins = Margins(np.full(9, 5.0), np.full(9, 0.3), np.zeros(9), np.ones(9, dtype=bool))
+    found = predict(margins, quantile=QUANTILE, elapsed=10.0, averages=10.0, least=20.0)
+    assert found.seconds is not None
+    assert 20 <= found.seconds < 28
+
+
+def test_it_decides_as_often_as_it_says() -> None:
+    """Channels of different noise, each estimated with scatter, now and after the time stated."""
+    rng, cov, n = np.random.default_rng(3), 0.12, 40
+    decided = n_predicted = 0
+    for _ in range(150):
+        truth = rng.normal(0.5, 0.15, n)
+        now = truth + cov * rng.standard_normal(n)
+        margins = Margins(now, np.full(n, cov), np.zeros(n), np.ones(n, dtype=bool))
+        found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
+        if found.seconds is None:
+            continue
+        n_predicted += 1
+        share = 100.0 / found.seconds
+        later = truth + cov * np.sqrt(share / (1 - share)) * rng.standard_normal(n)
+        then = share * now + (1 - share) * later
+        reach = QUANTILE * cov * math.sqrt(share)
+        decided += bool((then > reach).all() or (then < -reach).any())
+    assert n_predicted > 50
+    assert decided / n_predicted >= LIKELY - 4 * math.sqrt(LIKELY * (1 - LIKELY) / n_predicted)

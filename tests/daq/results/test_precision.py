@@ -1,0 +1,68 @@
+"""The c.o.v. of a result, and when it reaches what is wanted: computed once for every screen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daq.results.precision import channel_covs, precision
+from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
+
+
+def test_half_the_scatter_takes_four_times_as_long() -> None:
+    snapshot = made_snapshot(n_effective=1000.0)
+    cov = precision(snapshot, SETTINGS).cov
+    found = precision(snapshot, replace(SETTINGS, target_cov=cov / 2))
+    assert not found.is_reached
+    assert found.seconds_left == pytest.approx(3 * snapshot.n_segments)  # one a second
+    assert found.total == pytest.approx(4 * snapshot.elapsed, rel=0.1)
+    assert precision(made_snapshot(n_effective=4000.0), SETTINGS).cov == pytest.approx(
+        cov / 2, rel=0.01
+    )
+
+
+def test_a_target_that_is_reached_takes_no_more_time() -> None:
+    snapshot = made_snapshot()
+    cov = precision(snapshot, SETTINGS).cov
+    found = precision(snapshot, replace(SETTINGS, target_cov=cov))
+    assert found.is_reached
+    assert found.seconds_left == 0.0
+    assert found.total == snapshot.elapsed
+
+
+def test_segments_that_were_left_out_slow_it_down() -> None:
+    snapshot = made_snapshot()
+    gappy = replace(snapshot, n_dropped=snapshot.n_segments)
+    left = [precision(each, SETTINGS).seconds_left for each in (snapshot, gappy)]
+    assert left[0] is not None
+    assert left[1] == pytest.approx(2 * left[0])
+
+
+def test_without_a_target_or_an_estimate_there_is_none() -> None:
+    free = precision(made_snapshot(), replace(SETTINGS, target_cov=None))
+    assert (free.seconds_left, free.total, free.is_reached) == (None, None, False)
+    nothing = precision(empty_snapshot(), SETTINGS)
+    assert math.isnan(nothing.cov)
+    assert nothing.seconds_left is None
+    assert not nothing.is_reached
+
+
+def test_it_is_the_median_in_the_band_of_the_worst_channel_that_has_one() -> None:
+    snapshot = made_snapshot()
+    noise = snapshot.results["three-sensor"]
+    cov = np.full_like(noise.cov, 0.1)
+    cov[:, 4], cov[:, 8] = 0.2, np.nan
+    cov[100:, 4] = 5.0  # beyond the band
+    snapshot = replace(snapshot, results={"three-sensor": replace(noise, cov=cov)})
+    assert precision(snapshot, SETTINGS).cov == pytest.approx(0.2)
+    assert math.isnan(channel_covs(snapshot, SETTINGS)[8])
+
+
+def test_a_method_that_is_only_shown_is_not_the_one_that_counts() -> None:
+    snapshot = made_snapshot()
+    compared = replace(snapshot, results={"three-channel": snapshot.results["three-channel"]})
+    assert math.isnan(precision(compared, SETTINGS).cov)
+    assert math.isfinite(precision(snapshot, SETTINGS).cov)

@@ -1,0 +1,90 @@
+"""A quiet sensor among noisy ones: its mean noise, its interval, and no false advice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.model import Channel
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.protocols.block import HostTime
+from daq.recording.array_writer import ArrayWriter
+from daq.recording.file_format import SensorLayout
+from daq.results.band_summary import channel_means, deviation_at_bound
+from estimator.diagnostics.advice import WeakMotion
+from estimator.self_noise.result import Flag
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+
+RATE = 100.0
+BAND = (5.0, 45.0)
+SETTINGS = Settings(
+    segment=2.0, clocks="nominal", methods=("maximum-likelihood",), dimension=None, band=BAND
+)
+QUIET, NOISY, MOTION = 1.0, 30.0, 15.0
+"""Standard deviations: SNR 225 in the quiet sensor, 0.25 in the noisy ones."""
+
+
+def quiet_and_noisy(path: Path) -> Snapshot:
+    """Estimate two minutes of a quiet and two noisy sensors of two channels."""
+    rng = np.random.default_rng(11)
+    n_samples = round(240 * RATE)
+    channels = tuple(Channel(name=name, sensitivity=1000.0) for name in "xy")
+    layouts = [
+        SensorLayout(name, channels, RATE, dtype=np.dtype("<i4"), clock="one") for name in "ABC"
+    ]
+    motion = MOTION * rng.standard_normal((n_samples, 2))
+    with ArrayWriter(path, sensors=layouts, created=HostTime(0, 10**18)) as writer:
+        for name, own, angle in (("A", QUIET, 0.0), ("B", NOISY, 0.4), ("C", NOISY, 1.1)):
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            samples = motion @ turn + own * rng.standard_normal((n_samples, 2))
+            counts = np.round(1000 * samples).astype(np.int32)
+            writer.samples(name, counts, first_sample=0, block_rows=1000)
+    return estimate([path], SETTINGS)
+
+
+def test_its_noise_is_within_the_interval_and_the_motion_is_not_called_weak(tmp_path: Path) -> None:
+    snapshot = quiet_and_noisy(tmp_path / "a.h5")
+    noise = snapshot.results["maximum-likelihood"]
+    inside = (snapshot.frequency > BAND[0]) & (snapshot.frequency < BAND[1])
+    at_bound = (noise.flags[inside, :2] & Flag.BOUNDARY) != 0
+    assert at_bound.mean() > 0.1  # what this is about
+    naive = np.nanmean(np.where(at_bound, np.nan, noise.noise_psd[inside, :2]))
+    truth = np.array([QUIET] * 2 + [NOISY] * 4) ** 2 * 2 / RATE
+    assert naive > 3 * truth[0]
+    means = channel_means(noise, snapshot, SETTINGS, BAND)
+    for mean, true in zip(means, truth, strict=True):
+        assert abs(mean.mean[0] - true) < 4 * mean.spread[0]
+    for mean in means[:2]:
+        assert mean.low[0] < truth[0] < mean.high[0]
+        assert mean.high[0] < naive  # at least somewhat certain
+        assert mean.low[0] < mean.mean[0] < mean.high[0]
+    assert not any(isinstance(each, WeakMotion) for each in snapshot.diagnostics.advice)
+    assert snapshot.diagnostics.diagnosis is not None
+    lost = [band.noise_lost for band in snapshot.diagnostics.diagnosis.bands if band.low > 5]
+    assert all(each[:2].any() and not each[2:].any() for each in lost)
+
+
+def test_single_frequencies_at_the_bound_count_as_zero_with_their_deviation(tmp_path: Path) -> None:
+    snapshot = quiet_and_noisy(tmp_path / "a.h5")
+    noise = snapshot.results["maximum-likelihood"]
+    column = 2  # of a noisy sensor, never at the bound
+    psd, cov = noise.noise_psd.copy(), noise.cov.copy()
+    flags, high = noise.flags.copy(), noise.high.copy()
+    usual = channel_means(noise, snapshot, SETTINGS, BAND)[column]
+    where = np.flatnonzero((snapshot.frequency > 10) & (snapshot.frequency < 11))
+    psd[where, column], cov[where, column] = 0.0, np.nan
+    flags[where, column] |= Flag.BOUNDARY
+    high[where, column] = 5.0
+    changed = replace(noise, noise_psd=psd, cov=cov, flags=flags, high=high)
+    deviation = deviation_at_bound(changed, column)
+    assert np.flatnonzero(np.isfinite(deviation)).tolist() == where.tolist()
+    found = channel_means(changed, snapshot, SETTINGS, BAND)[column]
+    share = len(where) / ((snapshot.frequency >= BAND[0]) & (snapshot.frequency <= BAND[1])).sum()
+    assert abs(found.mean[0] / usual.mean[0] - (1 - share)) < 0.01

@@ -1,0 +1,1 @@
+"""Tests of estimator.noise_parameters."""

@@ -1,0 +1,574 @@
+"""The front door: ``import huddle``, its numbers, what it refuses, and ``python -m huddle``."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import importlib.metadata
+import json
+import re
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import signal
+from typer.testing import CliRunner
+
+import huddle
+from daq.bench.estimate_settings import table_keys
+from daq.errors import WrongSettingError
+from daq.python_process import python_command
+from estimator.errors import BandError
+from tests.test_architecture import modules_after
+from tui.cli.main import app
+from tui.notebook import estimates, planning, recording, simulation
+from tui.notebook.options import EstimateOptions
+from tui.output import extras
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+FloatArray = NDArray[np.float64]
+
+ROOT = Path(__file__).parents[1]
+RATE = 100.0
+SNR = 100.0
+
+
+def triaxial(n: int = 20_000, seed: int = 5) -> dict[str, FloatArray]:
+    """Make three sensors that point anywhere and feel one motion; noise of variance 1."""
+    rng = np.random.default_rng(seed)
+    motion = np.sqrt(SNR) * rng.normal(size=(n, 3))
+    turns = {name: np.linalg.qr(rng.normal(size=(3, 3)))[0] for name in "ABC"}
+    return {name: motion @ turn + rng.normal(size=(n, 3)) for name, turn in turns.items()}
+
+
+def command(*arguments: str) -> str:
+    """Run ``huddle`` in this process; return its standard output."""
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def imported(folder: Path, sensors: dict[str, FloatArray]) -> Path:
+    """Write the samples as a recording of the command's."""
+    source, out = folder / "arrays.npz", folder / "arrays.h5"
+    np.savez(source, sampling_rate=RATE, **sensors)  # type: ignore[arg-type]  # allow_pickle is no sensor
+    command("import", str(source), "--out", str(out))
+    return out
+
+
+# ------------------------------------------------------------------------------ numbers
+
+
+@pytest.mark.parametrize(
+    ("options", "arguments"),
+    [
+        ({}, ()),
+        ({"method": "all", "segment": 2.0}, ("--method", "all", "--segment", "2")),
+        (
+            {"segment": "4s", "window": "kaiser,8", "overlap": 0.6, "reject": True},
+            ("--segment", "4s", "--window", "kaiser,8", "--overlap", "0.6", "--reject"),
+        ),
+        (
+            {"octaves": True, "segment": "1s", "detrend": "linear", "correct": False},
+            ("--octaves", "--segment", "1s", "--detrend", "linear", "--no-correction"),
+        ),
+        (
+            {"gains": {"B": 1.02}, "segment": 2},
+            ("--gain", "B=1.02", "--segment", "2"),
+        ),
+    ],
+)
+def test_arrays_give_the_numbers_of_the_command_to_the_bit(
+    tmp_path: Path, options: dict[str, Any], arguments: tuple[str, ...]
+) -> None:
+    sensors = triaxial()
+    sensors["A"][7000:7003, 1] = np.nan
+    path = imported(tmp_path, sensors)
+    printed = json.loads(command("estimate", str(path), *arguments, "--json", "-"))
+    documents = printed.get("results", [printed])
+    of_arrays = huddle.self_noise(sensors, fs=RATE, **options)
+    of_file = huddle.estimate(path, **options)
+    assert of_arrays.methods == tuple(document["method"] for document in documents)
+    for document in documents:
+        for found in (of_arrays, of_file):
+            result = found.with_method(document["method"])
+            assert result.n_segments == document["segments"]
+            assert result.effective_averages == document["effective_averages"]
+            assert result.frequency.tolist() == document["frequency_hz"]
+            for column, channel in enumerate(document["channels"]):
+                label = result.channels[column]
+                assert (label.sensor, label.channel) == (channel["sensor"], channel["channel"])
+                curves = (result.data_psd, result.noise_psd, result.noise_low, result.noise_high)
+                names = ("data_psd", "noise_psd", "noise_psd_low", "noise_psd_high")
+                for curve, name in zip((*curves, result.cov), (*names, "cov"), strict=True):
+                    expected = np.array(channel[name], dtype=np.float64)
+                    np.testing.assert_array_equal(curve[:, column], expected, strict=True)
+
+
+def test_the_three_sensor_estimate_is_the_closed_form_of_scipys_spectra() -> None:
+    sensors = triaxial()
+    result = huddle.self_noise(sensors, fs=RATE, segment="4s", correct=False)
+    columns = np.hstack(list(sensors.values()))
+    pairs = [
+        # scipy takes the conjugate of the first signal, we that of the second
+        [
+            signal.csd(columns[:, q], columns[:, p], RATE, "hann", 400, 200, detrend="constant")[1]
+            for q in range(9)
+        ]
+        for p in range(9)
+    ]
+    csm = np.moveaxis(np.array(pairs), 2, 0)[1:-1]
+    a, b, c = slice(0, 3), slice(3, 6), slice(6, 9)
+    for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
+        motion = csm[:, i, k] @ np.linalg.inv(csm[:, j, k]) @ csm[:, j, i]
+        closed = np.einsum("fcc->fc", csm[:, i, i] - motion).real
+        # The noise is 1/SNR of the spectra that are subtracted, and so are 1/SNR of the digits.
+        rounding = 1e3 * SNR * np.finfo(np.float64).eps
+        np.testing.assert_allclose(result.noise_psd[1:-1, i], closed, rtol=rounding)
+
+
+def test_samples_that_are_not_numbers_cost_the_segments_they_touch() -> None:
+    sensors = triaxial()
+    whole = huddle.self_noise(sensors, fs=RATE, segment="2s", overlap=0.5)
+    sensors["B"][5050, 2] = np.nan  # within two segments of 200 samples, 100 apart
+    sensors["C"][9999:10_001] = np.nan  # within three
+    found = huddle.self_noise(sensors, fs=RATE, segment="2s", overlap=0.5)
+    assert whole.n_segments - found.n_segments == 5
+    assert np.isfinite(found.noise_psd[1:-1]).all()
+
+
+def test_a_unit_of_the_samples_is_turned_into_that_of_the_motion() -> None:
+    sensors = triaxial()
+    velocity = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s")
+    assert velocity.unit == "mm/s"
+    motion = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s", unit="m/s²")
+    omega = 2 * np.pi * motion.frequency[:, None]
+    np.testing.assert_allclose(
+        motion.data_psd[1:], velocity.data_psd[1:] * (omega[1:] * 1e-3) ** 2, rtol=1e-12
+    )
+    assert huddle.self_noise(sensors, fs=RATE, unit="m/s²").unit == "m/s²"
+    assert huddle.self_noise(sensors, fs=RATE).unit == "counts"
+
+
+def test_data_arrays_keep_their_unit_and_times() -> None:
+    start = np.datetime64("2026-11-21T03:00:00", "ns")
+    coords = {"time": start + np.arange(20_000) * np.timedelta64(10, "ms"), "channel": list("XYZ")}
+    dataset = xr.Dataset(
+        {
+            name: xr.DataArray(
+                array, dims=("time", "channel"), coords=coords, attrs={"units": "mm/s"}
+            )
+            for name, array in triaxial().items()
+        }
+    )
+    for given in (dataset, dict(dataset.data_vars)):
+        found = huddle.self_noise(given, unit="m/s²")
+        expected = huddle.self_noise(triaxial(), fs=RATE, sample_unit="mm/s", unit="m/s²")
+        np.testing.assert_array_equal(found.noise_psd, expected.noise_psd)
+        assert found.snapshot.start_utc_ns == int(start.astype(np.int64))
+    assert huddle.self_noise(dataset, sample_unit="nm/s").unit == "nm/s"
+
+
+def test_numbers_of_numpy_are_options() -> None:
+    options: dict[str, Any] = {
+        "segment": np.int64(4),
+        "overlap": np.float32(0.25),
+        "band": np.array([1.0, 9.0]),
+    }
+    found = huddle.self_noise(triaxial(), fs=float(np.float32(RATE)), **options)
+    assert (found.settings.overlap, found.settings.band) == (0.25, (1.0, 9.0))
+
+
+def test_sensors_may_have_different_numbers_of_channels() -> None:
+    sensors = triaxial()
+    sensors["D"] = sensors.pop("C")[:, :1] + sensors["A"][:, :1]
+    sensors["E"] = triaxial()["C"]
+    result = huddle.self_noise(sensors, fs=RATE)
+    assert result.noise_psd.shape == (501, 10)
+    dataset = result.to_xarray()
+    assert dataset.sizes == {"estimate": 1, "sensor": 4, "channel": 3, "frequency": 501}
+    assert np.isnan(dataset.noise_psd.sel(sensor="D", channel="2")).all()
+    np.testing.assert_array_equal(
+        dataset.noise_psd.sel(estimate="three-sensor", sensor="D", channel="1"),
+        result["D", "1"].noise_psd,
+    )
+
+
+# ------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"method": "three_sensor"}, "method='three_sensor': .*did you mean 'three-sensor'"),
+        ({"segmnt": 10}, r"option 'segmnt': expected one of .*\(did you mean 'segment'\?\)"),
+        ({"segment": "fast"}, "segment='fast': expected a positive duration"),
+        ({"segment": 1e9}, r"segment=1e\+09 s: longer than the 200 s of samples"),
+        ({"segment": 0.01}, "segment 0.01s: expected at least 0.04s, 4 samples at 100 Hz"),
+        ({"overlap": 1}, "overlap=1: expected a fraction from 0 to less than 1"),
+        ({"window": "kaiser"}, "window='kaiser': expected the window with a parameter"),
+        ({"dimension": 2, "method": "three-sensor"}, "dimension is for the maximum-likelihood"),
+        ({"gains": {"Z": 1.0}}, "gains Z=1: expected one of A, B, C"),
+        ({"unit": "volt"}, "unit 'm/s²' cannot be turned into 'volt'"),
+    ],
+)  # fmt: skip
+def test_wrong_options_are_refused_with_what_was_expected(
+    options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        huddle.self_noise(triaxial(), fs=RATE, sample_unit="m/s²", **options)
+    assert isinstance(caught.value, huddle.HuddleError)
+
+
+def test_too_few_sensors_are_refused_by_name() -> None:
+    sensors = triaxial()
+    two = {name: sensors[name] for name in "AB"}
+    with pytest.raises(ValueError, match=r"2 sensors \(A, B\): three-sensor takes at least 3; .*"
+                       r"or method='two-channel'"):  # fmt: skip
+        huddle.self_noise(two, fs=RATE)
+    with pytest.raises(ValueError, match=r"1 sensor \(A\): two-channel takes at least 2"):
+        huddle.self_noise({"A": sensors["A"]}, fs=RATE, method="two-channel")
+    assert huddle.self_noise(two, fs=RATE, method="two-channel").methods == ("two-channel",)
+    assert huddle.self_noise(two, fs=RATE, method="all").methods == ("two-channel",)
+
+
+def test_too_few_averages_are_refused_with_the_reason() -> None:
+    sensors = {name: array[:2000] for name, array in triaxial().items()}
+    with pytest.raises(huddle.EstimatorError, match=r"2\.89286 effective averages: more than 3"):
+        huddle.self_noise(sensors, fs=RATE, segment="10s")
+
+
+def test_paths_are_refused_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(huddle.HuddleError, match="absent"):
+        huddle.estimate(tmp_path / "absent.h5")
+    with pytest.raises(huddle.HuddleError, match="expected at least one path"):
+        huddle.estimate([])
+    with pytest.raises(huddle.HuddleError, match="recordings=3: expected a path"):
+        huddle.estimate(3)  # type: ignore[arg-type]  # what is tested
+    with pytest.raises(OSError, match="absent"):
+        huddle.open(tmp_path / "absent.h5")
+
+
+# ------------------------------------------------------------------------------ results
+
+
+@pytest.fixture(scope="module")
+def result() -> huddle.Result:
+    return huddle.self_noise(triaxial(), fs=RATE, channels="XYZ", method="all", segment="4s")
+
+
+def test_a_result_shows_the_table_of_the_command(result: huddle.Result) -> None:
+    lines = repr(result).splitlines()
+    assert lines[0].startswith("Self-noise, mean over 0.25 to 45 Hz, dB re 1 (counts)²/Hz")
+    assert lines[1].split()[:4] == ["sensor", "channel", "data", "three-sensor"]
+    assert [line.split()[:2] for line in lines[2:11]] == [[s, c] for s in "ABC" for c in "XYZ"]
+    assert lines[11].startswith("99 segments")
+    assert not any(line.endswith(" ") for line in lines)
+    assert max(map(len, lines)) <= 100
+    assert all(isinstance(line, str) for line in (*result.advice, *result.remarks))
+    assert result.remarks[0] == lines[11]
+
+
+def test_a_band_has_a_mean_with_its_interval(result: huddle.Result) -> None:
+    band = result.band(1, 40)
+    truth = 1 / (RATE / 2)  # variance 1 over all frequencies
+    assert band.noise_psd.shape == (9,)
+    np.testing.assert_allclose(band.noise_db, 10 * np.log10(truth), atol=0.3)
+    assert np.all((band.noise_low < band.noise_psd) & (band.noise_psd < band.noise_high))
+    assert "mean over 1 to 40 Hz" in repr(band)
+    usual = result.band()
+    assert (usual.low_hz, usual.high_hz) == (0.25, 45.0)
+    with pytest.raises(BandError, match="no frequency between 60 and 70 Hz"):
+        result.band(60, 70)
+
+
+def test_a_channel_is_found_by_its_labels(result: huddle.Result) -> None:
+    channel = result["B", "Y"]
+    for name in ("data_psd", "noise_psd", "noise_low", "noise_high", "cov"):
+        np.testing.assert_array_equal(getattr(channel, name), getattr(result, name)[:, 4])
+    assert repr(channel) == "ChannelNoise(B Y, (counts)²/Hz, 201 frequencies from 0 to 50 Hz)"
+    with pytest.raises(KeyError, match='expected a sensor and a channel, one of: "A", "X"'):
+        result["B", "W"]
+
+
+def test_methods_can_be_changed(result: huddle.Result) -> None:
+    other = result.with_method("maximum-likelihood")
+    assert other.method == "maximum-likelihood"
+    assert set(other.methods) == set(result.methods)
+    assert not np.array_equal(other.noise_psd, result.noise_psd)
+    with pytest.raises(WrongSettingError, match="method='four-sensor': not estimated; there is"):
+        result.with_method("four-sensor")
+
+
+def test_labels_and_numbers_go_into_xarray_and_pandas(result: huddle.Result) -> None:
+    dataset = result.to_xarray()
+    assert tuple(dataset.noise_psd.dims) == ("estimate", "sensor", "channel", "frequency")
+    assert dataset.noise_psd.attrs["units"] == "(counts)²/Hz"
+    frame = result.to_frame()
+    assert len(frame) == len(result.methods) * 9 * len(result.frequency)
+    for method in result.methods:
+        expected = result.with_method(method)
+        for column, label in enumerate(result.channels):
+            chosen = {"sensor": label.sensor, "channel": label.channel}
+            rows = frame[
+                (frame.method == method)
+                & (frame.sensor == label.sensor)
+                & (frame.channel == label.channel)
+            ]
+            for name in ("noise_psd", "noise_low", "noise_high", "cov", "flags", "data_psd"):
+                curve = getattr(expected, name)[:, column]
+                np.testing.assert_array_equal(rows[name].to_numpy(), curve)
+                by_method = chosen if name == "data_psd" else {"estimate": method, **chosen}
+                np.testing.assert_array_equal(dataset[name].sel(by_method).to_numpy(), curve)
+
+
+def test_a_dataset_can_be_stored(result: huddle.Result, tmp_path: Path) -> None:
+    dataset = result.to_xarray()
+    dataset.to_netcdf(tmp_path / "noise.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "noise.nc", engine="h5netcdf") as stored:
+        np.testing.assert_array_equal(stored.noise_psd, dataset.noise_psd)
+
+
+def test_a_figure_has_an_axis_for_each_channel(result: huddle.Result, tmp_path: Path) -> None:
+    import matplotlib as mpl  # noqa: PLC0415 - only here
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    figure = result.plot()
+    try:
+        titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
+        assert titles == list("XYZ") * 3
+        assert [text.get_text() for text in figure.texts] == [f"Sensor {name}" for name in "ABC"]
+        figure.savefig(tmp_path / "noise.png")
+        assert (tmp_path / "noise.png").stat().st_size > 10_000
+    finally:
+        plt.close(figure)
+
+
+def test_a_package_that_is_missing_is_named_with_its_extra(
+    result: huddle.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("xarray", "pandas", "matplotlib.pyplot"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for call in (result.to_xarray, result.to_frame, result.plot):
+        with pytest.raises(
+            extras.MissingPackageError, match=r"is not installed; run: pip install 'huddle-bench\["
+        ):
+            call()
+
+
+# --------------------------------------------------------------- recordings, simulations, plans
+
+
+def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
+    sensors = triaxial()
+    sensors["A"][100:103] = np.nan
+    path = imported(tmp_path, sensors)
+    with huddle.open(path) as recording:
+        assert recording.sensors == ("A", "B", "C")
+        assert recording.channels("A") == ("1", "2", "3")
+        assert recording.sampling_rate("A") == RATE
+        assert recording.closed
+        for name, array in sensors.items():
+            np.testing.assert_array_equal(recording.samples(name), array)
+        assert "A: 1 2 3 at 100 Hz, 19997 samples" in repr(recording)
+        assert "1 gap" in repr(recording)
+        with pytest.raises(WrongSettingError, match="sensor='Z': expected one of A, B, C"):
+            recording.samples("Z")
+        assert [event.kind for event in recording.events] == []
+        created = recording.created
+        result = recording.estimate(start="20s", end=created.replace(minute=2))
+        same = huddle.estimate(recording, start="20s", end="2min")
+        np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
+    assert created == datetime(1970, 1, 1, tzinfo=UTC)
+    assert result.snapshot.elapsed == pytest.approx(100)
+    same = huddle.estimate([path], start=20.0, end="1970-01-01T00:02:00")
+    np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
+    with pytest.raises(WrongSettingError, match="start='soon': expected UTC as in"):
+        huddle.estimate(path, start="soon")
+
+
+def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: Path) -> None:
+    simulation = huddle.simulate("fig9", duration="4min")
+    assert simulation.fs == {"i": 200.0, "j": 200.0, "k": 200.0}
+    assert {array.shape for array in simulation.values()} == {(48_000, 2)}
+    result = huddle.self_noise(simulation, fs=simulation.fs, unit="m/s²", segment="2s")
+    band = result.band(5, 60)
+    inside = (result.frequency >= 5) & (result.frequency <= 60)
+    truth = simulation.true_noise_psd(result.frequency[inside]).mean(axis=0)
+    assert np.mean((band.noise_low < truth) & (truth < band.noise_high)) >= 5 / 6
+    simulation.write(tmp_path / "fig9.h5")
+    recording = huddle.open(tmp_path / "fig9.h5")
+    assert recording.bench is not None
+    for sensor in recording.bench.sensors:
+        half_a_count = 0.5001 / sensor.channels[0].sensitivity
+        found = recording.samples(sensor.name)
+        np.testing.assert_allclose(found, simulation[sensor.name], rtol=0, atol=half_a_count)
+    of_file = huddle.estimate(recording, segment="2s")
+    np.testing.assert_allclose(of_file.band(5, 60).noise_psd, band.noise_psd, rtol=1e-3)
+
+
+def test_a_simulation_has_a_seed_and_may_be_a_table() -> None:
+    table = {
+        "motion": {"spectra": [{"shape": "white", "level": 1e-9}]},
+        "sensors": {name: {"noise": {"shape": "white", "level": 1e-13}} for name in "ABC"},
+    }
+    first, second, again = (
+        huddle.simulate(table, duration=10, fs=50, seed=seed)["A"] for seed in (1, 2, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, second)
+    with pytest.raises(ValueError, match="'fig99' is neither a file nor a scenario; expected"):
+        huddle.simulate("fig99")
+    with pytest.raises(ValueError, match="sampling_rate"):
+        huddle.simulate(table, duration=10)
+    with pytest.raises(WrongSettingError, match="duration='long': expected a positive duration"):
+        huddle.simulate("fig9", duration="long")
+    with pytest.raises(WrongSettingError, match="fs=50: fig9 has its own; expected no fs"):
+        huddle.simulate("fig9", fs=50)
+
+
+def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
+    bench = tmp_path / "bench.toml"
+    command("init", "--out", str(bench))
+    arguments = ("--snr", "250", "--cov", "0.05")
+    printed = json.loads(command("plan", str(bench), *arguments, "--json", "-"))
+    found = huddle.plan(bench, snr=250, cov=0.05)
+    assert [entry.method for entry in found.values()] == [m["method"] for m in printed["methods"]]
+    for entry, document in zip(found.values(), printed["methods"], strict=True):
+        assert entry.duration == document["duration"]
+        assert entry.bias.tolist() == document["bias"]
+    assert repr(found).split() == command("plan", str(bench), *arguments).split()
+    aligned = huddle.plan(snr=250, fs=200, segment="10s")
+    assert max(map(abs, aligned["three-channel"].bias)) < 1e-3
+    for wrong, said in (
+        ({"fs": None}, "fs=None: expected a sampling rate"),
+        ({"fs": 200, "sensors": 0}, "sensors=0: expected a number from 1"),
+        ({"bench": bench, "fs": 200, "overlap": 0}, "fs, overlap: expected in the bench file"),
+    ):
+        with pytest.raises(WrongSettingError, match=said):
+            huddle.plan(snr=250, **wrong)
+
+
+# ------------------------------------------------------------------------------ the door itself
+
+
+@pytest.mark.parametrize("module", [huddle, estimates, planning, recording, simulation])
+def test_the_examples_in_the_documentation_run(
+    module: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = doctest.testmod(module)
+    assert found.attempted >= 3
+    assert found.failed == 0
+
+
+def test_the_front_door_loads_nothing_until_it_is_used() -> None:
+    loaded = modules_after("import huddle") - modules_after(
+        "import importlib.util, pathlib, typing"
+    )
+    assert loaded - {"__future__"} == {"huddle"}
+
+
+def test_only_what_is_asked_for_is_loaded() -> None:
+    call = "import huddle; huddle.self_noise({k: [float(ord(k)) * n % 97 for n in range(4000)]"
+    loaded = modules_after(f"{call} for k in 'ABC'}}, fs=100, segment=1)")
+    assert "numpy" in loaded
+    assert not loaded & {"xarray", "pandas", "matplotlib", "textual", "obspy", "asyncio", "serial"}
+
+
+def imports_of(path: Path) -> dict[str, str]:
+    """Return the module of each name of ours that a file imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {
+        name.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module
+        for name in node.names
+        if node.module.partition(".")[0] in {"daq", "estimator", "sim_devices", "tui"}
+    }
+
+
+def test_names_types_and_modules_of_the_front_door_agree() -> None:
+    imported = imports_of(ROOT / "huddle.py")
+    assert imported.pop("main") == "tui.cli.main"
+    assert sorted(imported) == sorted(huddle.__all__) == sorted(set(dir(huddle)) & set(imported))
+    assert imports_of(ROOT / "tui" / "resources" / "huddle.pyi") == imported
+    for name, module in imported.items():
+        assert getattr(huddle, name) is getattr(importlib.import_module(module), name)
+
+
+def test_every_option_is_typed_and_explained() -> None:
+    typed = set(EstimateOptions.__annotations__)
+    assert typed == set(table_keys())
+    text = str(huddle.estimate.__doc__)
+    explained = re.findall(r"^    (\w+) : ", text[text.index("Other Parameters") :], re.MULTILINE)
+    assert typed <= set(explained)
+
+
+def test_public_names_are_there() -> None:
+    for name in huddle.__all__:
+        assert getattr(huddle, name).__doc__
+    assert huddle.__version__ == importlib.metadata.version("huddle-bench")
+    with pytest.raises(AttributeError, match="no attribute 'selfnoise'"):
+        huddle.selfnoise  # type: ignore[attr-defined]  # noqa: B018 - what is tested
+
+
+def test_the_module_is_the_command() -> None:
+    of_module, of_command = (
+        subprocess.run([*start, "--version"], capture_output=True, text=True, check=True).stdout
+        for start in (python_command("huddle"), [Path(sys.executable).with_name("huddle")])
+    )
+    assert of_module == of_command
+    assert of_module.startswith("huddle ")
+
+
+@pytest.fixture
+def crowded(tmp_path: Path) -> Path:
+    """Make a folder with modules of the user's own; each ends the process that imports it."""
+    for name in ("random", "cronsim", "json", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('own {name}')", encoding="utf-8")
+    for name in ("tui", "daq"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"raise SystemExit('own {name}')")
+    (tmp_path / "script.py").write_text("import huddle; print(huddle.plan(snr=1e3, fs=200))")
+    return tmp_path
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder."""
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_module_runs_as_a_command_in_a_crowded_folder(crowded: Path) -> None:
+    done = run(crowded, "-m", "huddle", "--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("huddle ")
+    assert "Usage: huddle plan" in run(crowded, "-m", "huddle", "plan", "--help").stdout
+
+
+def test_packages_that_hide_ours_are_named(crowded: Path) -> None:
+    done = run(crowded, "script.py")
+    assert done.returncode == 1
+    said = done.stderr.splitlines()[-1]
+    own = crowded / "daq" / "__init__.py"
+    assert said.startswith(f"ImportError: {own}: hides the package 'daq' of huddle; expected")
+    assert "-P" in said
+
+
+def test_a_script_beside_them_runs_with_its_folder_off_the_path(crowded: Path) -> None:
+    done = run(crowded, "-P", "script.py")
+    assert done.returncode == 0, done.stderr
+    assert "three-sensor" in done.stdout

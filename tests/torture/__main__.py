@@ -1,0 +1,106 @@
+"""All of the torture: ``python -m tests.torture``, or ``make torture``.
+
+Writes the counts to docs/validation/torture.md. The numbers of cases can be multiplied, as in
+``python -m tests.torture 0.1``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.torture.crashes import disk_faults, kill_faults
+from tests.torture.damaged_files import LIMIT, contents, flips, make_recording, tally
+from tests.torture.power_cuts import MODELS, faults, recorded, shim
+
+PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
+KILLS, CUTS, DISK_ERRORS, FLIPS = 300, 100, 50, 500
+HEAD = """# Recordings under torture
+
+`make torture` records with the writer of the product, and lets the process be killed, the power be
+cut, the disk fail, or a bit of the file flip. After each crash the recording is repaired. It must
+then have every acknowledged row, with the right samples, and open in plain HDF5. A damaged file
+must be refused, have its damage named, or be read as it was. The table is the outcome of one
+complete run.
+
+| torture | cases | good | faults |
+|---|---:|---:|---|
+"""
+TAIL = """
+- *Kills*: SIGKILL after 0 to 40 commits. Half of the repairs are killed too, and repeated.
+- *Power cuts*: a preloaded library records all writes and fsyncs of the recorder. They are replayed
+  up to a random one. Of what was written after the last fsync of a file the disk then has nothing
+  (synced), everything (prefix), some whole writes, some 4 KiB pages of them, or some 512-byte
+  sectors.
+- *Disk errors*: from a random call on, once or permanently, `pwrite`, `fsync`, `write` or
+  `ftruncate` fails with ENOSPC or EIO. One `pwrite` or `write` that fails must not end the
+  recording; otherwise the recorder must end with an error message.
+- *Flipped bits*: one bit of a closed recording, in 80 % of the cases outside of the samples. A
+  reader may take ten seconds at most.
+"""
+
+
+@dataclass(slots=True)
+class Row:
+    """One row of the table."""
+
+    name: str
+    n_cases: int
+    faults: list[str] = field(default_factory=list)
+    remark: str = ""
+
+    def __str__(self) -> str:
+        """Return the row in Markdown."""
+        said = "; ".join(self.faults) or "none"
+        return (
+            f"| {self.name} | {self.n_cases} | {self.n_cases - len(self.faults)} |"
+            f" {said}{self.remark} |"
+        )
+
+
+def torture(share: float, folder: Path) -> list[Row]:
+    """Do all of it, or a share; return the rows of the table."""
+    rows = []
+
+    def add(row: Row) -> None:
+        print(row, flush=True)
+        rows.append(row)
+
+    n = max(1, round(KILLS * share))
+    add(Row("kills", n, kill_faults(folder, n, seed=1)))
+    library = shim(folder)
+    if library is None:
+        print("no C compiler, or not Linux: no power cuts and no disk errors")
+    else:
+        operations = recorded(library, folder, 30)
+        n = max(1, round(CUTS * share))
+        for seed, model in enumerate(MODELS):
+            add(Row(f"power cuts, {model}", n, faults(operations, model, n, folder, seed=seed)))
+        n = max(1, round(DISK_ERRORS * share))
+        add(Row("disk errors", n, disk_faults(library, folder, n, seed=2)))
+    n = max(1, round(FLIPS * share))
+    whole = folder / "whole.h5"
+    make_recording(whole)
+    counts = tally(list(flips(whole, n, seed=3)), contents(whole), folder, limit=LIMIT)
+    good = ("refused", "damage named", "read as it was")
+    wrong = Counter({what: count for what, count in counts.items() if what not in good})
+    remark = f" ({', '.join(f'{counts[what]} {what}' for what in good)})"
+    add(Row("flipped bits", n, list(wrong.elements()), remark))
+    return rows
+
+
+def main() -> int:
+    """Do it, and write the page if it was all of it."""
+    share = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
+    with tempfile.TemporaryDirectory(prefix="huddle-torture-") as folder:
+        rows = torture(share, Path(folder))
+    if share == 1.0:
+        PAGE.write_text(HEAD + "\n".join(map(str, rows)) + "\n" + TAIL, encoding="utf-8")
+    return 1 if any(row.faults for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

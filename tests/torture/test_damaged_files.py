@@ -1,0 +1,22 @@
+"""A part of the torture of damaged files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.torture.damaged_files import LIMIT, contents, flips, make_recording, tally
+from tests.waiting import limit
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_no_flipped_bit_is_taken_for_data_or_stops_the_reader(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.h5"
+    make_recording(whole)
+    files = list(flips(whole, 130, seed=4))
+    counts = tally(files, contents(whole), tmp_path, limit=limit(LIMIT))
+    assert counts.total() == 130
+    for fault in ("hang", "crash", "changed silently"):
+        assert counts[fault] == 0, counts
+    assert counts["damage named"] > 0

@@ -1,0 +1,77 @@
+"""A part of the torture by power cuts, and what the journal is for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.errors import RecordingError
+from daq.recording.reader import Recording
+from daq.recording.repair import repair
+from daq.recording.storage.journal import journal_path
+from tests.torture.power_cuts import MODELS, Operation, faults, recorded, replay, shim
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture(scope="module")
+def operations(tmp_path_factory: pytest.TempPathFactory) -> list[Operation]:
+    folder = tmp_path_factory.mktemp("power")
+    library = shim(folder)
+    if library is None:
+        pytest.skip("no C compiler, or not Linux")
+    return recorded(library, folder, 12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_nothing_acknowledged_is_lost(
+    operations: list[Operation], model: str, tmp_path: Path
+) -> None:
+    assert faults(operations, model, 6, tmp_path, seed=7) == []
+
+
+def test_without_its_journal_a_torn_recording_is_lost(
+    operations: list[Operation], tmp_path: Path
+) -> None:
+    """Shows that the cuts above tear recordings at all."""
+    lost = 0
+    for number in range(40):
+        disk = tmp_path / str(number)
+        disk.mkdir()
+        rng = np.random.default_rng(number)
+        n = int(rng.integers(len(operations) // 3, len(operations)))
+        replay(operations, n, "sectors", rng, disk)
+        journal_path(disk / "r.h5").unlink(missing_ok=True)
+        try:
+            repair(disk / "r.h5")
+        except RecordingError:
+            lost += 1
+    assert lost > 0
+
+
+def test_a_journal_of_another_recording_is_not_used(
+    operations: list[Operation], tmp_path: Path
+) -> None:
+    """It lies there when a recording was replaced by another file of its name."""
+    path = tmp_path / "r.h5"
+    replay(operations, len(operations) * 2 // 3, "prefix", np.random.default_rng(1), tmp_path)
+    with Recording.open(path) as recording:
+        run_id = recording.run_id
+    content = path.read_bytes()
+    path.write_bytes(content.replace(run_id.encode(), run_id[::-1].encode()))
+    journal = journal_path(path).read_bytes()
+    assert repair(path).closed
+    with Recording.open(path) as recording:
+        assert recording.run_id == run_id[::-1]
+    assert journal_path(path).read_bytes() == journal
+
+
+def test_a_torn_recording_names_its_remedy(operations: list[Operation], tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    replay(operations, len(operations) // 2, "prefix", np.random.default_rng(1), tmp_path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(RecordingError, match=f"its journal has .*: huddle repair {path}"):
+        Recording.open(path)

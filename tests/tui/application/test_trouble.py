@@ -1,0 +1,183 @@
+"""What the application shows when something is wrong, and what stray keys cannot do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.model import Limit
+from daq.drivers.bench_file import parse
+from daq.errors import HuddleError
+from estimator.diagnostics.advice import NoSharedMotion
+from estimator.diagnostics.kinds import Level
+from tests.tui.application.screen_text import screen_text
+from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
+from tests.tui.example_snapshot import (
+    SETTINGS,
+    ProgressCallback,
+    diagnosed,
+    made_now,
+    made_snapshot,
+    waiting_now,
+)
+from tui.application.app import HuddleApp
+from tui.application.messages import ErrorReported, Progress, SnapshotReady, StatusUpdated
+from tui.output.formatting import clock_time
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@dataclass
+class Refusing(ProgressCallback):
+    """Controls whose recorder does not start."""
+
+    def start(self) -> Path:
+        """Refuse."""
+        raise HuddleError(
+            "sensor A at /dev/ttyUSB0: no answer\nsensor C at /dev/ttyUSB2: no such port"
+        )
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5")
+
+
+async def test_starting_over_a_result_is_asked_first(
+    told: ProgressCallback, tmp_path: Path
+) -> None:
+    path = tmp_path / "old.h5"  # which is not there: nothing else comes
+    app = HuddleApp(told, path=path)
+    async with app.run_test(size=NARROW) as pilot:
+        await app.workers.wait_for_complete()
+        await shown(pilot, app, *running())
+        await shown(pilot, app, *ended())
+        await pilot.press("escape", "s")
+        await shown(pilot, app)
+        assert "Start a new recording? old.h5 is kept" in screen_text(app)
+        await pilot.press("s", "enter", "x", "escape")  # none of them starts
+        await pilot.press("s", "n")
+        assert told.told == []
+        await pilot.press("s", "y")
+        await app.workers.wait_for_complete()
+    assert told.told == ["start"]
+
+
+@pytest.mark.parametrize("size", [NARROW, WIDE])
+async def test_why_no_recording_started_stays_on_the_screen(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    app = HuddleApp(Refusing(tmp_path / "run.h5"))
+    async with app.run_test(size=size) as pilot:
+        await app.workers.wait_for_complete()
+        await pilot.press("s")
+        await app.workers.wait_for_complete()
+        await shown(pilot, app)
+        await pilot.press("escape", "d", "escape")
+        text = screen_text(app)
+        assert "sensor A at /dev/ttyUSB0: no answer" in text
+        assert "sensor C at /dev/ttyUSB2: no such port" in text
+        assert "connecting" not in text
+
+
+async def test_a_recorder_that_is_gone_leaves_no_sensor_live(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        assert "● live" in screen_text(app)
+        await shown(pilot, app, ErrorReported("run.h5: the recorder ended", ended=True))
+        text = screen_text(app)
+    assert "● live" not in text
+    assert text.count("■ not recorded") == 3
+
+
+async def test_states_and_progress_are_there_before_the_first_estimate(
+    told: ProgressCallback,
+) -> None:
+    """Of a recording of hours the first estimate takes a while."""
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, StatusUpdated(made_now(elapsed=7200.0)), Progress(300, 1000))
+        text = screen_text(app)
+        assert "● live" in text
+        assert "○ silent 0:12" in text
+        assert "reading what was recorded: 30%" in text
+        assert clock_time(7200.0) in text
+        await shown(pilot, app, StatusUpdated(waiting_now()))
+        assert screen_text(app).count("○ waiting") == 3
+
+
+async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown(
+    told: ProgressCallback,
+) -> None:
+    snapshot = made_snapshot()
+    three_channel = snapshot.results["three-channel"]
+    sure = replace(three_channel, cov=three_channel.cov * 1e-3)
+    snapshot = replace(snapshot, results={**snapshot.results, "three-channel": sure})
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        for _ in range(3):
+            await pilot.press("e")
+            await shown(pilot, app)
+            text = screen_text(app)
+            assert "c.o.v. 0.461 → 0.05" in text
+            assert "target reached" not in text
+        assert app.choice.methods != ("three-sensor",)
+
+
+async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressCallback) -> None:
+    snapshot = diagnosed()
+    stranger = NoSharedMotion(
+        level=Level.PROBLEM,
+        sensors=(0,),
+        band=(0.5, 100.0),
+        partners=(1, 2),
+        share=0.001,
+        share_of_partners=0.99,
+    )
+    assert snapshot.diagnostics.diagnosis is not None
+    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(stranger,))
+    diagnostics = replace(snapshot.diagnostics, diagnosis=diagnosis)
+    snapshot = replace(snapshot, diagnostics=diagnostics, closed=False)
+    live = tuple(replace(s, overdue_for=0.0, state=made_now().sensors[0].state)
+                 for s in made_now().sensors)  # fmt: skip
+    now = replace(made_now(), sensors=live)
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
+        text = screen_text(app)
+        assert "▲ A records none of the motion that B and C share: check its input" in text
+        assert text.count("no shared motion") == 3
+        await pilot.resize_terminal(*NARROW)
+        await shown(pilot, app)
+        assert "▲ A records none of the motion that B and C share" in screen_text(app)
+
+
+async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
+    told: ProgressCallback,
+) -> None:
+    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(8e-12, 8e-12))
+    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    told.bench = parse(text).model_copy(update={"limits": (limit,)})
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        snapshot = made_snapshot(n_effective=60.0)
+        await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
+        assert screen_text(app).count("NOT DECIDED") == 2  # beside the time, and with what to do
+        await pilot.resize_terminal(*NARROW)
+        await shown(pilot, app)
+        assert "recording  1:40  NOT DECIDED" in screen_text(app)
+        await pilot.resize_terminal(*WIDE)
+        snapshot = made_snapshot(n_effective=5000.0, closed=True)
+        await shown(
+            pilot, app, StatusUpdated(made_now(closed=True)), SnapshotReady(snapshot, SETTINGS)
+        )
+        text = screen_text(app)
+    assert "✗ FAIL: 1 of 9 channels above data sheet: C.Z." in text
+    assert "C.Z fails 'data sheet'" in text
+    assert "✓ A.X passes 'data sheet'" in text

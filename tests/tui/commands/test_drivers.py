@@ -1,0 +1,63 @@
+"""What the commands say about drivers: which there are, and what settings they have."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from daq.drivers.bench_file import parse
+from daq.drivers.registry import driver_names, driver_type
+from daq.errors import BenchFileError
+from tui.cli.main import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+BENCH = """
+name = "b"
+sampling_rate = 200.0
+[[sensors]]
+name = "A"
+driver = "epsom"
+port = "/dev/ttyUSB0"
+channels = [{name = "X", sensitivity = 1.0}]
+[estimate]
+method = "two-channel"
+"""
+
+
+def test_a_misspelt_driver_is_a_fault_of_the_file(tmp_path: Path) -> None:
+    with pytest.raises(BenchFileError, match=r"driver = \"epsom\": .*did you mean 'epson'\?"):
+        parse(BENCH)
+    path = tmp_path / "b.toml"
+    path.write_text(BENCH, encoding="utf-8")
+    result = CliRunner().invoke(app, ["check", str(path), "--no-devices"])
+    assert result.exit_code == 2
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("name", driver_names())
+def test_the_settings_of_every_driver_are_listed_with_what_they_mean(name: str) -> None:
+    result = CliRunner().invoke(app, ["devices", "--driver", name, "--json", "-"])
+    assert result.exit_code == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert told["summary"] == driver_type(name).summary
+    fields = driver_type(name).settings.model_fields
+    assert [one["name"] for one in told["settings"]] == list(fields)
+    for one in told["settings"]:
+        assert one["values"], one
+    shown = CliRunner().invoke(app, ["devices", "--driver", name])
+    assert all(field in shown.stdout for field in fields)
+
+
+def test_a_driver_that_is_not_installed_is_named_with_those_that_are() -> None:
+    result = CliRunner().invoke(app, ["devices", "--driver", "none"])
+    assert result.exit_code == 2
+    assert all(driver_type(name).summary[:20] in result.stderr for name in driver_names())
+
+
+def test_a_bench_file_or_a_driver() -> None:
+    assert CliRunner().invoke(app, ["devices"]).exit_code == 2

@@ -1,0 +1,220 @@
+"""Estimates from arrays and from recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
+
+from daq.errors import ArrayError, WrongSettingError
+from daq.estimation.estimation import Estimation
+from daq.estimation.settings import Settings, check_fit
+from daq.formats.arrays import recording_of_arrays
+from daq.recording.reader import Recording
+from tui.notebook.options import EstimateOptions, Time, called, moment, settings_of
+from tui.notebook.result import Result
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.recording.interface import ReadableRecording, ReadableSensor
+
+PathLike: TypeAlias = "str | os.PathLike[str]"
+_LEAST = {"two-channel": 2, "all": 2}
+"""Sensors that a method takes; three if it is not named here."""
+
+
+def self_noise(
+    sensors: Mapping[Any, Any],
+    fs: float | Mapping[str, float] | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    sample_unit: str | None = None,
+    **options: Unpack[EstimateOptions],
+) -> Result:
+    """Estimate the self-noise of every channel from samples in memory.
+
+    The numbers are those of ``huddle estimate`` on a recording of the same samples, to the bit.
+
+    Parameters
+    ----------
+    sensors : mapping of str to array, or ObsPy Stream
+        Samples of each sensor by its name: an array of shape (n_samples, n_channels) or
+        (n_samples,), of integers or floats; an xarray DataArray with the dimension ``time``; an
+        ObsPy Stream or Trace. An ObsPy Stream as a whole holds one sensor for each network, station
+        and location. Samples that are NaN or infinite are gaps: the segments that they touch are
+        left out.
+    fs : float or mapping of str to float, optional
+        Sampling rate in Hz, of all sensors or of each. Not needed where the samples have times.
+    channels : sequence of str, optional
+        Names of the channels, the same for every sensor, as in ``"XYZ"``.
+    sample_unit : str, optional
+        Unit of the samples. Where not given: that of the DataArrays, else `unit`, else counts.
+    **options
+        Options of the estimate: those of `estimate`.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    HuddleError
+        If samples or options are wrong, or do not fit together. Also a `ValueError`.
+    EstimatorError
+        If the samples are too few for any estimate. Also a `ValueError`.
+
+    Examples
+    --------
+    >>> import huddle
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(1)
+    >>> motion = rng.standard_normal((60_000, 3))
+    >>> noise = {name: 0.1 * rng.standard_normal((60_000, 3)) for name in "ABC"}
+    >>> result = huddle.self_noise(
+    ...     {name: motion + noise[name] for name in "ABC"}, fs=200, channels="XYZ", segment="2s"
+    ... )
+    >>> result.n_segments, result.frequency.shape, result.noise_psd.shape
+    (299, (201,), (201, 9))
+
+    The noise is white: its PSD is its variance over half the sampling rate, 0.1²/100 = 1e-4.
+
+    >>> result.band(10, 90).noise_db.round().tolist()
+    [-40.0, -40.0, -40.0, -40.0, -40.0, -40.0, -40.0, -40.0, -40.0]
+    >>> result["A", "X"].noise_psd.shape
+    (201,)
+    """
+    settings = settings_of(Settings(), options)
+    recording = recording_of_arrays(
+        sensors, fs, channels=channels, unit=sample_unit, usual_unit=settings.unit
+    )
+    _check_sensors(recording.sensors, settings)
+    check_fit(settings, recording.sensors, called=called)
+    return _result([recording], settings)
+
+
+def estimate(
+    recordings: PathLike | Iterable[PathLike],
+    *,
+    start: Time | None = None,
+    end: Time | None = None,
+    **options: Unpack[EstimateOptions],
+) -> Result:
+    """Estimate the self-noise of every channel from one recording or several.
+
+    Parameters
+    ----------
+    recordings : path or iterable of paths
+        Several recordings of the same sensors are estimated together.
+    start, end : str, float or datetime, optional
+        Span to estimate: UTC, as a datetime or a text such as ``2026-11-21T03:00:00``, or a time
+        after the start of the recording, in seconds or as a text such as ``2h``.
+    **options
+        Options of the estimate, below. Defaults come from the bench file in the recording.
+
+    Other Parameters
+    ----------------
+    method : str or sequence of str
+        ``"three-sensor"`` (default), ``"two-channel"``, ``"three-channel"``,
+        ``"maximum-likelihood"``, or ``"all"`` that apply.
+    segment : str or float
+        Length of a segment in seconds, or as in ``"10s"`` (default) or ``"2min"``. It sets the
+        frequency resolution.
+    overlap : float
+        Overlap between consecutive segments, as a fraction of their length (default 0.5).
+    window : str
+        Window of each segment: ``"hann"`` (default), ``"blackman"``, ``"kaiser,8"``, …
+    detrend : str
+        Trend removed from each segment: ``"none"``, ``"constant"`` (default) or ``"linear"``.
+    correct : bool
+        Whether to correct the bias of few averages (default True).
+    clocks : str
+        Time of samples: from arrival times, refined by the common motion (``"refined"``, default);
+        from arrival times alone (``"arrivals"``); from the nominal rates (``"nominal"``).
+    reject : bool
+        Whether to exclude segments with transients also. Segments with gaps are always excluded,
+        clipped ones unless this is False.
+    octaves : bool
+        Whether each octave has its own segment length: `segment` in the top octave, doubled in each
+        octave below.
+    dimension : int or str
+        Dimensions of the common motion for maximum likelihood: a number, or ``"auto"``.
+    gains : mapping of str to float
+        Response of a sensor (``{"B": 1.02}``) or a channel (``{"B.X": 1.02}``) relative to the
+        others, for the two-channel method.
+    unit : str
+        Unit of the motion, such as ``"m/s²"``; spectra are in its square per Hz.
+    band : (float, float)
+        Band of interest in Hz: of `Result.band`, and of the effect of clocks.
+    target_cov : float
+        Wanted coefficient of variation of the noise in the band.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    HuddleError
+        If a recording cannot be read, or options are wrong or do not fit it.
+    EstimatorError
+        If the recordings are too short for any estimate.
+
+    Examples
+    --------
+    >>> import huddle
+    >>> huddle.simulate("fig9", duration="2min").write("floor.h5")
+    >>> result = huddle.estimate("floor.h5", method="all", segment="4s", start="20s")
+    >>> result.methods
+    ('three-sensor', 'two-channel', 'three-channel', 'maximum-likelihood')
+    >>> result.unit
+    'm/s²'
+    """
+    if isinstance(recordings, (str, os.PathLike)):
+        recordings = [recordings]
+    if not isinstance(recordings, Iterable):
+        raise WrongSettingError(f"recordings={recordings!r}: expected a path, or several")
+    paths = [Path(path) for path in recordings]
+    if not paths:
+        raise WrongSettingError("recordings=[]: expected at least one path")
+    with Recording.open(paths[0]) as recording:
+        bench = recording.bench
+        settings = settings_of(Settings.of(bench), options)
+        check_fit(settings, recording.sensors, called=called)
+        created = recording.created
+    settings = replace(
+        settings, start=moment("start", start, created), end=moment("end", end, created)
+    )
+    with Estimation(paths, settings) as estimation:
+        return Result(estimation.finish(), settings, bench)
+
+
+def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Result:
+    with Estimation(recordings, settings) as estimation:
+        return Result(estimation.finish(), settings)
+
+
+def _check_sensors(sensors: Sequence[ReadableSensor], settings: Settings) -> None:
+    """Refuse what can give no estimate, in the words of whoever passes arrays.
+
+    Raises
+    ------
+    ArrayError
+        With the sensors, or the segment, that there are.
+    """
+    least = min(_LEAST.get(method, 3) for method in settings.methods)
+    if len(sensors) < least:
+        names = ", ".join(sensor.name for sensor in sensors)
+        way_out = ", or method='two-channel' where they are alike" if len(sensors) == 2 else ""
+        raise ArrayError(
+            f"{len(sensors)} sensor{'s' if len(sensors) > 1 else ''} ({names}):"
+            f" {settings.methods[0]} takes at least {least}; expected more sensors{way_out}"
+        )
+    longest = min(sensor.n_samples / sensor.sampling_rate for sensor in sensors)
+    if settings.segment > longest:
+        raise ArrayError(
+            f"segment={settings.segment:g} s: longer than the {longest:g} s of samples; expected"
+            " shorter segments: tens of them give an estimate"
+        )

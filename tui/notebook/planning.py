@@ -1,0 +1,262 @@
+"""The duration of recording for a target precision, by every method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+
+from daq.bench.durations import format_duration
+from daq.drivers.bench_file import load
+from daq.errors import WrongSettingError
+from daq.estimation.settings import Settings
+from estimator import planning
+from estimator.spectra.welch import WelchSettings
+from tui.notebook.options import settings_of
+from tui.notebook.text import rendered
+from tui.output.formatting import percent, signed
+from tui.simulation.devices import scenario_of
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterator
+
+    from daq.bench.model import Bench
+    from estimator.planning import Plan
+    from estimator.types import FloatArray
+
+YEAR = 365 * 86400.0  # s: nobody records for longer because the motion is weak
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MethodPlan:
+    """Needs of one method.
+
+    Attributes
+    ----------
+    method : str
+        Or "cramer-rao-bound", the bound of all unbiased methods.
+    duration : float
+        Length of the recording in seconds; NaN if the method has no estimate of a channel.
+    n_segments : float
+    bias : float64, shape (n_channels,)
+        Bias that remains at any duration, as a fraction of the noise.
+    efficiency : float64, shape (n_channels,)
+        Share of this recording that the best possible estimate would need.
+    is_motion_weak : bool
+        Whether finding the motion takes longer than the precision requires.
+    """
+
+    method: str
+    duration: float
+    n_segments: float
+    bias: FloatArray
+    efficiency: FloatArray
+    is_motion_weak: bool
+
+    @classmethod
+    def of(cls, entry: Plan) -> MethodPlan:
+        """Return the plan for the channel that needs the longest duration."""
+        return cls(
+            entry.method,
+            _worst(entry.duration),
+            _worst(entry.n_segments),
+            entry.bias[0],
+            entry.efficiency[0],
+            bool(entry.weak.any()),
+        )
+
+
+class RecordingPlan(Mapping[str, MethodPlan]):
+    """What every method needs, as `huddle.plan` returns it: a `MethodPlan` by name of the method.
+
+    Attributes
+    ----------
+    snr, cov : float
+    settings : WelchSettings
+    """
+
+    def __init__(
+        self, plans: Mapping[str, MethodPlan], *, snr: float, cov: float, settings: WelchSettings
+    ) -> None:
+        self.snr, self.cov, self.settings = snr, cov, settings
+        self._plans = dict(plans)
+
+    def __getitem__(self, method: str) -> MethodPlan:
+        return self._plans[method]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._plans)
+
+    def __len__(self) -> int:
+        return len(self._plans)
+
+    def __repr__(self) -> str:
+        return rendered([self.title, self.table(), *self.remarks])
+
+    @property
+    def title(self) -> str:
+        """What is planned."""
+        segment = self.settings.segment_length / self.settings.sampling_rate
+        return (
+            f"Duration for a c.o.v. of {self.cov:g} at each frequency in every channel; motion"
+            f" {self.snr:g} × noise; {format_duration(segment)} segments, {self.settings.window}:"
+        )
+
+    def table(self) -> Table:
+        """Return the needs of every method as a table."""
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        table.add_column("method")
+        for name in ("duration", "segments", "remaining bias", "efficiency"):
+            table.add_column(name, justify="right")
+        for entry in self.values():
+            table.add_row(entry.method, *_row(entry))
+        return table
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks below the table."""
+        plans = list(self.values())
+        lines = []
+        if any(entry.is_motion_weak for entry in plans):
+            lines.append(
+                "The motion is weak: finding it takes longer than the precision requires, and "
+                "shorter recordings cannot be predicted. The data spectra themselves exceed the "
+                f"noise by the motion, {percent(self.snr)} here."
+            )
+        if plans[0].duration < plans[-1].duration:
+            lines.append(
+                f"{plans[0].method} assumes known gains of the channels, the bound does not; so "
+                "its duration can be shorter than that of the bound."
+            )
+        return lines
+
+
+def plan_bench(path: Path, *, snr: float, cov: float) -> RecordingPlan:
+    """Return the plan of a bench file; orientations come from its simulation table."""
+    bench = load(path)
+    settings = Settings.of(bench)
+    dims = tuple(sensor.n_main_channels for sensor in bench.sensors)
+    return _planned(
+        _directions(bench), dims, settings, sampling_rate=bench.sampling_rate, snr=snr, cov=cov
+    )
+
+
+def plan(
+    bench: str | os.PathLike[str] | None = None,
+    *,
+    snr: float,
+    cov: float = 0.05,
+    fs: float | None = None,
+    sensors: int = 3,
+    channels: int = 3,
+    segment: str | float | None = None,
+    overlap: float | None = None,
+    window: str | None = None,
+) -> RecordingPlan:
+    """Compute the duration of recording for a target precision, by every method.
+
+    Parameters
+    ----------
+    bench : path, optional
+        Bench file with sensors, segments, and orientations if it has a simulation table. It
+        replaces all parameters except `snr` and `cov`.
+    snr : float
+        Motion over noise, the mean over all channels.
+    cov : float
+        Target coefficient of variation of the noise PSD of every channel, at each frequency.
+    fs : float, optional
+        Sampling rate in Hz.
+    sensors, channels : int
+        Number of sensors, and of channels of each.
+    segment, overlap, window : optional
+        As in `estimate`.
+
+    Returns
+    -------
+    RecordingPlan
+
+    Raises
+    ------
+    HuddleError
+        If the bench file or an option is wrong.
+    EstimatorError
+        If nothing can be planned: fewer than three sensors, `snr` or `cov` not above 0.
+
+    Examples
+    --------
+    >>> import huddle
+    >>> plan = huddle.plan(snr=250, cov=0.05, fs=200, segment="10s")
+    >>> round(plan["three-sensor"].duration / 60)
+    88
+    """
+    options = {"segment": segment, "overlap": overlap, "window": window}
+    if bench is not None:
+        given = [name for name, value in {"fs": fs, **options}.items() if value is not None]
+        if given:
+            raise WrongSettingError(f"{', '.join(given)}: expected in the bench file {bench}")
+        return plan_bench(Path(bench), snr=snr, cov=cov)
+    if fs is None or not 0 < fs < math.inf:
+        raise WrongSettingError(f"fs={fs!r}: expected a sampling rate in Hz, above 0")
+    for name, value in (("sensors", sensors), ("channels", channels)):
+        if value < 1:
+            raise WrongSettingError(f"{name}={value!r}: expected a number from 1")
+    directions = np.vstack([np.eye(channels)] * sensors)
+    settings = settings_of(Settings(), options)
+    dims = (channels,) * sensors
+    return _planned(directions, dims, settings, sampling_rate=fs, snr=snr, cov=cov)
+
+
+def _planned(
+    directions: FloatArray,
+    dims: tuple[int, ...],
+    settings: Settings,
+    *,
+    sampling_rate: float,
+    snr: float,
+    cov: float,
+) -> RecordingPlan:
+    welch = WelchSettings(
+        sampling_rate=sampling_rate,
+        segment_length=round(settings.segment * sampling_rate),
+        overlap=settings.overlap,
+        window=settings.window,
+    )
+    csm, noise = planning.planned_csm(directions, snr=snr)
+    found = planning.plan(csm, noise, dims=dims, settings=welch, cov=cov)
+    plans = map(MethodPlan.of, found)
+    return RecordingPlan({each.method: each for each in plans}, snr=snr, cov=cov, settings=welch)
+
+
+def _directions(bench: Bench) -> FloatArray:
+    """Return the directions of the channels: as simulated, or along common axes."""
+    if bench.simulation:
+        scenario = scenario_of(bench)
+        return np.vstack([scenario.directions(sensor.name) for sensor in bench.sensors])
+    most = max(sensor.n_main_channels for sensor in bench.sensors)
+    return np.vstack([np.eye(most)[: sensor.n_main_channels] for sensor in bench.sensors])
+
+
+def _worst(values: FloatArray) -> float:
+    return float(np.max(values)) if np.isfinite(values).all() else float("nan")
+
+
+def _row(entry: MethodPlan) -> tuple[str, str, str, str]:
+    if np.isnan(entry.duration):
+        return "no estimate", "", "", ""
+    if entry.is_motion_weak and entry.duration > YEAR:
+        return "motion too weak", "", "", ""
+    low, high = float(entry.bias.min()), float(entry.bias.max())
+    none = max(-low, high) < 1e-3
+    efficiency = float(entry.efficiency.min())
+    return (
+        format_duration(entry.duration),
+        f"{entry.n_segments:.0f}",
+        "none" if none else f"{signed(low, '+.0%')} to {signed(high, '+.0%')}",
+        f"{efficiency:.0%}" if none and np.isfinite(efficiency) else "",
+    )

@@ -1,0 +1,84 @@
+"""Results as text: what a notebook shows of them."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from estimator.errors import BandError
+from tui.output import diagnostics, results
+from tui.output.formatting import level, level_with_error
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import RenderableType
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from estimator.types import FloatArray
+
+_WIDTH = 100
+
+
+def result(snapshot: Snapshot, settings: Settings) -> str:
+    """Return the table that ``huddle estimate`` prints, and where the advice is."""
+    try:
+        parts: list[RenderableType] = [
+            results.result_title(snapshot, settings),
+            results.result_table(snapshot, settings),
+        ]
+    except BandError as error:
+        parts = [Text(f"Self-noise: {error}")]
+    parts.append(Text(remarks(snapshot)[0]))
+    if advice(snapshot):
+        parts.append(Text("advice on the test: print(*result.advice, sep='\\n')"))
+    return rendered(parts)
+
+
+def band(
+    labels: Sequence[ChannelLabel],
+    data_psd: FloatArray,
+    noise_psd: FloatArray,
+    noise_high: FloatArray,
+    *,
+    span: tuple[float, float],
+    method: str,
+) -> str:
+    """Return a table of channels with their means over a band."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("sensor")
+    table.add_column("channel")
+    table.add_column("data", justify="right")
+    table.add_column(method, justify="right")
+    for label, data, mean, high in zip(labels, data_psd, noise_psd, noise_high, strict=True):
+        cells = (label.sensor, label.channel, level(float(data)))
+        table.add_row(*map(Text, (*cells, level_with_error(float(mean), float(high)))))
+    title = (
+        f"Self-noise, mean over {span[0]:.3g} to {span[1]:.3g} Hz, dB re 1"
+        f" ({labels[0].unit})²/Hz, with its 95 % interval"
+    )
+    return rendered([Text(title), table])
+
+
+def advice(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return the diagnosis in sentences."""
+    return tuple(diagnostics.summary(snapshot))
+
+
+def remarks(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return the remarks below the table."""
+    return tuple(results.remarks(snapshot))
+
+
+def rendered(parts: Sequence[RenderableType]) -> str:
+    """Return what a terminal without colours would show."""
+    screen = Console(file=io.StringIO(), width=_WIDTH, color_system=None, markup=False, emoji=False)
+    with screen.capture() as shown:
+        for part in parts:
+            screen.print(part)
+    return "\n".join(line.rstrip() for line in shown.get().splitlines())

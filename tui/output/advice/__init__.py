@@ -1,0 +1,4 @@
+"""Advice as words: whole sentences, several pieces in one line, a few words for a screen.
+
+Chosen by the type of the advice; never parsed.
+"""

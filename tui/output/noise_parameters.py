@@ -1,0 +1,198 @@
+"""Noise parameters of every channel as tables, as sentences, and as JSON values."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.results.noise_parameters import MOSTLY, Outcome, Quantity
+from estimator.noise_parameters.fit import Term
+from tui.output.formatting import level, percent, span
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.estimation.snapshot import ChannelLabel
+    from daq.results.noise_parameters import ChannelNoise, Comparison
+    from estimator.noise_parameters.allan import AllanDeviation
+
+MISFIT = 5.0
+"""Standard errors from which on it is said that the terms do not describe the noise."""
+SEEN = 2.0
+"""Standard errors from which on a term counts as seen."""
+COLUMNS = {
+    Term.RANDOM_WALK: "random walk",
+    Term.FLICKER: "flicker",
+    Term.WHITE: "white",
+    Term.F_SQUARED: "f²",
+}
+OUTCOMES = {
+    Outcome.MEETS: "meets it",
+    Outcome.FALLS_SHORT: "falls short",
+    Outcome.NOT_DECIDED: "not decided",
+    Outcome.UNKNOWN: "no estimate",
+}
+QUANTITIES = {
+    Quantity.NOISE_DENSITY: "noise density",
+    Quantity.INTEGRATED_NOISE: "integrated noise",
+    Quantity.DYNAMIC_RANGE: "dynamic range",
+}
+MOST_TIMES = 5
+"""Averaging times in the table of Allan deviations: what a terminal is wide."""
+
+
+def term_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return header and rows: each term's PSD at 1 Hz in dB, with its standard error."""
+    header = ("channel", *COLUMNS.values(), "quantisation")
+    rows = []
+    for each in found:
+        cells = ["–"] * len(COLUMNS)
+        if each.parameters is not None:
+            pairs = zip(each.parameters.values, each.parameters.errors, strict=True)
+            cells = [_term(float(value), float(error)) for value, error in pairs]
+        quantisation = "–" if math.isnan(each.quantisation_psd) else level(each.quantisation_psd)
+        rows.append((each.label.name, *cells, quantisation))
+    return header, rows
+
+
+def _term(value: float, error: float) -> str:
+    if value > SEEN * error:
+        return f"{level(value)} ±{10 / math.log(10) * error / value:.2f}"
+    return f"< {level(max(value, 0.0) + SEEN * error)}"
+
+
+def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return header and rows: Allan deviation and its 95 % interval, by averaging time."""
+    known = [each for each in found if each.allan is not None and len(each.allan.tau)]
+    if not known or known[0].allan is None:
+        return (), []
+    tau = known[0].allan.tau
+    shown = tau[np.unique(np.linspace(0, len(tau) - 1, min(MOST_TIMES, len(tau))).astype(int))]
+    rows = []
+    for each in known:
+        times = [] if each.allan is None else each.allan.tau.tolist()
+        cells = [
+            _allan(each.allan, times.index(time)) if each.allan and time in times else "–"
+            for time in shown
+        ]
+        rows.append((each.label.name, *cells))
+    return ("channel", *(f"{time:g} s" for time in shown)), rows
+
+
+def _allan(found: AllanDeviation, at: int) -> str:
+    value, low, high = (float(each[at]) for each in (found.deviation, found.low, found.high))
+    if not low > 0:
+        return f"< {high:.2g}"
+    return f"{value:.3g} ±{percent((high - low) / 2 / value)}"
+
+
+def sheet_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return header and rows: every value of a data sheet beside the measured one."""
+    header = ("channel", "quantity", "at", "data sheet", "measured", "95 % interval", "")
+    rows: list[tuple[str, ...]] = [
+        (
+            each.label.name,
+            f"{QUANTITIES[one.quantity]}, {one.unit}",
+            _where(one),
+            f"{one.stated:.4g}",
+            _number(one.measured),
+            f"{_number(one.low)} … {_number(one.high)}",
+            OUTCOMES[one.outcome],
+        )
+        for each in found
+        for one in each.comparisons
+    ]
+    return header, rows
+
+
+def _where(one: Comparison) -> str:
+    if one.quantity is Quantity.NOISE_DENSITY:
+        return f"{math.sqrt(one.low_hz * one.high_hz):.3g} Hz"
+    return span(one.low_hz, one.high_hz)
+
+
+def _number(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.4g}"
+
+
+def notes(found: Sequence[ChannelNoise]) -> list[str]:
+    """Return what must be said beside the tables."""
+    lines = [
+        f"{each.label.name}: no noise parameters: {each.refused}"
+        for each in found
+        if each.parameters is None
+    ]
+    known = [(each.label.name, each.parameters) for each in found if each.parameters is not None]
+    misfits = [
+        f"{name} ({percent(abs(fitted.worst_ratio - 1))} "
+        f"{'above' if fitted.worst_ratio > 1 else 'below'} them at "
+        f"{span(fitted.worst_low, fitted.worst_high)})"
+        for name, fitted in known
+        if abs(fitted.worst_score) > MISFIT
+    ]
+    if misfits:
+        lines.append(f"These terms do not describe all of the noise of {', '.join(misfits)}.")
+    excluded = [f"{name} {fitted.n_lines}" for name, fitted in known if fitted.n_lines]
+    if excluded:
+        lines.append(f"Frequencies left out as lines: {', '.join(excluded)}.")
+    return lines
+
+
+def quantisation_notes(
+    channels: Sequence[ChannelLabel], shares: Sequence[tuple[float, float]]
+) -> list[str]:
+    """Return which channels' noise is mostly that of counting in whole numbers."""
+    mostly = [
+        f"{label.name} ({percent(min(share, 1.0))})"
+        for label, (_, share) in zip(channels, shares, strict=True)
+        if share > MOSTLY
+    ]
+    if not mostly:
+        return []
+    line = (
+        f"Quantisation: most of the noise of {', '.join(mostly)} comes from the size of a count. "
+        "Use a smaller range or more gain to measure the noise of the sensor."
+    )
+    return [line]
+
+
+def noise_parameters_document(found: Sequence[ChannelNoise]) -> list[dict[str, Any]]:
+    """Return the noise parameters of every channel as JSON values."""
+    return [
+        {
+            "sensor": each.label.sensor,
+            "channel": each.label.channel,
+            "unit": each.label.unit,
+            "terms": None
+            if each.parameters is None
+            else {
+                term.value: {
+                    "value": each.parameters.value(term),
+                    "error": each.parameters.error(term),
+                }
+                for term in Term
+            },
+            "covariance": None if each.parameters is None else each.parameters.covariance,
+            "fit": None
+            if each.parameters is None
+            else {
+                "low": each.parameters.low,
+                "high": each.parameters.high,
+                "n_frequencies": each.parameters.n_frequencies,
+                "n_lines": each.parameters.n_lines,
+                "chi_square": each.parameters.chi_square,
+                "worst_low": each.parameters.worst_low,
+                "worst_high": each.parameters.worst_high,
+                "worst_ratio": each.parameters.worst_ratio,
+                "worst_score": each.parameters.worst_score,
+            },
+            "refused": each.refused or None,
+            "allan_deviation": each.allan,
+            "quantisation_psd": each.quantisation_psd,
+            "quantisation_share": each.quantisation_share,
+            "data_sheet": each.comparisons,
+        }
+        for each in found
+    ]

@@ -1,0 +1,146 @@
+"""The verdict on the limits in sentences, for screens, tables and reports alike."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from daq.results.decision_time import LIKELY
+from daq.results.limits import FEWEST_AVERAGES
+from daq.results.verdict import Obstacle, Verdict
+from tui.output.exit_codes import ExitCode
+from tui.output.formatting import level, listed, roughly, several, signed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.results.verdict import LimitResult, Prediction, TestVerdict
+
+WORDS: Mapping[Verdict, str] = {
+    Verdict.PASS: "PASS",
+    Verdict.FAIL: "FAIL",
+    Verdict.NOT_DECIDED: "NOT DECIDED",
+}
+EXIT_CODES: Mapping[Verdict, ExitCode] = {
+    Verdict.PASS: ExitCode.DONE,
+    Verdict.FAIL: ExitCode.LIMIT_NOT_MET,
+    Verdict.NOT_DECIDED: ExitCode.NOT_DECIDED,
+}
+STYLES: Mapping[Verdict, str] = {
+    Verdict.PASS: "bold green",
+    Verdict.FAIL: "bold red",
+    Verdict.NOT_DECIDED: "bold yellow",
+}
+MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
+OBSTACLES: Mapping[Obstacle, str] = {
+    Obstacle.SENSORS_LOST: "All sensors were lost before the end: check power and cables, and "
+    "record again.",
+    Obstacle.NO_SEGMENTS: "There is no whole segment without a gap: record longer, or choose a "
+    "shorter segment.",
+    Obstacle.NO_ESTIMATE: "There is no noise estimate for {channels}: see the advice on what is "
+    "missing, and record again.",
+    Obstacle.OUTSIDE_SPECTRUM: "The spectrum has no frequency of {limits}: choose longer segments "
+    "or another sampling rate.",
+    Obstacle.NO_SHARED_MOTION: "A sensor records none of the motion that the others share: see the "
+    "advice, and record again.",
+    Obstacle.FAULTY_CHANNEL: "{channels}: clipped or temporarily dead, so the noise is lower "
+    "than estimated. Remove the cause and record again.",
+    Obstacle.MODEL_MISFIT: "{channels}: one common motion does not explain what the sensors have "
+    "in common, and the noise estimate may be wrong by more than the margin. Follow the advice and "
+    "record again.",
+    Obstacle.CLOCKS: "{channels}: what is above the limit may come from the clocks. Give the "
+    "sensors one clock, or record longer for their rates to be known.",
+    Obstacle.TOO_FEW_AVERAGES: "The uncertainty of fewer than {averages:g} averages is not "
+    "reliable: record longer.",
+    Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",
+}
+"""What keeps a test from a decision, and what to do."""
+
+
+def headline(found: TestVerdict) -> str:
+    """Return the verdict in a sentence or two."""
+    word = WORDS[found.verdict]
+    n_channels = len({each.name for each in found.limits})
+    names = listed(list(dict.fromkeys(each.limit for each in found.limits)) or ["the limits"])
+    undecided = _channels(found.having(Verdict.NOT_DECIDED))
+    if found.verdict is Verdict.PASS:
+        who = "the channel is" if n_channels == 1 else f"all {n_channels} channels are"
+        return f"{word}: {who} below {names}."
+    if found.verdict is Verdict.NOT_DECIDED:
+        if not undecided:
+            return f"{word}: whether the channels are below {names} cannot be said."
+        who = f"{len(undecided)} of {several(n_channels, 'channel')}"
+        return f"{word}: whether {who} are below {names} cannot be said yet."
+    failing = _channels(found.having(Verdict.FAIL))
+    text = (
+        f"{word}: {len(failing)} of {several(n_channels, 'channel')} above {names}: "
+        f"{', '.join(failing)}."
+    )
+    left = [name for name in undecided if name not in failing]
+    return text + (f" {several(len(left), 'channel')} not decided." if left else "")
+
+
+def what_to_do(found: TestVerdict) -> list[str]:
+    """Return what keeps a test from a decision, and how long to record; empty where decided."""
+    if found.verdict is not Verdict.NOT_DECIDED:
+        return []
+    lines = [_obstacle(each, found) for each in found.obstacles]
+    return lines + ([record_for(found.prediction)] if found.prediction is not None else [])
+
+
+def record_for(prediction: Prediction) -> str:
+    """Return how long to record for a decision."""
+    if prediction.seconds is not None:
+        return (
+            f"Record for {roughly(prediction.seconds)} in all: that decides with a probability of "
+            f"{LIKELY:.0%}."
+        )
+    left = ""
+    if math.isfinite(prediction.resolution_db):
+        left = f", and even {roughly(prediction.longest)} leave ±{prediction.resolution_db:.2g} dB"
+    return (
+        f"A recording of up to {roughly(prediction.longest)} is not likely to decide: the noise is "
+        f"too close to the limit{left}."
+    )
+
+
+def limit_line(result: LimitResult) -> str:
+    """Return a channel beside a limit in one line: verdict, noise, limit, margin."""
+    if not result.known:
+        return f"{result.name}: {result.limit!r} not decided, no estimate"
+    words = {
+        Verdict.PASS: "passes",
+        Verdict.FAIL: "fails",
+        Verdict.NOT_DECIDED: "is not decided against",
+    }
+    return (
+        f"{result.name} {words[result.verdict]} {result.limit!r}: {result.method} "
+        f"{level(result.noise_psd)} dB at {result.frequency:.3g} Hz, limit "
+        f"{level(result.limit_psd)} dB, margin {margin(result)}"
+    )
+
+
+def margin(result: LimitResult) -> str:
+    """Return a margin in dB with its interval."""
+    if not result.known:
+        return "?"
+    middle = "?" if math.isnan(result.margin_db) else f"{signed(result.margin_db, '+.1f')} dB"
+    low, high = result.margin_low_db, result.margin_high_db
+    if math.isnan(low) or math.isinf(low):
+        return f"{middle} (not bounded below)"
+    if math.isinf(high):
+        return f"{middle} ({signed(low, '+.1f')} or more)"
+    return f"{middle} ({signed(low, '+.1f')} to {signed(high, '+.1f')})"
+
+
+def _obstacle(obstacle: Obstacle, found: TestVerdict) -> str:
+    concerned = [each for each in found.limits if each.obstacle is obstacle]
+    return OBSTACLES[obstacle].format(
+        channels=listed(_channels(concerned)) if concerned else "the channels",
+        limits=listed(list(dict.fromkeys(each.limit for each in concerned)) or ["the limits"]),
+        averages=FEWEST_AVERAGES,
+    )
+
+
+def _channels(results: Sequence[LimitResult]) -> list[str]:
+    return list(dict.fromkeys(each.name for each in results))

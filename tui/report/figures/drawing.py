@@ -1,0 +1,131 @@
+"""How plots of a report look, on whatever they are drawn: colours, letters, and places of axes.
+
+Axes are placed by inches, so a plot looks alike in a page of its own and in the middle of another.
+"""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.artist import Artist
+
+    from tui.report.parts import Plot
+
+INK, GRID = "#20262d", "#d8dde2"
+DATA, NOISE, LIMIT, NOTHING = "#8b949e", "#0b62a8", "#c2321f", "#c7b98a"
+QUANTISATION = "#7d6a58"
+LINES = ("#0b62a9", "#d1661f", "#2f8f4e", "#8c4fb0", "#b3272c", "#7d6a57", "#c4579b", "#4d8f9b")
+"""Of several things in one plot; each colour of its own, so that a page can replace it."""
+
+LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.19
+"""Room left of a row of axes, between them, above, for titles, below, and for a row of the key."""
+
+_LOOK: dict[Any, Any] = {  # matplotlib's own type of keys is a list of them all
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.labelsize": 7.0,
+    "axes.linewidth": 0.5,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 7.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 3.0,
+    "axes.labelpad": 2.0,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.facecolor": "none",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 7.0,
+    "figure.facecolor": "none",
+    "grid.color": GRID,
+    "grid.linewidth": 0.4,
+    "hatch.linewidth": 0.5,
+    "legend.fontsize": 7.0,
+    "lines.linewidth": 0.9,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "xtick.minor.width": 0.3,
+    "ytick.minor.width": 0.3,
+    "text.parse_math": False,  # names may hold dollar signs
+    "svg.fonttype": "none",
+    "svg.hashsalt": "huddle",
+    "pdf.fonttype": 42,
+}
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Draw in the report's own style, whatever a user's configuration says."""
+    with mpl.rc_context(), warnings.catch_warnings():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_LOOK)
+        # Names may hold letters that the font does not have; a box is drawn for them.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        yield
+
+
+def height_of(plot: Plot) -> float:
+    """Return how high a plot is with all that belongs to it, in inches."""
+    return _above(plot) + plot.height + BOTTOM
+
+
+def draw(plot: Plot, figure: Figure, *, left: float, top: float, width: float) -> None:
+    """Draw a plot into a part of a figure; all numbers in inches from its lower left corner."""
+    whole_width, whole_height = figure.get_size_inches()
+    inner = width - LEFT - plot.right
+    one = (inner - GAP * (plot.n_columns - 1)) / plot.n_columns
+    bottom = top - _above(plot) - plot.height
+    named: dict[str, Artist] = {}
+    for number, panel in enumerate(plot.panels):
+        place = (
+            (left + LEFT + number * (one + GAP)) / whole_width,
+            bottom / whole_height,
+            one / whole_width,
+            plot.height / whole_height,
+        )
+        axes = figure.add_axes(place)
+        panel(axes)
+        if number:
+            axes.tick_params(axis="y", labelleft=False, length=0)
+            axes.set_ylabel("")
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    if plot.key_rows and named:
+        figure.legend(
+            list(named.values()),
+            list(named),
+            loc="upper left",
+            bbox_to_anchor=((left + LEFT) / whole_width, top / whole_height),
+            ncols=-(-len(named) // plot.key_rows),
+            frameon=False,
+            borderpad=0,
+            borderaxespad=0,
+            handlelength=1.6,
+            columnspacing=1.4,
+            labelspacing=0.25,
+        )
+
+
+def alone(plot: Plot, width: float) -> Figure:
+    """Return a figure that holds nothing else."""
+    height = height_of(plot)
+    figure = Figure(figsize=(width, height))
+    draw(plot, figure, left=0, top=height, width=width)
+    return figure
+
+
+def _above(plot: Plot) -> float:
+    return TOP + plot.key_rows * KEY_ROW + (TITLE if plot.titled else 0.0)

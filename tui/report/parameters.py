@@ -1,0 +1,141 @@
+"""The section about noise terms, the Allan deviation and the data sheet."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from daq.results.noise_parameters import noise_parameters, quantisation_shares
+from tui.output.noise_parameters import (
+    allan_table,
+    notes,
+    quantisation_notes,
+    sheet_table,
+    term_table,
+)
+from tui.report.figures import drawing
+from tui.report.parts import Items, Paragraph, Part, Plot, Section, Table
+from tui.report.wording import power_of_ten
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.noise_parameters import ChannelNoise
+
+HEIGHT = 1.45
+
+
+@dataclass(frozen=True, slots=True)
+class _AllanPanel:
+    """Draws the Allan deviation of one sensor's channels."""
+
+    name: str
+    channels: tuple[ChannelNoise, ...]
+    unit: str
+    scale: tuple[float, float]
+
+    def __call__(self, axes: Axes) -> None:
+        axes.set_title(self.name)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for number, each in enumerate(self.channels):
+            if each.allan is None:
+                continue
+            colour = drawing.LINES[number % len(drawing.LINES)]
+            dashes = [(), (4, 1.5), (1, 1)][number % 3]  # told apart without colours, too
+            found = each.allan
+            known = found.deviation > 0
+            axes.fill_between(
+                found.tau[known], found.low[known], found.high[known], color=colour, alpha=0.2, lw=0
+            )
+            axes.plot(
+                found.tau[known],
+                found.deviation[known],
+                color=colour,
+                dashes=dashes or (None, None),
+                lw=0.9,
+                label=each.label.channel,
+            )
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_formatter(
+            FuncFormatter(lambda value, _: power_of_ten(math.log10(value)))
+        )
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(self.scale)
+        axes.set_xlabel("averaging time (s)")
+        axes.set_ylabel(f"Allan deviation ({self.unit})")
+
+
+def parameters_section(
+    snapshot: Snapshot, settings: Settings, bench: Bench | None
+) -> Section | None:
+    """Return noise terms, Allan deviation and data sheet; None where nothing can be fitted."""
+    found = noise_parameters(snapshot, settings, bench)
+    if not any(each.parameters is not None for each in found):
+        return None
+    parts: list[Part] = []
+    tables = (
+        (f"Noise terms at 1 Hz, dB re 1 ({snapshot.unit})²/Hz, with standard errors", term_table),
+        (f"Allan deviation in {snapshot.unit}, with 95 % intervals", allan_table),
+        ("Data sheet", sheet_table),
+    )
+    for title, table in tables:
+        header, rows = table(found)
+        if rows:
+            left = frozenset({0, 1, 6}) if table is sheet_table else frozenset({0})
+            parts.append(Table(header, tuple(rows), left=left, title=title))
+    lines = [
+        *notes(found),
+        *quantisation_notes(snapshot.channels, quantisation_shares(snapshot, settings)),
+    ]
+    if lines:
+        parts.append(Items(tuple(Paragraph(line, "doubtful") for line in lines)))
+    parts.append(
+        Paragraph(
+            "The PSD of the noise is described by random walk (f⁻²), flicker (f⁻¹), white and f² "
+            "noise, fitted by weighted least squares to the estimate as it is. Quantisation: the "
+            "white noise of counting in whole numbers, part of the white term. The Allan deviation "
+            "is that of the sensor's own noise, without the motion, up to the highest frequency of "
+            "the estimate.",
+            "quiet",
+        )
+    )
+    parts += _plots(found, snapshot)
+    return Section("Noise parameters", tuple(parts))
+
+
+def _plots(found: tuple[ChannelNoise, ...], snapshot: Snapshot) -> list[Plot]:
+    """Return the Allan deviation of every sensor, up to three side by side."""
+    known = [each.allan for each in found if each.allan is not None]
+    values = np.concatenate([each.deviation for each in known] or [np.empty(0)])
+    values = values[values > 0]
+    if not values.size:
+        return []
+    low, high = np.log10(values.min() / 1.2), np.log10(values.max() * 1.2)
+    scale = (10.0 ** math.floor(low), 10.0 ** math.ceil(high))
+    panels = []
+    for sensor in snapshot.sensor_names:
+        channels = tuple(each for each in found if each.label.sensor == sensor)
+        if any(each.allan is not None and (each.allan.deviation > 0).any() for each in channels):
+            panels.append(_AllanPanel(f"Sensor {sensor}", channels, snapshot.unit, scale))
+    return [
+        Plot(
+            "",
+            tuple(panels[first : first + 3]),
+            n_columns=min(3, max(2, len(panels))),
+            height=HEIGHT,
+            key_rows=1 if first == 0 else 0,
+            titled=True,
+            alt="Allan deviation of the noise against averaging time",
+        )
+        for first in range(0, len(panels), 3)
+    ]
