@@ -28,8 +28,8 @@ from daq.results.band_summary import correlation_of
 from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
 from tui.commands.tui import RecordingControls
-from tui.report import drawing
 from tui.report.contents import report_of
+from tui.report.figures import drawing
 from tui.report.paper import pages
 from tui.report.source import sources
 

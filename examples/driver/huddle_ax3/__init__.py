@@ -1,0 +1,1 @@
+"""Driver for the AX3, an invented triaxial accelerometer."""

@@ -1,0 +1,164 @@
+"""Simulated AX3 on TCP ports, or one on a pseudo-terminal: ``python -m huddle_ax3.simulator``.
+
+All devices measure the same motion, and each has noise of its own, so that an estimate has a known
+result. Sample n of a device is a function of n alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from huddle_ax3.protocol import RATES, encode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+COUNTS_PER_UNIT = 1e6
+MOTION_PSD = 1e-6
+"""(m/s²)²/Hz, on each axis."""
+NOISE_PSD = 1e-9
+"""(m/s²)²/Hz, of each channel."""
+SEND_INTERVAL = 0.05
+"""Seconds."""
+_CHUNK = 1024
+
+
+def samples(number: int, rate: float, first: int, n_samples: int) -> NDArray[np.int32]:
+    """Return counts of a device, shape (n_samples, 3)."""
+    chunks = range(first // _CHUNK, (first + n_samples - 1) // _CHUNK + 1)
+    made = np.concatenate([_chunk(number, rate, chunk) for chunk in chunks])
+    skip = first - chunks[0] * _CHUNK
+    return made[skip : skip + n_samples]
+
+
+def _chunk(number: int, rate: float, chunk: int) -> NDArray[np.int32]:
+    motion = np.random.default_rng([1, chunk]).standard_normal((_CHUNK, 3))
+    noise = np.random.default_rng([2, chunk, number]).standard_normal((_CHUNK, 3))
+    angle = 0.1 * number  # about the vertical axis, in rad
+    turn = np.array(
+        [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    bandwidth = rate / 2
+    measured = motion @ turn.T * (MOTION_PSD * bandwidth) ** 0.5
+    measured += noise * (NOISE_PSD * bandwidth) ** 0.5
+    counts: NDArray[np.int32] = np.rint(measured * COUNTS_PER_UNIT).astype(np.int32)
+    return counts
+
+
+class Simulator:
+    """One AX3: takes received bytes, sends with `send`.
+
+    Parameters
+    ----------
+    number : int
+        0 for the first device; its serial number is 1001.
+    send : callable
+        Takes the bytes to send.
+    """
+
+    def __init__(self, number: int, send: Callable[[bytes], object]) -> None:
+        self._number = number
+        self._send = send
+        self._line = b""
+        self._rate = 100.0
+        self._streaming: asyncio.Task[None] | None = None
+
+    def receive(self, received: bytes) -> None:
+        """Answer every complete line."""
+        *lines, self._line = (self._line + received).split(b"\r\n")
+        for line in lines:
+            self._answer(line.decode("ascii", errors="replace").split())
+
+    def stop(self) -> None:
+        """End the stream."""
+        if self._streaming is not None:
+            self._streaming.cancel()
+            self._streaming = None
+
+    def _answer(self, words: Sequence[str]) -> None:
+        match words:
+            case ["STOP"]:
+                self.stop()
+                self._send(b"STOPPED\r\n")
+            case ["ID"]:
+                self._send(f"ID AX3 {1001 + self._number} 1.0\r\n".encode("ascii"))
+            case ["RATE", rate] if rate in map(str, RATES):
+                self._rate = float(rate)
+                self._send(f"RATE {rate}\r\n".encode("ascii"))
+            case ["START"]:
+                self._send(b"STARTED\r\n")
+                self._streaming = asyncio.create_task(self._stream())
+            case _:
+                self._send(b"ERROR\r\n")
+
+    async def _stream(self) -> None:
+        # All devices sample at the same instants: sample n is taken at n / rate of the clock.
+        now = asyncio.get_running_loop().time
+        sent = int(now() * self._rate)
+        while True:
+            await asyncio.sleep(SEND_INTERVAL)
+            due = int(now() * self._rate) - sent
+            if due > 0:
+                self._send(encode(sent, samples(self._number, self._rate, sent, due)))
+                sent += due
+
+
+async def serve_tcp(n_devices: int, port: int) -> list[asyncio.Server]:
+    """Serve devices on consecutive TCP ports, or each on a free port if ``port`` is 0."""
+
+    async def serve(number: int) -> asyncio.Server:
+        async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            device = Simulator(number, writer.write)
+            with contextlib.suppress(ConnectionError):
+                while received := await reader.read(4096):
+                    device.receive(received)
+            device.stop()
+            writer.close()
+
+        return await asyncio.start_server(connected, "127.0.0.1", port and port + number)
+
+    return [await serve(number) for number in range(n_devices)]
+
+
+async def serve_terminal() -> None:
+    """Serve one device on a pseudo-terminal, until cancelled (Linux, macOS)."""
+    import tty  # noqa: PLC0415 - Windows has none
+
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    print(os.ttyname(slave), flush=True)
+    device = Simulator(0, lambda octets: os.write(master, octets))
+    loop = asyncio.get_running_loop()
+    loop.add_reader(master, lambda: device.receive(os.read(master, 4096)))
+    await asyncio.Event().wait()
+
+
+async def _main(arguments: argparse.Namespace) -> None:
+    if arguments.terminal:
+        await serve_terminal()
+    for server in await serve_tcp(arguments.devices, arguments.port):
+        host, port = server.sockets[0].getsockname()
+        print(f"socket://{host}:{port}", flush=True)
+    await asyncio.Event().wait()
+
+
+def main() -> None:
+    """Serve until Ctrl-C."""
+    parser = argparse.ArgumentParser(description="Serve simulated AX3 accelerometers.")
+    parser.add_argument("--devices", type=int, default=3, help="number of devices (default 3)")
+    parser.add_argument("--port", type=int, default=4001, help="first TCP port; 0: free ports")
+    parser.add_argument("--terminal", action="store_true", help="one device on a pseudo-terminal")
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_main(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    main()

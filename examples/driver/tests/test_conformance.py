@@ -1,0 +1,36 @@
+"""The driver contract of huddle, against the simulator: ``pytest`` in this folder."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+from huddle_ax3.driver import DRIVER
+from huddle_ax3.simulator import COUNTS_PER_UNIT, serve_tcp
+
+from daq.bench.model import Channel, Sensor
+from daq.conformance.suite import DriverConformance, Served
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+class TestAX3(DriverConformance):
+    """Every test of the suite."""
+
+    driver = DRIVER
+
+    @contextlib.asynccontextmanager
+    async def serve(self) -> AsyncIterator[Served]:
+        """Serve one simulated device."""
+        (server,) = await serve_tcp(1, 0)
+        number = server.sockets[0].getsockname()[1]
+        sensor = Sensor(
+            name="A",
+            driver=DRIVER.name,
+            port=f"socket://127.0.0.1:{number}",
+            sampling_rate=100.0,
+            channels=tuple(Channel(name=name, sensitivity=COUNTS_PER_UNIT) for name in "XYZ"),
+        )
+        yield Served([sensor])
+        server.close()

@@ -1,0 +1,64 @@
+"""The examples and the tutorial of the documentation run, and say what they say there."""
+
+from __future__ import annotations
+
+import doctest
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "examples"
+
+
+def run(script: str, folder: Path) -> str:
+    """Run an example in a folder of its own; return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-P", str(ROOT / "examples" / script)],
+        cwd=folder,
+        env=os.environ | {"MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_noise_from_arrays(tmp_path: Path) -> None:
+    printed = run("noise_from_arrays.py", tmp_path)
+    rows = [line.split() for line in printed.splitlines() if re.match("[ABC] +[XYZ]", line)][:9]
+    levels = [float(row[3].replace("−", "-")) for row in rows]  # of the three-sensor estimate
+    assert levels == pytest.approx([-130.0] * 9, abs=0.15)
+    assert "The model test passes in all bands" in printed
+    assert (tmp_path / "noise.svg").stat().st_size > 10_000
+
+
+def test_from_a_bench_to_a_report(tmp_path: Path) -> None:
+    printed = run("bench_to_report.py", tmp_path)
+    assert printed.count("PASS: all 9 channels") == 2
+    assert "('A', 'B', 'C') (48000, 3) ('X', 'Y', 'Z')" in printed
+    assert "PASS" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_tutorial_says_what_python_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) >= 10
+    examples = doctest.DocTestParser().get_doctest("\n".join(blocks), {}, "tutorial", None, 0)
+    found = doctest.DocTestRunner().run(examples)
+    assert found.failed == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / "examples").glob("*.py")))
+def test_every_script_has_its_page(script: str) -> None:
+    pages = [path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")]
+    assert sum(f"{{example}} {script}" in page for page in pages) == 1

@@ -1,0 +1,85 @@
+"""The documents: numbered decisions, links that resolve, and commands that exist."""
+
+from __future__ import annotations
+
+import re
+from itertools import chain
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from tui.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
+PAGES = sorted(
+    page
+    for page in chain(ROOT.glob("*.md"), ROOT.glob("docs/**/*.md"), ROOT.glob("examples/**/*.md"))
+    if page.name[0] != "_"
+)
+SOURCES = ("daq", "estimator", "sim_devices", "tui", "examples")
+
+
+def name(page: Path) -> str:
+    """Return the path of a page from the root of the repository."""
+    return str(page.relative_to(ROOT))
+
+
+def test_decisions_are_numbered_without_holes() -> None:
+    assert [int(page.name[:4]) for page in DECISIONS] == list(range(1, len(DECISIONS) + 1))
+
+
+@pytest.mark.parametrize("page", DECISIONS, ids=name)
+def test_a_decision_has_status_date_and_sections(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith(f"# {page.name[:4]}. ")
+    assert re.search(r"^- Status: (accepted|superseded|proposed)", text, re.MULTILINE)
+    assert re.search(r"^- Date: \d{4}-\d\d-\d\d$", text, re.MULTILINE)
+    sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert sections == ["Context", "Decision", "Consequences"]
+    index = (page.parent / "index.md").read_text(encoding="utf-8")
+    assert f"[{page.name[:4]}]({page.name})" in index
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_resolve(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
+    local = [
+        target for target in targets if "://" not in target and not target.startswith("mailto")
+    ]
+    assert [target for target in local if not (page.parent / target).exists()] == []
+
+
+def test_documents_that_code_names_exist() -> None:
+    missing = []
+    for source in chain.from_iterable((ROOT / folder).rglob("*.py") for folder in SOURCES):
+        if source == Path(__file__):
+            continue
+        for found in re.findall(r"docs/[\w/.-]+", source.read_text(encoding="utf-8")):
+            path = ROOT / found.rstrip(".")
+            if not path.exists() and not list(path.parent.glob(f"{path.name}*")):
+                missing.append(f"{name(source)}: {found}")
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_and_their_options_exist(page: Path) -> None:
+    group = typer.main.get_command(app)
+    commands = group.commands  # type: ignore[attr-defined]  # a group has them
+    text = page.read_text(encoding="utf-8")
+    wrong = []
+    for line in re.findall(r"(?:^|[`\s/\\])huddle ([a-z]+[^`\n]*)", text, re.MULTILINE):
+        word = line.split()[0]
+        options = re.findall(r"(?<!\S)--[a-z][a-z-]*", line)
+        if word not in commands:
+            if options or re.search(rf"`huddle {word}`", text):
+                wrong.append(f"huddle {line}")
+            continue
+        known = {
+            "--help",
+            *chain.from_iterable(p.opts + p.secondary_opts for p in commands[word].params),
+        }
+        wrong += [f"huddle {word} {option}" for option in options if option not in known]
+    assert wrong == []
