@@ -32,6 +32,8 @@ BUFFER = 3.0
 PAUSES = (0.4, 1.0, 2.0, 2.9)
 """Seconds that its buffer lasts."""
 TOO_LONG = 5.0
+PATIENCE = 20.0
+"""What every session states, s: no pause ends a connection, however busy the computer is."""
 MODES = [
     mode
     for mode, case in CASES.items()
@@ -74,7 +76,11 @@ async def _recorded(served: Served, path: Path) -> float:
     bench = Bench(
         name="pauses",
         sampling_rate=RATE,
-        sensors=tuple(sensor for mode in MODES for sensor in served.sensors(mode)),
+        sensors=tuple(
+            sensor.model_copy(update={"settings": {**sensor.settings, "patience": PATIENCE}})
+            for mode in MODES
+            for sensor in served.sensors(mode)
+        ),
     )
     while not stop.is_set():
         try:
