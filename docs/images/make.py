@@ -25,13 +25,13 @@ from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.python_process import python_command
 from daq.results.band_summary import correlation_of
+from daq.results.sources import sources
 from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
 from tui.commands.tui import RecordingControls
 from tui.report.contents import report_of
 from tui.report.figures import drawing
 from tui.report.paper import pages
-from tui.report.source import sources
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

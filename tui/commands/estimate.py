@@ -13,6 +13,7 @@ from daq.estimation.estimation import estimate
 from daq.results.limits import judge
 from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
+from daq.results.sources import sources
 from daq.results.verdict import Verdict
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
@@ -63,6 +64,7 @@ def estimate_recordings(
     found = show_result(
         snapshot,
         settings,
+        recordings=files,
         json=json,
         csv=csv,
         bench=bench,
@@ -113,6 +115,7 @@ def show_result(
     snapshot: Snapshot,
     settings: Settings,
     *,
+    recordings: Sequence[Path],
     json: str | None,
     csv: str | None,
     bench: Bench | None,
@@ -139,7 +142,15 @@ def show_result(
     for part in details(snapshot) if diagnostics else summary(snapshot):
         screen.print(part)
     found = judge(bench, snapshot, settings)
-    write_json(json, document(snapshot, found, parameters))
+    if json is not None:
+        result = document(
+            snapshot,
+            settings,
+            sources=sources(recordings),
+            verdict=found,
+            noise_parameters=parameters,
+        )
+        write_json(json, result)
     if csv is not None:
         write_text(csv, curves_csv(snapshot))
     if found is not None:

@@ -93,7 +93,13 @@ def run_test(
             # First into the recording, whatever becomes of screens and other files.
             stored = _Stored(out, snapshot)
             found = show_result(
-                snapshot, settings, json=json, csv=csv, bench=bench, diagnostics=diagnostics
+                snapshot,
+                settings,
+                recordings=[out],
+                json=json,
+                csv=csv,
+                bench=bench,
+                diagnostics=diagnostics,
             )
             recorder.check()  # its error says more than one that follows from it
             stored.check()

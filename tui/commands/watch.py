@@ -56,7 +56,7 @@ def watch_recording(
         follow(file, settings, lines)
     finally:
         if lines.last is not None and lines.last.results and json is None:
-            show_result(lines.last, settings, json=None, csv=None, bench=bench)
+            show_result(lines.last, settings, recordings=[file], json=None, csv=None, bench=bench)
     if lines.last is not None:
         exit_with(judge(bench, lines.last, settings))
 

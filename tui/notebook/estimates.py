@@ -188,7 +188,7 @@ def estimate(
         settings, start=moment("start", start, created), end=moment("end", end, created)
     )
     with Estimation(paths, settings) as estimation:
-        return Result(estimation.finish(), settings, bench)
+        return Result(estimation.finish(), settings, bench, paths)
 
 
 def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Result:

@@ -13,6 +13,9 @@ from estimator.self_noise.band_means import band_edges
 from tui.notebook import text
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
@@ -102,10 +105,17 @@ class Result:
         Options of the estimate.
     """
 
-    def __init__(self, snapshot: Snapshot, settings: Settings, bench: Bench | None = None) -> None:
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        settings: Settings,
+        bench: Bench | None = None,
+        recordings: Sequence[Path] = (),
+    ) -> None:
         self.snapshot = snapshot
         self.settings = settings
         self._bench = bench
+        self._recordings = tuple(recordings)
 
     @property
     def method(self) -> str:
@@ -239,7 +249,8 @@ class Result:
                 f"method={method!r}: {why or 'not estimated'}; there is {', '.join(self.methods)}"
             )
         results = {method: self.snapshot.results[method]} | self.snapshot.results
-        return Result(replace(self.snapshot, results=results), self.settings, self._bench)
+        snapshot = replace(self.snapshot, results=results)
+        return Result(snapshot, self.settings, self._bench, self._recordings)
 
     def band(self, low: float | None = None, high: float | None = None) -> BandNoise:
         """Return the mean noise of every channel in a band.
@@ -303,7 +314,20 @@ class Result:
         return to_frame(self.snapshot)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``huddle estimate --json`` writes."""
-        from tui.output.json_document import document  # noqa: PLC0415 - seldom needed
+        """Return what ``huddle estimate --json`` writes; of arrays without recordings.
 
-        return document(self.snapshot)
+        Raises
+        ------
+        RecordingError
+            If a recording cannot be read any more.
+        """
+        from daq.results.limits import judge  # noqa: PLC0415 - seldom needed
+        from daq.results.sources import sources  # noqa: PLC0415
+        from tui.output.json_document import document  # noqa: PLC0415
+
+        return document(
+            self.snapshot,
+            self.settings,
+            sources=sources(self._recordings),
+            verdict=judge(self._bench, self.snapshot, self.settings),
+        )

@@ -1,10 +1,17 @@
-"""A finished estimate as the JSON that ``--json`` writes (docs/json.md)."""
+"""A finished estimate as the JSON that ``--json`` writes.
+
+docs/json.md describes it for people, ``tui/resources/result-1.schema.json`` for programs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import fields
+from datetime import datetime
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from daq.bench.estimate_settings import table_keys
+from daq.results.band_summary import band_of, channel_means, data_means
 from estimator.diagnostics.advice import Advice
 from estimator.self_noise.result import Flag
 from tui.output.advice.sentences import Names, explain
@@ -14,9 +21,14 @@ from tui.output.noise_parameters import noise_parameters_document
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Diagnosis, Snapshot
     from daq.results.noise_parameters import ChannelNoise
+    from daq.results.sources import Source
     from daq.results.verdict import TestVerdict
+
+SCHEMA_VERSION = 1
+"""Rises when a key is removed or changes its meaning; new keys do not change it."""
 
 
 def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
@@ -48,22 +60,130 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
 
 def document(
     snapshot: Snapshot,
+    settings: Settings,
+    *,
+    sources: Sequence[Source] = (),
     verdict: TestVerdict | None = None,
     noise_parameters: Sequence[ChannelNoise] | None = None,
 ) -> dict[str, Any]:
-    """Return the JSON of a result: of its one method, or of all of them under ``results``."""
+    """Return the JSON of a result: of its one method, or of all of them under ``results``.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A finished estimate.
+    settings : Settings
+        It was made with.
+    sources : sequence of Source
+        The recordings it was made from; none for arrays.
+    verdict : TestVerdict or None
+        On the limits of the bench file.
+    noise_parameters : sequence of ChannelNoise or None
+        Of every channel, where they were asked for.
+    """
     documents = [result_document(snapshot, method) for method in snapshot.results]
-    whole = documents[0] if len(documents) == 1 else {"results": documents}
+    whole = {
+        "schema_version": SCHEMA_VERSION,
+        "software": {"name": "huddle-bench", "version": version("huddle-bench")},
+        "run_id": sources[-1].run_id if sources else None,
+        "recordings": [_recording(source) for source in sources],
+        "settings": _settings(settings, snapshot),
+    }
+    whole |= documents[0] if len(documents) == 1 else {"results": documents}
     whole |= verdict_document(verdict)
+    whole["band_means"] = _band_means(snapshot, settings)
     if noise_parameters is not None:
         whole["noise_parameters"] = plain(noise_parameters_document(noise_parameters))
     return whole
 
 
+def _recording(source: Source) -> dict[str, Any]:
+    return {
+        "file": source.path.name,
+        "run_id": source.run_id,
+        "sha256": source.sha256 or None,
+        "bytes": source.n_bytes,
+        "state": source.state.replace(" ", "-"),
+        "software": source.software,
+        "operator": source.operator or None,
+        "location": source.location or None,
+        "bench": None if source.bench is None else source.bench.name,
+        "started": source.started.isoformat(),
+        "last_block": source.last.isoformat(),
+        "sensors": [
+            {
+                "name": sensor.name,
+                "model": sensor.model or None,
+                "serial_number": sensor.serial_number or None,
+                "driver": sensor.driver or None,
+                "sampling_rate_hz": sensor.sampling_rate,
+                "channels": [
+                    {
+                        "name": channel.name,
+                        "unit": channel.unit,
+                        "counts_per_unit": channel.sensitivity,
+                        "direction": channel.direction,
+                        "auxiliary": channel.auxiliary,
+                    }
+                    for channel in sensor.channels
+                ],
+            }
+            for sensor in source.sensors
+        ],
+    }
+
+
+def _settings(settings: Settings, snapshot: Snapshot) -> dict[str, Any]:
+    """Return the options of the estimate under their names in the bench file."""
+
+    def value_of(name: str) -> object:
+        value = getattr(settings, name)
+        return value.isoformat() if isinstance(value, datetime) else plain(value)
+
+    return {
+        **{key: value_of(name) for key, name in table_keys().items()},
+        "method": list(snapshot.results) or list(settings.methods),
+        "unit": snapshot.unit,
+        "start": value_of("start"),
+        "end": value_of("end"),
+        "sampling_rate_hz": 2 * float(snapshot.frequency[-1]),
+    }
+
+
+def _band_means(snapshot: Snapshot, settings: Settings) -> list[dict[str, Any]]:
+    """Return the mean noise of every channel in the band of the tables, by every method."""
+    if not snapshot.results:
+        return []
+    low, high = band_of(settings, snapshot)
+    data = data_means(snapshot, (low, high)).tolist()
+    return [
+        {
+            "sensor": label.sensor,
+            "channel": label.channel,
+            "unit": label.unit,
+            "method": method,
+            "low_hz": low,
+            "high_hz": high,
+            "data_psd": data[column],
+            "noise_psd": float(mean.mean[0]),
+            "noise_psd_low": float(mean.low[0]),
+            "noise_psd_high": float(mean.high[0]),
+        }
+        for method, noise in snapshot.results.items()
+        for column, (label, mean) in enumerate(
+            zip(
+                snapshot.channels,
+                channel_means(noise, snapshot, settings, (low, high)),
+                strict=True,
+            )
+        )
+    ]
+
+
 def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
     """Return the verdict on the limits of the bench file; null where it has none."""
     if found is None:
-        return {"verdict": None, "limits": []}
+        return {"verdict": None, "obstacles": [], "record_for": None, "limits": []}
     prediction = found.prediction
     return {
         "verdict": found.verdict,

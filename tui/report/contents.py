@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Channel
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.sources import RecordedSensor, Source
     from daq.timing.clock_model import ClockState
-    from tui.report.source import RecordedSensor, Source
 
 _STATES = {
     "closed": "closed",

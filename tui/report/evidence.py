@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.sources import Happening, Source
     from daq.timing.clock_model import ClockState
     from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.relative_response import RelativeResponse
     from tui.report.parts import Tone
-    from tui.report.source import Happening, Source
 
 LISTED = 40
 """Most lines of the list of what happened; with more, those of one kind go together."""

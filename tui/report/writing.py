@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
+from daq.results.sources import sources
 from tui.report.contents import report_of
 from tui.report.page import page
 from tui.report.paper import write_paper
-from tui.report.source import sources
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,7 +10,7 @@ import numpy as np
 from estimator.diagnostics.kinds import Untested
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-from tests.tui.example_snapshot import diagnosed, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tui.output.console import finite
 from tui.output.json_document import document, result_document
 
@@ -18,7 +18,7 @@ from tui.output.json_document import document, result_document
 def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     change = np.eye(9)
     change[5, 5] = -1
-    found = json.loads(json.dumps(finite(document(diagnosed(change)))))
+    found = json.loads(json.dumps(finite(document(diagnosed(change), SETTINGS))))
     diagnostics = found["results"][0]["diagnostics"]
     polarity = [each for each in diagnostics["advice"] if each["kind"] == "reversed-polarity"]
     assert [(a["sensors"], a["numbers"]) for a in polarity] == [

@@ -1,4 +1,4 @@
-"""What the recordings themselves say, beside the estimate made of them."""
+"""What the recordings of an estimate say of themselves: sensors, run, checksum, events."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Source:
     ----------
     path : Path
     sha256 : str
-        Of the file; empty while it is being written.
+        Of the whole file as it is now; empty while it is being written.
     n_bytes : int
     run_id, software, operator, location : str
     started : datetime
