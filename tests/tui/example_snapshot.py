@@ -215,11 +215,16 @@ def empty_snapshot() -> Snapshot:
     )
 
 
+def demo_bench() -> Bench:
+    """Return the bench of the demo: three sensors, no limits."""
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    return parse(text)
+
+
 @contextmanager
 def growing(path: Path, *, duration: float | None = None) -> Iterator[RecordingWriter]:
     """Yield the writer of a recording of the demo's bench that nobody has closed."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    bench = parse(text)
+    bench = demo_bench()
     sensors = [
         SensorLayout(s.name, s.channels, bench.sampling_rate, dtype=np.dtype("<i4"), clock=s.name)
         for s in bench.sensors
@@ -249,10 +254,6 @@ class ProgressCallback:
     bench: Bench | None = None
     running: Path | None = None
     told: list[str] = field(default_factory=list)
-
-    def description(self) -> str:
-        """Return what is shown without a recording."""
-        return "three sensors of lab"
 
     def start(self) -> Path:
         """Note it."""

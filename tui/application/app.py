@@ -9,17 +9,17 @@ from functools import partial
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from textual import on, work
-from textual.app import App
+from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
 from textual.filter import Monochrome
 from textual.reactive import var
-from textual.widgets import Footer
 
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
+from daq.results.limits import judge
 from estimator.errors import EstimatorError
-from tui.application import panels
-from tui.application.main_screen import Board, Shown
+from tui.application.bench_view.view import BenchView
+from tui.application.dialogs import MarkScreen, StartScreen, StopScreen
 from tui.application.messages import (
     ErrorReported,
     Messenger,
@@ -28,25 +28,19 @@ from tui.application.messages import (
     SnapshotReady,
     StatusUpdated,
 )
-from tui.application.plot import PlainMonochrome
-from tui.application.result_text import details, result
-from tui.application.screens import (
-    MarkScreen,
-    ResultScreen,
-    StartScreen,
-    StopScreen,
-    TextScreen,
-    help_text,
-)
+from tui.application.result_view.view import ResultView
+from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
+from tui.application.test_view.plot import PlainMonochrome
+from tui.application.test_view.view import TestView
+from tui.application.view import View
 from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    from rich.console import RenderableType
-    from textual.app import ComposeResult
     from textual.filter import LineFilter
+    from textual.screen import Screen
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -73,30 +67,18 @@ class HuddleApp(App[None]):
 
     CSS_PATH = "huddle.tcss"
     TITLE = "huddle"
-    ENABLE_COMMAND_PALETTE = False
+    DEFAULT_MODE = BENCH
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("s", "start", "Start"),
-        Binding("x", "stop", "Stop"),
-        Binding("m", "mark", "Mark"),
-        Binding("r", "result", "Result"),
-        Binding("c", "clocks", "Clocks"),
-        Binding("d", "details", "Details"),
-        Binding("e", "method", "Estimate"),
-        Binding("question_mark", "help", "Help", key_display="?"),
+        *(
+            Binding(str(number), f"view('{name}')", TITLES[name], show=False)
+            for number, name in enumerate(VIEWS, start=1)
+        ),
+        Binding("question_mark", "screen.help", "Help", key_display="?"),
         Binding("q", "quit", "Quit"),
         Binding("ctrl+c", "quit", "Quit", show=False),
-        Binding("right", "channel(1)", "Select", key_display="←→↑↓"),
-        Binding("left", "channel(-1)", "Channel", show=False),
-        Binding("down", "sensor(1)", "Sensor", show=False),
-        Binding("up", "sensor(-1)", "Sensor", show=False),
     ]
 
-    snapshot: var[Snapshot | None] = var(None, always_update=True)
-    now: var[RecordingStatus | None] = var(None, always_update=True)
-    choice: var[panels.Choice] = var(panels.Choice)
-    note: var[str] = var("")
-    trouble: var[str] = var("")
-    failure: var[str] = var("")
+    state: var[State] = var(partial(State, ""), always_update=True)
 
     def __init__(
         self, controls: Controls, *, path: Path | None = None, start: bool = False
@@ -104,23 +86,24 @@ class HuddleApp(App[None]):
         super().__init__()
         self._start_at_once = start
         self._controls = controls
-        self._path = path
-        self._settings: Settings | None = None
-        self._starting = False
         self._ended = threading.Event()
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
-        self._offered: tuple[bool, ...] = ()
+        views: tuple[type[View], ...] = (BenchView, TestView, ResultView)
+        for view in views:
+            self.add_mode(view.VIEW, partial(self._new_view, view))
+        self.set_reactive(HuddleApp.state, self._state_of(path))
 
-    def compose(self) -> ComposeResult:
-        """Lay out the screen."""
-        yield Board()
-        yield Footer(show_command_palette=False)
+    def _state_of(self, path: Path | None) -> State:
+        controls = self._controls
+        return State(controls.name, controls.bench, can_start=controls.can_start, path=path)
+
+    def _new_view(self, kind: type[View]) -> View:
+        return kind(self.state)
 
     def on_mount(self) -> None:
-        """Show what there is, and follow a recording that is given or already runs."""
-        self._show()
-        if self._path is not None:
-            self.post_message(RecordingOpened(self._path))
+        """Follow a recording that is given or already runs."""
+        if self.path is not None:
+            self.post_message(RecordingOpened(self.path))
         elif self._start_at_once:
             self.action_start()
         else:
@@ -137,16 +120,41 @@ class HuddleApp(App[None]):
             for each in super().get_line_filters()
         ]
 
+    # ---------------------------------------------------------------------- views
+
+    def watch_state(self) -> None:
+        """Draw the state in the view that is shown."""
+        if self.is_running and isinstance(view := self.screen_stack[0], View):
+            view.show(self.state)
+
+    async def action_view(self, name: str) -> None:
+        """Show a view; a dialog that is open in another one stays open there."""
+        await self.switch_mode(name)
+        self.watch_state()
+
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        """Yield the commands of the palette: views, recording, and what the view offers."""
+        for name in VIEWS:
+            title = f"View: {TITLES[name]}"
+            yield SystemCommand(title, f"Show the {name} view", partial(self.action_view, name))
+        for binding in screen.active_bindings.values():
+            if binding.enabled and binding.binding.description not in TITLES.values():
+                action = partial(self.run_action, binding.binding.action, binding.node)
+                title = binding.binding.description
+                yield SystemCommand(title, f"Key {binding.binding.key}", action)
+        for command in super().get_system_commands(screen):
+            if command.title in {"Theme", "Screenshot"}:
+                yield command
+
     # ------------------------------------------------------------------ following
 
     @on(RecordingOpened)
-    def _on_following(self, message: RecordingOpened) -> None:
-        self._path = message.path
-        self._starting, self.trouble, self.failure, self.note = False, "", "", ""
-        self.now = self.snapshot = None
+    async def _on_following(self, message: RecordingOpened) -> None:
+        self.state = self._state_of(message.path)
         self._ended.set()
         self._ended = threading.Event()
         self._follow(message.path, self._ended)
+        await self.action_view(TEST)
 
     @work(thread=True, group="follow")
     def _follow(self, path: Path, ended: threading.Event) -> None:
@@ -164,185 +172,82 @@ class HuddleApp(App[None]):
 
     @on(StatusUpdated)
     def _on_looked(self, message: StatusUpdated) -> None:
-        self.now = message.now
+        self.state = replace(self.state, now=message.now)
 
     @on(Progress)
     def _on_progress(self, message: Progress) -> None:
-        what = "the result is being computed" if self._is_closed else "reading what was recorded"
-        self.note = f"{what}: {message.done / message.total:.0%}"
+        closed = self.now is not None and self.now.closed
+        what = "the result is being computed" if closed else "reading what was recorded"
+        self.state = replace(self.state, note=f"{what}: {message.done / message.total:.0%}")
 
     @on(SnapshotReady)
-    def _on_fresh(self, message: SnapshotReady) -> None:
-        self._settings = message.settings
-        before = self.snapshot
-        self.note = ""
-        if not self.choice.methods:
-            names = tuple(name for name in message.settings.methods if name != "all")
-            names = names or tuple(message.snapshot.results)
-            self.choice = replace(self.choice, methods=names if len(names) < 3 else names[:1])
-        self.snapshot = message.snapshot
-        if message.snapshot.closed and before is not None and not before.closed:
-            self.action_result()
+    async def _on_fresh(self, message: SnapshotReady) -> None:
+        snapshot, before = message.snapshot, self.snapshot
+        self.state = replace(
+            self.state,
+            snapshot=snapshot,
+            settings=message.settings,
+            verdict=judge(self._controls.bench, snapshot, message.settings),
+            note="",
+        )
+        if snapshot.closed and before is not None and not before.closed:
+            await self._show_result()
+
+    async def _show_result(self) -> None:
+        """Show the result of a test that has just ended, unless somebody is at something else."""
+        if self.current_mode == TEST and len(self.screen_stack) == 1:
+            await self.action_view(RESULT)
+        else:
+            self.notify("The test has ended: 3 shows its result.", timeout=30)
 
     @on(ErrorReported)
     def _on_trouble(self, message: ErrorReported) -> None:
-        starting, self._starting, self.note = self._starting, False, ""
+        starting = self.state.is_starting
+        self.state = replace(self.state, is_starting=False, note="")
         if message.ended:
-            self.trouble = message.text
+            self.state = replace(self.state, trouble=message.text)
         elif starting:
-            self.failure = message.text
+            self.state = replace(self.state, failure=message.text)
         else:
             self.notify(message.text, title="Error", severity="error", timeout=30, markup=False)
-
-    # -------------------------------------------------------------------- showing
-
-    def watch_snapshot(self) -> None:
-        """Draw a new snapshot."""
-        self._show()
-
-    def watch_now(self) -> None:
-        """Write what has changed between segments."""
-        self._show()
-
-    def watch_choice(self) -> None:
-        """Draw another channel, method or picture."""
-        self._show()
-
-    def watch_note(self) -> None:
-        """Show a notice in place of the progress."""
-        self._show()
-
-    def watch_trouble(self) -> None:
-        """Show an error."""
-        self._show()
-
-    def watch_failure(self) -> None:
-        """Say why there is no recording."""
-        self._show()
-
-    def _show(self) -> None:
-        if not self.is_running:
-            return
-        board = self.screen_stack[0].query_one(Board)
-        board.show(
-            Shown(
-                name=self._controls.name,
-                description=self._controls.description(),
-                choice=self.choice,
-                path=self._path,
-                now=self.now,
-                snapshot=self.snapshot,
-                settings=self._settings,
-                trouble=self.trouble,
-                failure=self.failure,
-                note=self.note,
-                bench=self._controls.bench,
-            )
-        )
-        offered = self.recording, self._starting, self._has_result, self.snapshot is None
-        if offered != self._offered:
-            self._offered = offered
-            self.refresh_bindings()
-
-    # -------------------------------------------------------------------- choosing
-
-    def action_channel(self, step: int) -> None:
-        """Show the next or previous channel."""
-        if self.snapshot is not None:
-            channel = (self.choice.channel + step) % len(self.snapshot.channels)
-            self.choice = replace(self.choice, channel=channel)
-
-    def action_sensor(self, step: int) -> None:
-        """Show the same channel of the next or previous sensor."""
-        if self.snapshot is None:
-            return
-        starts = [sum(self.snapshot.dims[:n]) for n in range(len(self.snapshot.dims))]
-        sensor = max(n for n, start in enumerate(starts) if start <= self.choice.channel)
-        place = self.choice.channel - starts[sensor]
-        other = (sensor + step) % len(starts)
-        channel = starts[other] + min(place, self.snapshot.dims[other] - 1)
-        self.choice = replace(self.choice, channel=channel)
-
-    def action_method(self) -> None:
-        """Show the next method, and after the last one all of them."""
-        if self.snapshot is None or not self.snapshot.results:
-            return
-        names = tuple(self.snapshot.results)
-        turns: list[tuple[str, ...]] = [(name,) for name in names]
-        if len(names) > 1:
-            turns.insert(0, names)
-        place = turns.index(self.choice.methods) if self.choice.methods in turns else -1
-        self.choice = replace(self.choice, methods=turns[(place + 1) % len(turns)])
-
-    def action_clocks(self) -> None:
-        """Show clocks in place of noise, or noise again."""
-        if self.snapshot is not None:
-            self.choice = replace(self.choice, clocks=not self.choice.clocks)
-
-    def action_help(self) -> None:
-        """Say what keys and words mean."""
-        self.push_screen(TextScreen("huddle", help_text))
-
-    def action_details(self) -> None:
-        """Show all that is known of the test."""
-        self.push_screen(TextScreen("details", self._details, refresh_every=2.0))
-
-    def _details(self) -> RenderableType:
-        if self.now is None:
-            return self._controls.description()
-        return details(self.now, self.snapshot, self._settings, trouble=self.trouble)
-
-    def action_result(self) -> None:
-        """Show the end of the test."""
-        if isinstance(self.screen, ResultScreen) or not self._has_result:
-            return
-        self.push_screen(ResultScreen("result", self._result))
-
-    @property
-    def _is_closed(self) -> bool:
-        return self.now is not None and self.now.closed
-
-    @property
-    def _has_result(self) -> bool:
-        return self.snapshot is not None and self.snapshot.closed
-
-    def _result(self) -> RenderableType:
-        if self.snapshot is None or self._settings is None:
-            return ""
-        return result(
-            self.now, self.snapshot, self._settings, bench=self._controls.bench, path=self._path
-        )
-
-    # ------------------------------------------------------------------ controlling
 
     @property
     def path(self) -> Path | None:
         """The recording that is, or was, followed."""
-        return self._path
+        return self.state.path
+
+    @property
+    def now(self) -> RecordingStatus | None:
+        """How the recording is doing."""
+        return self.state.now
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """The latest estimate."""
+        return self.state.snapshot
 
     @property
     def recording(self) -> bool:
         """Whether a recording is running that is followed here."""
-        if self.trouble or self._has_result:
-            return False
-        return self._path is not None if self.now is None else not self.now.closed
+        return self.state.is_recording
+
+    # ------------------------------------------------------------------ controlling
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
         if action == "start":
-            return self._controls.can_start and not self.recording and not self._starting
+            state = self.state
+            return state.can_start and not state.is_recording and not state.is_starting
         if action in {"stop", "mark"}:
             return self.recording and self.now is not None
-        if action == "result":
-            return self._has_result
-        if action in {"channel", "sensor", "method", "clocks"}:
-            return self.snapshot is not None
+        if action == "report":
+            return self.state.has_result
         return True
 
     def action_start(self) -> None:
         """Start a recorder; asked before where a test is shown."""
-        if self._path is None:
+        if self.path is None:
             self._begin()
             return
 
@@ -350,11 +255,11 @@ class HuddleApp(App[None]):
             if really:
                 self._begin()
 
-        self.push_screen(StartScreen(self._path.name), start)
+        self.push_screen(StartScreen(self.path.name), start)
 
     def _begin(self) -> None:
-        self._starting, self.failure = True, ""
-        self.note = "connecting to the sensors …"
+        note = "connecting to the sensors …"
+        self.state = replace(self.state, is_starting=True, failure="", note=note)
         self._start()
 
     @work(thread=True, group="control", exclusive=True)
@@ -379,22 +284,22 @@ class HuddleApp(App[None]):
 
     def action_stop(self) -> None:
         """Stop the recorder, once that has been confirmed."""
-        if self._path is None or self.now is None:
+        if self.path is None or self.now is None:
             return
-        path = self._path
+        path = self.path
 
         def stop(really: bool | None) -> None:
             if really:
-                self.note = "stopping …"
+                self.state = replace(self.state, note="stopping …")
                 self._tell(path, "stop")
 
         self.push_screen(StopScreen(clock_time(self.now.elapsed)), stop)
 
     def action_mark(self) -> None:
         """Ask for a remark and mark the moment."""
-        if self._path is None:
+        if self.path is None:
             return
-        path, began = self._path, time.monotonic()
+        path, began = self.path, time.monotonic()
 
         def mark(text: str | None) -> None:
             if text is not None:
@@ -417,7 +322,7 @@ class HuddleApp(App[None]):
 
     def action_report(self) -> None:
         """Write the report of the test that has ended."""
-        path, snapshot, settings = self._path, self.snapshot, self._settings
+        path, snapshot, settings = self.path, self.snapshot, self.state.settings
         if path is None or snapshot is None or settings is None or not snapshot.closed:
             return
         self.notify("writing the report …", timeout=3)

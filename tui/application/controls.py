@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rich.console import RenderableType
-
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -35,10 +33,6 @@ class Controls(Protocol):
     @property
     def can_start(self) -> bool:
         """Whether a recording can be started from here."""
-        ...
-
-    def description(self) -> RenderableType:
-        """Return what to show while there is no recording."""
         ...
 
     def start(self) -> Path:

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from daq.acquisition.recorder import recording_path
 from daq.drivers.bench_file import load
@@ -55,17 +53,6 @@ class BenchControls:
     def name(self) -> str:
         """The bench's name."""
         return self.bench.name
-
-    def description(self) -> Table:
-        """Return the sensors that will be recorded."""
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold #9aa5b8")
-        for column in ("sensor", "model", "driver", "port", "channels"):
-            table.add_column(column, no_wrap=True)
-        for sensor in self.bench.sensors:
-            channels = " ".join(channel.name for channel in sensor.channels)
-            row = (sensor.name, sensor.model, sensor.driver, sensor.port, channels)
-            table.add_row(*map(Text, row))
-        return table
 
     def start(self) -> Path:
         """Start a recorder; return its file once it exists."""
@@ -117,10 +104,6 @@ class RecordingControls:
     def name(self) -> str:
         """The file's name."""
         return self.path.stem
-
-    def description(self) -> str:
-        """Return the text to show until the first snapshot."""
-        return "opening …"
 
     def start(self) -> Path:
         """Raise an error: a recording cannot be started again."""

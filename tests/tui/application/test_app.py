@@ -15,6 +15,7 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
+    demo_bench,
     diagnosed,
     empty_snapshot,
     growing,
@@ -24,10 +25,13 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.messages import ErrorReported, RecordingOpened, SnapshotReady, StatusUpdated
+from tui.application.state import BENCH
+from tui.application.test_view.view import TestView
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from textual.app import App
     from textual.message import Message
     from textual.pilot import Pilot
 
@@ -35,11 +39,20 @@ NARROW, WIDE = (80, 24), (160, 45)
 
 
 async def shown(pilot: Pilot[None], app: HuddleApp, *messages: Message) -> None:
-    """Post messages and wait until they have been drawn."""
+    """Post messages and wait until they have been drawn, in the Test view unless it was left."""
+    if messages and app.current_mode == BENCH:
+        await pilot.press("2")
     for message in messages:
         app.post_message(message)
     for _ in range(4):
         await pilot.pause()
+
+
+def view(app: App[None]) -> TestView:
+    """Return the Test view, which is shown."""
+    shown = app.screen_stack[0]
+    assert isinstance(shown, TestView)
+    return shown
 
 
 def running(*, n_effective: float = 100.0) -> tuple[Message, Message]:
@@ -112,15 +125,15 @@ async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> N
     async with app.run_test(size=NARROW) as pilot:
         await shown(pilot, app, *running())
         both = ("three-sensor", "three-channel")
-        assert app.choice.methods == both
+        assert view(app).choice.methods == both
         for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
             await pilot.press(key)
-            assert app.choice.channel == channel
-        title = app.query_one("#title", Static)
+            assert view(app).choice.channel == channel
+        title = app.screen.query_one("#title", Static)
         assert "C X" in str(title.render())
         for methods in (("three-sensor",), ("three-channel",), both):
             await pilot.press("e")
-            assert app.choice.methods == methods
+            assert view(app).choice.methods == methods
 
 
 async def test_trouble_is_told(told: ProgressCallback) -> None:
@@ -195,7 +208,7 @@ async def test_names_are_shown_as_they_are(
         assert f"/dev/{sensors[0]}" in text
         assert f"{sensors[2]} [/dropped]" in text
         assert f"{sensors[0]} → {sensors[1]}" in text
-        await pilot.press("escape", "r")
+        await pilot.press("escape", "3")
         await shown(pilot, app)
         result = screen_text(app)
         assert all(f"{name}.X" in result for name in sensors)
@@ -207,6 +220,7 @@ async def test_names_are_shown_as_they_are(
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    told.bench = demo_bench()
     app = HuddleApp(told)
     async with app.run_test(size=size) as pilot:
         await app.workers.wait_for_complete()
@@ -229,10 +243,10 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await pilot.press("escape")
         await shown(pilot, app, *ended())
         await assert_looks_as_before(pilot, f"{name}-result")
-        await pilot.press("escape")
+        await pilot.press("2")
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-ended")
-        assert screen_text(app).splitlines()[-1].endswith("←→↑↓ Select")  # the longest line of keys
+        assert screen_text(app).splitlines()[-1].endswith("q Quit")  # the longest line of keys
         await pilot.press("question_mark")
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-help")
@@ -310,7 +324,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
         live = tuple(replace(sensor, state=SensorState.LIVE) for sensor in made_now().sensors)
         now = replace(made_now(), sensors=live, ends_in=100.0)
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(snapshot, settings))
-        line = str(app.query_one("#progress", Static).content)
+        line = str(app.screen.query_one("#progress", Static).content)
     assert line.endswith("ends in 2 min")
     assert (" · target in 3 h · " in line) == (target is not None)
     bar = line.split(maxsplit=1)[0]

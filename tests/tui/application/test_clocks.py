@@ -12,8 +12,8 @@ from daq.drivers.bench_file import parse
 from daq.estimation.snapshot import SnapshotDiagnostics, Synchronisation
 from daq.results.clock_effect import effect, effect_by_sensor
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
-from tui.application.clocks import clock_line, drift_lines, drift_title
-from tui.application.plot import TimeAxis
+from tui.application.test_view.clocks import clock_line, drift_lines, drift_title
+from tui.application.test_view.plot import TimeAxis
 from tui.commands.demo import compare
 from tui.report.evidence import clocks_section
 from tui.report.parts import Paragraph, Table

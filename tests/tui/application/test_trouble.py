@@ -14,7 +14,7 @@ from daq.errors import HuddleError
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level
 from tests.tui.application.screen_text import screen_text
-from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
+from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
@@ -56,7 +56,7 @@ async def test_starting_over_a_result_is_asked_first(
         await app.workers.wait_for_complete()
         await shown(pilot, app, *running())
         await shown(pilot, app, *ended())
-        await pilot.press("escape", "s")
+        await pilot.press("s")
         await shown(pilot, app)
         assert "Start a new recording? old.h5 is kept" in screen_text(app)
         await pilot.press("s", "enter", "x", "escape")  # none of them starts
@@ -77,7 +77,7 @@ async def test_why_no_recording_started_stays_on_the_screen(
         await pilot.press("s")
         await app.workers.wait_for_complete()
         await shown(pilot, app)
-        await pilot.press("escape", "d", "escape")
+        await pilot.press("escape", "2", "d", "escape", "1")
         text = screen_text(app)
         assert "sensor A at /dev/ttyUSB0: no answer" in text
         assert "sensor C at /dev/ttyUSB2: no such port" in text
@@ -127,7 +127,7 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
             text = screen_text(app)
             assert "c.o.v. 0.461 → 0.05" in text
             assert "target reached" not in text
-        assert app.choice.methods != ("three-sensor",)
+        assert view(app).choice.methods != ("three-sensor",)
 
 
 async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressCallback) -> None:

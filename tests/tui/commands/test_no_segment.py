@@ -13,7 +13,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from estimator.spectra.segment_rejection import Reason
 from tests.daq.alignment.recordings import write_polled
-from tui.application.panels import findings
+from tui.application.test_view.panels import findings
 from tui.commands.watch import watch_recording
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The result and the details in the application. Does not use Textual."""
+"""The result of a test as text. Does not use Textual."""
 
 from __future__ import annotations
 
@@ -9,63 +9,54 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of, channel_means, data_means
-from daq.results.limits import judge
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from daq.results.verdict import Verdict
-from tui.application.panels import alerts, grouped, state
-from tui.output.diagnostics import details as diagnosis_details
+from tui.application.dialogs import item
+from tui.application.test_view.panels import alerts
 from tui.output.diagnostics import summary
-from tui.output.formatting import clock_time, level, level_with_error, utc
-from tui.output.results import left_out, remarks
+from tui.output.formatting import clock_time, level, level_with_error
+from tui.output.results import remarks
 from tui.output.verdict_text import MARKS, STYLES, headline, limit_line, what_to_do
 from tui.output.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from rich.console import RenderableType
 
-    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
+    from daq.results.verdict import TestVerdict
+    from tui.application.state import State
 
-LATEST_EVENTS = 200
-MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
+MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 
 
-def result(
-    now: RecordingStatus | None,
-    snapshot: Snapshot,
-    settings: Settings,
-    *,
-    bench: Bench | None,
-    path: Path | None,
-) -> RenderableType:
+def result(state: State) -> RenderableType:
     """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
-    parts: list[RenderableType] = [*_verdict(snapshot, settings, bench)]
+    now, snapshot, settings, path = state.now, state.snapshot, state.settings, state.path
+    if snapshot is None or settings is None:
+        return ""
+    parts: list[RenderableType] = [*_verdict(snapshot, settings, state.verdict)]
     wrong = [] if now is None else alerts(now, settings)
     parts += ["", *wrong] if wrong else []
     parts.append("")
     if snapshot.results:
         parts += [_channels(snapshot, settings), ""]
-    parts += [_item(line) for line in (*remarks(snapshot), *summary(snapshot))]
+    parts += [item(line) for line in (*remarks(snapshot), *summary(snapshot))]
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
     return Group(*parts)
 
 
-def _verdict(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> Iterator[Text]:
+def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) -> Iterator[Text]:
     if not snapshot.results:
         yield Text("No result: nothing can be said of the sensors' noise.", BAD)
         for method, why in snapshot.refused.items():
             yield Text(f"{method}: {why}", BAD)
         return
-    found = judge(bench, snapshot, settings)
     if found is None:
         yield Text("No limits in the bench file: neither passed nor failed.", MUTED)
     else:
@@ -118,69 +109,4 @@ def _channels(snapshot: Snapshot, settings: Settings) -> Table:
             level(high),
             "?" if math.isnan(cov[column]) else f"{cov[column]:.3f}",
         )
-    return table
-
-
-def details(
-    now: RecordingStatus, snapshot: Snapshot | None, settings: Settings | None, *, trouble: str
-) -> RenderableType:
-    """Return everything that is known of a test: sensors, segments, diagnosis, events."""
-    parts: list[RenderableType] = [Text(trouble, BAD), ""] if trouble else []
-    parts += [Text(f"sensors, since {utc(now.started_utc_ns)}", HEADER), _sensors(now)]
-    if snapshot is not None and settings is not None:
-        parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
-        parts += [_item(f"{method}: {why}") for method, why in snapshot.refused.items()]
-        parts += ["", Text("diagnosis", HEADER)]
-        parts += diagnosis_details(snapshot)
-    parts += ["", Text("events, latest first", HEADER), _events(now)]
-    return Group(*parts)
-
-
-def _sensors(now: RecordingStatus) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
-    for title in ("sensor", "state", "gaps", "missing", "clipped"):
-        table.add_column(title, no_wrap=True)
-    table.add_column("port", overflow="fold")
-    for sensor in now.sensors:
-        table.add_row(
-            Text(sensor.name, "bold"),
-            state(sensor),
-            grouped(sensor.n_gaps),
-            f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
-            f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
-            Text(sensor.port),
-        )
-    return table
-
-
-def _segments(snapshot: Snapshot, settings: Settings) -> Text:
-    text = (
-        f"{snapshot.n_segments} of {settings.segment:g} s ({settings.window}, "
-        f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"
-    )
-    if snapshot.n_dropped:
-        text += f"; {snapshot.n_dropped} excluded{left_out(snapshot)}"
-    return Text(text)
-
-
-def _events(now: RecordingStatus) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
-    table.add_column(justify="right", style=MUTED, no_wrap=True)
-    for _ in range(2):
-        table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    shown = now.events[-LATEST_EVENTS:]
-    for event in reversed(shown):
-        at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
-        style = "bold #f4a261" if event.kind == EventKind.MARK else ""
-        table.add_row(clock_time(at), Text(event.sensor), Text(event.kind, style), Text(event.text))
-    if len(shown) < len(now.events):
-        table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
-    return table
-
-
-def _item(text: str) -> Table:
-    """Return a paragraph of a list."""
-    table = Table.grid(padding=(0, 1, 0, 0))
-    table.add_row(Text("·", MUTED), Text(text))
     return table

@@ -12,14 +12,14 @@ from textual.filter import Monochrome
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
-from tui.application.curves import level_limits
+from tui.application.test_view.curves import level_limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from textual.color import Color
 
-    from tui.application.curves import Curve, Line
+    from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
 MARKED = 12  # points from one mark of a curve to the next

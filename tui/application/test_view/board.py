@@ -1,72 +1,26 @@
-"""The one screen of the application: everything it shows of a bench and its recording."""
+"""What the Test view shows: curves, sensors, clocks, progress, alerts and advice."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich.text import Text
 from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
-from daq.results.limits import judge
-from tui.application import clocks, panels
-from tui.application.plot import DriftPlot, PsdPlot
-from tui.output.formatting import clock_time
-from tui.output.verdict_text import STYLES, WORDS
+from tui.application.test_view import clocks, panels
+from tui.application.test_view.plot import DriftPlot, PsdPlot
+from tui.application.view import TALL
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import RenderableType
     from textual.app import ComposeResult
     from textual.events import Resize
 
-    from daq.bench.model import Bench
-    from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
-    from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
+    from tui.application.state import State
 
-TALL = 34  # rows from which there is room for remarks and air
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-
-
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """The state of the screen.
-
-    Attributes
-    ----------
-    name : str
-        Of the bench.
-    description : object
-        Shown in place of sensors and curves until the first snapshot.
-    choice : view.Choice
-    path : Path or None
-        The recording.
-    now, snapshot, settings : Now, Snapshot and Settings, or None
-        What is known of it.
-    trouble : str
-        Why the recording is no longer followed.
-    failure : str
-        Why no recording could be started, a line for each sensor.
-    note : str
-        Notice in place of the progress.
-    """
-
-    name: str
-    description: RenderableType
-    choice: panels.Choice
-    path: Path | None = None
-    now: RecordingStatus | None = None
-    snapshot: Snapshot | None = None
-    settings: Settings | None = None
-    trouble: str = ""
-    failure: str = ""
-    note: str = ""
-    bench: Bench | None = None
 
 
 class Board(Vertical):
@@ -74,15 +28,14 @@ class Board(Vertical):
 
     def __init__(self) -> None:
         super().__init__()
-        self._shown: Shown | None = None
+        self._shown: State | None = None
+        self._choice = panels.Choice()
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
-        self._judged: tuple[object, TestVerdict | None] = (None, None)
         self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
 
     def compose(self) -> ComposeResult:
         """Lay out the screen."""
-        yield Static(id="status")
         yield Static(id="title")
         yield PsdPlot(id="plot")
         yield DriftPlot(id="drift")
@@ -95,17 +48,18 @@ class Board(Vertical):
 
     def on_resize(self, event: Resize) -> None:
         """Fit the screen's size."""
-        self.set_class(event.size.height >= TALL, "-tall")
+        self.set_class(event.size.height + 2 >= TALL, "-tall")  # beside status line and footer
         self._drawn = None
         self.call_after_refresh(self._draw)
 
-    def show(self, shown: Shown) -> None:
+    def show(self, shown: State, choice: panels.Choice) -> None:
         """Show this."""
-        before, self._shown = self._shown, shown
-        self.set_class(shown.choice.clocks, "-clocks")
+        before, self._shown = self._choice, shown
+        self._choice = choice
+        self.set_class(choice.clocks, "-clocks")
         self.set_class(shown.snapshot is None or shown.now is None, "-idle")
         self._draw_texts()
-        if before is None or before.choice != shown.choice:
+        if before != choice:
             self._scroll_to_chosen()
         self.call_after_refresh(self._draw_curves)  # when they have been given their room
 
@@ -117,19 +71,17 @@ class Board(Vertical):
         shown = self._shown
         if shown is None:
             return
-        status = _status(shown, self._verdict(shown), width=self.size.width)
-        self._write("#status", status)
         self._write_alerts(shown)
-        now, snapshot, settings, choice = shown.now, shown.snapshot, shown.settings, shown.choice
+        now, snapshot, settings, choice = shown.now, shown.snapshot, shown.settings, self._choice
         width = self.size.width - 2
         if now is None or snapshot is None or settings is None:
-            table = shown.description if now is None else panels.state_table(now, shown.trouble)
+            table = Text("") if now is None else panels.state_table(now, shown.trouble)
             self._write("#table", table, n_lines=-1)
-            waiting = "s starts a recording · ? helps" if shown.path is None else "opening …"
+            waiting = "no test yet: s starts one · ? helps" if shown.path is None else "opening …"
             self._write("#progress", Text(shown.note or waiting, MUTED))
             return
         if choice.clocks:
-            table = clocks.clock_table(snapshot, settings, chosen=_sensor(shown), width=width - 1)
+            table = clocks.clock_table(snapshot, settings, chosen=self._sensor(), width=width - 1)
         else:
             table = panels.sensor_table(
                 now,
@@ -144,37 +96,22 @@ class Board(Vertical):
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
         progress = panels.progress_line(now, snapshot, settings, width=width)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
-        self._write("#advice", panels.advice(snapshot, choice, self._verdict(shown)))
+        self._write("#advice", panels.advice(snapshot, choice, shown.verdict))
 
-    def _noise(self, shown: Shown) -> tuple[BandMeans, ...]:
+    def _noise(self, shown: State) -> tuple[BandMeans, ...]:
         """Return the channels' noise, computed once for each snapshot."""
         snapshot, settings = shown.snapshot, shown.settings
         if snapshot is None or settings is None:
             return ()
-        key = (id(snapshot), shown.choice.methods)
+        key = (id(snapshot), self._choice.methods)
         if self._means[0] != key:
-            self._means = key, panels.noise_in_band(snapshot, settings, shown.choice)
+            self._means = key, panels.noise_in_band(snapshot, settings, self._choice)
         return self._means[1]
 
-    def _verdict(self, shown: Shown) -> TestVerdict | None:
-        """Return the verdict so far, computed once for each snapshot."""
-        snapshot, settings = shown.snapshot, shown.settings
-        if snapshot is None or settings is None:
-            return None
-        if self._judged[0] != id(snapshot):
-            self._judged = id(snapshot), judge(shown.bench, snapshot, settings)
-        return self._judged[1]
-
-    def _write_alerts(self, shown: Shown) -> None:
+    def _write_alerts(self, shown: State) -> None:
         alerts = [] if shown.now is None else panels.alerts(shown.now, shown.settings)
         if shown.snapshot is not None and not shown.trouble:
             alerts += panels.findings(shown.snapshot, width=self.size.width - 10)
-        if shown.failure:
-            lines = shown.failure.splitlines()
-            alerts = [Text(f"▲ {line}", BAD) for line in lines[:5]]
-            self.set_class(True, "-alert")
-            self._write("#alert", Text("\n").join(alerts), n_lines=-1)
-            return
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1
@@ -188,7 +125,7 @@ class Board(Vertical):
         shown = self._shown
         if shown is None or shown.snapshot is None or shown.settings is None:
             return
-        snapshot, settings, choice = shown.snapshot, shown.settings, shown.choice
+        snapshot, settings, choice = shown.snapshot, shown.settings, self._choice
         psd, drift = self.query_one(PsdPlot), self.query_one(DriftPlot)
         drawn = (id(snapshot), choice, (drift if choice.clocks else psd).size)
         if drawn == self._drawn:
@@ -196,7 +133,7 @@ class Board(Vertical):
         self._drawn = drawn
         if choice.clocks:
             self._write("#title", clocks.drift_title(snapshot))
-            lines = clocks.drift_lines(snapshot, chosen=_sensor(shown), n_points=drift.n_points)
+            lines = clocks.drift_lines(snapshot, chosen=self._sensor(), n_points=drift.n_points)
             drift.show(lines)
         else:
             psd.visible = snapshot.n_segments > 0
@@ -216,34 +153,12 @@ class Board(Vertical):
         shown = self._shown
         if shown is None or shown.snapshot is None or shown.now is None:
             return
-        row = 1 + [sensor.name for sensor in shown.now.sensors].index(_sensor(shown))
+        row = 1 + [sensor.name for sensor in shown.now.sensors].index(self._sensor())
         area = self.query_one("#sensors", VerticalScroll)
         if not area.scroll_y <= row < area.scroll_y + area.size.height:
             area.scroll_to(y=max(0, row + 1 - area.size.height), animate=False)
 
-
-def _sensor(shown: Shown) -> str:
-    """Return the name of the chosen sensor."""
-    return "" if shown.snapshot is None else shown.snapshot.channels[shown.choice.channel].sensor
-
-
-def _status(shown: Shown, verdict: TestVerdict | None, *, width: int) -> Text:
-    now = shown.now
-    line = Text()
-    line.append("huddle ", "bold #4cc9f0")
-    line.append(f" {shown.name}  ", "bold")
-    if now is not None and now.closed:
-        line.append("■ ended", MUTED)
-    elif shown.trouble:
-        line.append("▲ not followed any more", BAD)
-    elif now is None:
-        line.append("○ no recording" if shown.path is None else "○ opening", MUTED)
-    else:
-        line.append("● recording", BAD)
-    if now is not None:
-        line.append(f"  {clock_time(now.elapsed)}")
-    if verdict is not None:
-        line.append(f"  {WORDS[verdict.verdict]}", STYLES[verdict.verdict])
-    if shown.path is not None and len(shown.path.name) <= width - line.cell_len - 4:
-        line.append(f"  {shown.path.name}", MUTED)
-    return line
+    def _sensor(self) -> str:
+        """Return the name of the chosen sensor."""
+        snapshot = None if self._shown is None else self._shown.snapshot
+        return "" if snapshot is None else snapshot.channels[self._choice.channel].sensor

@@ -16,7 +16,7 @@ from daq.results.band_summary import band_of, channel_means, correlation_of, dec
 from daq.results.partners import without_partners
 from daq.results.precision import precision
 from estimator.diagnostics.kinds import Level
-from tui.application.curves import data_curve, noise_curve
+from tui.application.test_view.curves import data_curve, noise_curve
 from tui.output.advice.alerts import alert
 from tui.output.advice.sentences import Names
 from tui.output.formatting import clock_time, roughly, several, signed, time_left
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from daq.results.partners import WithoutPartner
     from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
-    from tui.application.curves import Curve
+    from tui.application.test_view.curves import Curve
 
 DATA_STYLE, MUTED = "#7d8799", "#9aa5b8"
 STYLES = {

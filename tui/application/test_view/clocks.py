@@ -20,7 +20,7 @@ from daq.results.clock_effect import (
     residuals,
 )
 from daq.timing.clock_model import ClockSource
-from tui.application.curves import Line
+from tui.application.test_view.curves import Line
 from tui.output.vocabulary import clock_source
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Screens over the application: help, questions, and texts to read."""
+"""Dialogs over a view: help, questions, and texts to read."""
 
 from __future__ import annotations
 
@@ -20,15 +20,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from textual.app import ComposeResult
 
-KEYS = (
-    ("s", "start a recording of this bench"),
-    ("x", "stop it; the result is then computed from the whole recording"),
-    ("m", "mark this moment in the recording, with a remark"),
-    ("← → ↑ ↓", "channel, and sensor"),
-    ("e", "estimate shown: each method in turn, then all"),
-    ("c", "clocks: how they drift, and whether that matters; c again: noise"),
-    ("d", "details: states, segments, diagnosis, events"),
-    ("r", "result, when the recording has ended"),
+EVERYWHERE = (
+    ("1 2 3", "the views: bench, test, result"),
+    ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording goes on, and is found again"),
 )
 WORDS = (
@@ -61,9 +55,16 @@ def _pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
     return table
 
 
-def help_text() -> RenderableType:
+def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:
     """Return what each key does and what each word on the screen means."""
-    return Group(_pairs(KEYS, "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
+    return Group(_pairs((*keys, *EVERYWHERE), "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
+
+
+def item(text: str) -> Table:
+    """Return a paragraph of a list."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    table.add_row(Text("·", "#9aa5b8"), Text(text))
+    return table
 
 
 class TextScreen(ModalScreen[None]):
@@ -108,18 +109,6 @@ class TextScreen(ModalScreen[None]):
     def rewrite(self) -> None:
         """Update the text."""
         self.query_one(Static).update(self._content())
-
-
-class ResultScreen(TextScreen):
-    """The end of a test; its report can be written from here."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("w", "app.report", "Report")]
-
-    def on_mount(self) -> None:
-        """Say what can be done here."""
-        super().on_mount()
-        scroll = self.query_one(VerticalScroll)
-        scroll.border_subtitle = "↑ ↓ scroll · w writes the report · esc closes, r reopens"
 
 
 class MarkScreen(ModalScreen[str | None]):

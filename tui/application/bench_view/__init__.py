@@ -1,0 +1,1 @@
+"""The Bench view: sensors and checks before a test."""

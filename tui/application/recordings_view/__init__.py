@@ -1,0 +1,1 @@
+"""The Recordings view: what the bench has recorded."""

@@ -1,0 +1,1 @@
+"""The Result view: verdict, margins and noise of a test that has ended."""

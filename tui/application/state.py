@@ -1,0 +1,82 @@
+"""The state of the application, which every view draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
+    from daq.results.verdict import TestVerdict
+
+BENCH, TEST, RESULT = VIEWS = ("bench", "test", "result")
+TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """What is known of the bench and of the recording that is followed.
+
+    Attributes
+    ----------
+    name : str
+        Of the bench, or of the recording.
+    bench : Bench or None
+    can_start : bool
+        Whether a recording can be started from here.
+    path : Path or None
+        The recording.
+    now, snapshot, settings : RecordingStatus, Snapshot and Settings, or None
+        What is known of it.
+    verdict : TestVerdict or None
+        On the limits, of `snapshot`.
+    trouble : str
+        Why the recording is no longer followed.
+    failure : str
+        Why no recording could be started, a line for each sensor.
+    note : str
+        Notice in place of the progress.
+    is_starting : bool
+        Whether a recorder is being started.
+    """
+
+    name: str
+    bench: Bench | None = None
+    can_start: bool = False
+    path: Path | None = None
+    now: RecordingStatus | None = None
+    snapshot: Snapshot | None = None
+    settings: Settings | None = None
+    verdict: TestVerdict | None = None
+    trouble: str = ""
+    failure: str = ""
+    note: str = ""
+    is_starting: bool = False
+
+    @property
+    def has_result(self) -> bool:
+        """Whether the recording has ended and its result is known."""
+        return self.snapshot is not None and self.snapshot.closed
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether a recording is running that is followed here."""
+        if self.trouble or self.has_result:
+            return False
+        return self.path is not None if self.now is None else not self.now.closed
+
+    @property
+    def offers(self) -> tuple[object, ...]:
+        """What decides which keys do something."""
+        return (
+            self.is_recording,
+            self.has_result,
+            self.is_starting,
+            self.snapshot is None,
+            self.path,
+        )

@@ -1,0 +1,1 @@
+"""The Test view: the live estimate of one recording."""

@@ -1,0 +1,84 @@
+"""Everything that is known of a test, as text. Does not use Textual."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from daq.protocols.block import EventKind
+from tui.application.dialogs import item
+from tui.application.test_view.panels import grouped, state
+from tui.output.diagnostics import details as diagnosis_details
+from tui.output.formatting import clock_time, utc
+from tui.output.results import left_out
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.recording.monitor import RecordingStatus
+
+LATEST_EVENTS = 200
+MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
+
+
+def details(
+    now: RecordingStatus, snapshot: Snapshot | None, settings: Settings | None, *, trouble: str
+) -> RenderableType:
+    """Return everything that is known of a test: sensors, segments, diagnosis, events."""
+    parts: list[RenderableType] = [Text(trouble, BAD), ""] if trouble else []
+    parts += [Text(f"sensors, since {utc(now.started_utc_ns)}", HEADER), _sensors(now)]
+    if snapshot is not None and settings is not None:
+        parts += ["", Text("segments", HEADER), _segments(snapshot, settings)]
+        parts += [item(f"{method}: {why}") for method, why in snapshot.refused.items()]
+        parts += ["", Text("diagnosis", HEADER)]
+        parts += diagnosis_details(snapshot)
+    parts += ["", Text("events, latest first", HEADER), _events(now)]
+    return Group(*parts)
+
+
+def _sensors(now: RecordingStatus) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
+    for title in ("sensor", "state", "gaps", "missing", "clipped"):
+        table.add_column(title, no_wrap=True)
+    table.add_column("port", overflow="fold")
+    for sensor in now.sensors:
+        table.add_row(
+            Text(sensor.name, "bold"),
+            state(sensor),
+            grouped(sensor.n_gaps),
+            f"{grouped(sensor.n_missing)} samples" if sensor.n_missing else "0",
+            f"{grouped(sensor.n_clipped)} blocks" if sensor.n_clipped else "no",
+            Text(sensor.port),
+        )
+    return table
+
+
+def _segments(snapshot: Snapshot, settings: Settings) -> Text:
+    text = (
+        f"{snapshot.n_segments} of {settings.segment:g} s ({settings.window}, "
+        f"{settings.overlap:.0%} overlap), worth {snapshot.n_effective:.0f} independent averages"
+    )
+    if snapshot.n_dropped:
+        text += f"; {snapshot.n_dropped} excluded{left_out(snapshot)}"
+    return Text(text)
+
+
+def _events(now: RecordingStatus) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
+    table.add_column(justify="right", style=MUTED, no_wrap=True)
+    for _ in range(2):
+        table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    shown = now.events[-LATEST_EVENTS:]
+    for event in reversed(shown):
+        at = (event.received.utc_ns - now.started_utc_ns) * 1e-9
+        style = "bold #f4a261" if event.kind == EventKind.MARK else ""
+        table.add_row(clock_time(at), Text(event.sensor), Text(event.kind, style), Text(event.text))
+    if len(shown) < len(now.events):
+        table.add_row("", "", "", f"and {len(now.events) - len(shown)} before")
+    return table

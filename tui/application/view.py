@@ -1,0 +1,136 @@
+"""What all views share: the line at the top, the keys at the bottom, and help."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from rich.style import Style
+from rich.text import Text
+from textual.screen import Screen
+from textual.widgets import Footer, Static
+
+from tui.application.dialogs import TextScreen, help_text
+from tui.application.state import TITLES, VIEWS
+from tui.output.formatting import clock_time
+from tui.output.verdict_text import STYLES, WORDS
+
+if TYPE_CHECKING:
+    from textual.app import ComposeResult
+    from textual.events import Resize
+
+    from tui.application.state import State
+
+MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
+TALL = 34  # rows from which there is room for remarks and air
+ALL_TABS = 60  # columns from which the titles of all views fit
+
+
+class View(Screen[None]):
+    """One view of the application. Draws the state that `show` hands over.
+
+    Attributes
+    ----------
+    name : str
+        One of `VIEWS`.
+    KEYS : sequence of (str, str)
+        Keys of the view and what they do, for its help.
+    """
+
+    VIEW: ClassVar[str]
+    KEYS: ClassVar[tuple[tuple[str, str], ...]] = ()
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        self._state = state
+        self._offered: tuple[object, ...] | None = None
+        self._is_ready = False
+
+    @property
+    def state(self) -> State:
+        """What is shown."""
+        return self._state
+
+    def compose(self) -> ComposeResult:
+        """Lay out the frame around the parts of a view."""
+        yield Static(id="status")
+        yield from self.parts()
+        yield Footer(show_command_palette=False)
+
+    def parts(self) -> ComposeResult:
+        """Yield what the view consists of."""
+        raise NotImplementedError
+
+    def draw(self) -> None:
+        """Draw the state."""
+        raise NotImplementedError
+
+    def show(self, state: State) -> None:
+        """Show this state."""
+        self._state = state
+        if not self._is_ready:
+            return
+        self._write_status()
+        self.draw()
+        if state.offers != self._offered:
+            self._offered = state.offers
+            self.refresh_bindings()
+
+    def on_mount(self) -> None:
+        """Draw for the first time."""
+        self._is_ready = True
+        self.show(self._state)
+
+    def on_resize(self, event: Resize) -> None:
+        """Fit the terminal's size."""
+        self.set_class(event.size.height >= TALL, "-tall")
+        self._write_status()
+
+    def action_help(self) -> None:
+        """Say what keys and words mean."""
+        title = f"huddle: {TITLES[self.VIEW]} view"
+        self.app.push_screen(TextScreen(title, lambda: help_text(self.KEYS)))
+
+    def _write_status(self) -> None:
+        if self._is_ready:
+            self.query_one("#status", Static).update(
+                status_line(self._state, self.VIEW, width=self.app.size.width), layout=False
+            )
+
+
+def status_line(state: State, view: str, *, width: int) -> Text:
+    """Return the line at the top: views, bench, what the recording does, verdict, file."""
+    line = Text()
+    for number, name in enumerate(VIEWS, start=1):
+        if name == view:
+            line.append(f" {number} {TITLES[name]} ", "bold reverse")
+        elif width >= ALL_TABS:
+            opens = Style(color=MUTED, meta={"@click": f"app.view('{name}')"})
+            line.append(f" {number} {TITLES[name]} ", opens)
+    line.append(" ")
+    now, path = state.now, state.path
+    doing = _doing(state)
+    if now is not None:
+        doing.append(f"  {clock_time(now.elapsed)}")
+    if state.verdict is not None:
+        doing.append(f"  {WORDS[state.verdict.verdict]}", STYLES[state.verdict.verdict])
+    room = width - 2 - line.cell_len - doing.cell_len
+    if len(state.name) + 2 <= room:
+        line.append(f"{state.name}  ", "bold")
+        room -= len(state.name) + 2
+    line.append_text(doing)
+    if path is not None and len(path.name) + 2 <= room:
+        line.append(f"  {path.name}", MUTED)
+    return line
+
+
+def _doing(state: State) -> Text:
+    now = state.now
+    if now is not None and now.closed:
+        return Text("■ ended", MUTED)
+    if state.trouble:
+        return Text("▲ not followed any more", BAD)
+    if state.is_starting:
+        return Text("○ starting", MUTED)
+    if now is None:
+        return Text("○ no recording" if state.path is None else "○ opening", MUTED)
+    return Text("● recording", BAD)
