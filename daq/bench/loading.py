@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from daq.bench.field_faults import field_faults
+from daq.bench.mask_file import embed_masks
 from daq.bench.model import Bench
 from daq.bench.validation import cross_faults
 from daq.errors import BenchFileError, FileFault
@@ -50,6 +51,10 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
             found = f"byte {error.start} is not UTF-8 text"
         fault = FileFault("", f"{found}; expected a bench file (.toml)")
         raise BenchFileError(fault, source=source) from None
+    _table(text, source)
+    text, faults = embed_masks(text, source.parent)
+    if faults:
+        raise BenchFileError(*faults, source=source)
     return parse(text, source, drivers)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -26,7 +27,9 @@ from pydantic import (
 
 from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
+from daq.bench.masks import NOISE_MODELS, Mask, check_points
 from daq.bench.toml_text import to_toml
+from daq.bench.units import DensityUnit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -256,12 +259,51 @@ class Limit(Table):
     """A noise mask for pass or fail: the noise PSD's upper bound, straight in log-log between."""
 
     name: Name = Field(description="the limit's name")
-    frequency: tuple[PositiveNumber, ...] = Field(min_length=2, description="frequencies in Hz")
-    psd: tuple[PositiveNumber, ...] = Field(min_length=2, description="noise PSD in unit²/Hz")
+    frequency: tuple[PositiveNumber, ...] = Field((), description="frequencies in Hz")
+    psd: tuple[Number, ...] = Field((), description="noise PSD in unit²/Hz")
+    unit: str | None = None
+    """Of ``psd``, such as ``µg/√Hz``; the channel's unit²/Hz, if not given."""
+    model: str | None = None
+    """Name of a published model (`daq.bench.masks.NOISE_MODELS`), in place of the points."""
+    file: str | None = None
+    """CSV file with the points, beside the bench file; read when the bench file is."""
     sensors: tuple[str, ...] = ()
     """Names of the sensors it holds for; all, if empty."""
     channels: tuple[str, ...] = ()
     """Names of the channels it holds for; all, if empty."""
+
+    @model_validator(mode="after")
+    def _is_a_mask(self) -> Limit:
+        if self.file is not None:
+            raise ValueError("file: expected frequency and psd, or model, in a recording")
+        if self.model is not None:
+            if self.model.lower() not in NOISE_MODELS:
+                raise ValueError(f"model: expected one of {', '.join(NOISE_MODELS)}")
+            if self.frequency or self.psd or self.unit:
+                raise ValueError("model: expected without frequency, psd and unit")
+        elif not self.frequency and not self.psd:
+            raise ValueError("expected frequency and psd, or model, or file")
+        else:
+            unit = None if self.unit is None else DensityUnit.parse(self.unit)
+            check_points(self.frequency, self.psd)
+            if min(self.psd) <= 0 and (unit is None or not unit.is_level):
+                raise ValueError("psd: expected numbers above 0")
+        return self
+
+    def concerns(self, sensor: str, channel: str) -> bool:
+        """Whether the mask is for a channel, by the names of sensor and channel."""
+        return (not self.sensors or sensor in self.sensors) and (
+            not self.channels or channel in self.channels
+        )
+
+    @property
+    def mask(self) -> Mask:
+        """The mask itself."""
+        if self.model is not None:
+            return replace(NOISE_MODELS[self.model.lower()], name=self.name)
+        unit = None if self.unit is None else DensityUnit.parse(self.unit)
+        psd = self.psd if unit is None else tuple(map(unit.psd, self.psd))
+        return Mask(self.name, None if unit is None else unit.unit, self.frequency, psd)
 
 
 class Bench(Table):

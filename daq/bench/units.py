@@ -1,7 +1,9 @@
-"""Units of ground motion, and the way from one to another through powers of iω."""
+"""Units of ground motion and of noise density, and the way from one to another."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +20,7 @@ _MOTION = {
     "g": (2, 9.80665),
     "mg": (2, 9.80665e-3),
     "µg": (2, 9.80665e-6),
+    "ng": (2, 9.80665e-9),
     "Gal": (2, 1e-2),
     "m/s": (1, 1.0),
     "mm/s": (1, 1e-3),
@@ -78,3 +81,57 @@ def conversion(unit: str, wanted: str, frequency: NDArray[np.float64]) -> NDArra
     with np.errstate(divide="ignore", invalid="ignore"):
         power = (2j * np.pi * frequency) ** (wanted_derivatives - derivatives)
     return np.asarray(power * (si / wanted_si), dtype=np.complex128)
+
+
+_FORMS = "such as µg/√Hz, (m/s²)²/Hz, g²/Hz or dB re 1 (m/s²)²/Hz"
+_LEVEL = re.compile(r"dB\b(?:\s*(?:re|rel|ref|relative to)\b\.?)?(?:\s+1\b)?\s*(.*)")
+_ROOT = re.compile(r"(\(.+\)|.+?)\s*/\s*(?:√\s*Hz|rt\s*Hz|sqrt\(Hz\)|Hz(?:\^|\*\*)0\.5)")
+_SQUARE = re.compile(r"(\(.+\)|[^()/]+?)\s*(?:²|\^2|\*\*2)\s*/\s*Hz")
+_ACCELERATION = re.compile(r"m(?:²|\^2|\*\*2)/s(?:⁴|\^4|\*\*4)/Hz")
+
+
+@dataclass(frozen=True, slots=True)
+class DensityUnit:
+    """Unit of the numbers of a noise density.
+
+    Attributes
+    ----------
+    unit : str
+        Of the motion.
+    is_root : bool
+        Whether the numbers are roots of a PSD, per √Hz.
+    is_level : bool
+        Whether they are in dB.
+    """
+
+    unit: str
+    is_root: bool = False
+    is_level: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> DensityUnit:
+        """Read a unit such as ``µg/√Hz`` or ``dB re 1 (m/s²)²/Hz``.
+
+        Raises
+        ------
+        ValueError
+            With the forms that are known.
+        """
+        level = _LEVEL.fullmatch(text.strip())
+        inner = text.strip() if level is None else level[1]
+        if not inner:
+            raise ValueError(f"{text!r}: expected what 0 dB is, {_FORMS}")
+        if _ACCELERATION.fullmatch(inner):
+            return cls("m/s²", is_level=level is not None)
+        square, root = _SQUARE.fullmatch(inner), _ROOT.fullmatch(inner)
+        found = square or root
+        if found is None:
+            raise ValueError(f"{text!r}: expected a unit of noise density, {_FORMS}")
+        unit = canonical(found[1].removeprefix("(").removesuffix(")"))
+        return cls(unit, is_root=square is None, is_level=level is not None)
+
+    def psd(self, value: float) -> float:
+        """Return a number in this unit as a PSD in unit**2/Hz."""
+        if self.is_level:
+            return float(10 ** (value / 10))
+        return value**2 if self.is_root else value

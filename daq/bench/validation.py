@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from daq.bench.driver_rules import Checking
@@ -18,7 +19,7 @@ from daq.bench.model import (
     estimate_settings,
     valid_rate,
 )
-from daq.errors import BenchFileError, FileFault
+from daq.errors import BenchFileError, FileFault, WrongSettingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -239,22 +240,28 @@ def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterat
         if limit is None:
             continue
         key = f'limits["{limit.name}"]'
-        if len(limit.psd) != len(limit.frequency):
-            yield FileFault(
-                f"{key}.psd",
-                f"expected {len(limit.frequency)}, one for each frequency",
-                f"{len(limit.psd)} values",
-            )
-        if any(b <= a for a, b in zip(limit.frequency, limit.frequency[1:], strict=False)):
-            yield FileFault(
-                f"{key}.frequency", "expected increasing frequencies", list(limit.frequency)
-            )
         for name in limit.sensors:
             if name not in known_sensors:
                 yield FileFault(f"{key}.sensors", one_of(name, known_sensors), name)
         for name in limit.channels:
             if name not in known_channels:
                 yield FileFault(f"{key}.channels", one_of(name, known_channels), name)
+        yield from _limit_unit_faults(limit, key, sensors)
+
+
+def _limit_unit_faults(limit: Limit, key: str, sensors: Sequence[Sensor]) -> Iterator[FileFault]:
+    """Yield a fault where a mask cannot be turned into the unit of a channel that it is for."""
+    for sensor in sensors:
+        for channel in sensor.channels:
+            if channel.auxiliary or not limit.concerns(sensor.name, channel.name):
+                continue
+            try:
+                limit.mask.at(np.ones(1), channel.unit)
+            except WrongSettingError as error:
+                where = f"{key}.{'unit' if limit.model is None else 'model'}"
+                expected = f"{error} ({sensor.name}.{channel.name})"
+                yield FileFault(where, expected, limit.unit or limit.model)
+                return
 
 
 def _simulation_faults(table: Mapping[str, Any]) -> Iterator[FileFault]:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.units import canonical, conversion
 from daq.results.band_summary import (
     averages_at,
     correlation_of,
@@ -90,21 +89,18 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
 
 def concerns(limit: Limit, label: ChannelLabel) -> bool:
     """Whether a mask is for a channel."""
-    return (not limit.sensors or label.sensor in limit.sensors) and (
-        not limit.channels or label.channel in limit.channels
-    )
+    return limit.concerns(label.sensor, label.channel)
 
 
 def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray) -> FloatArray:
     """Return a mask between its points, straight in log-log, in the unit of the result squared/Hz.
 
-    The file's numbers are in the unit that the channel has there.
+    A mask without a unit is in the unit that the channel has in the bench file. A band that ends
+    just outside of the mask has its value at the end.
     """
-    mask = np.exp(np.interp(np.log(frequency), np.log(limit.frequency), np.log(limit.psd)))
-    unit = _unit_in_file(bench, label)
-    if unit is not None and canonical(unit) != label.unit:
-        mask = mask * np.abs(conversion(unit, label.unit, frequency)) ** 2
-    return np.asarray(mask)
+    mask = limit.mask
+    inside = np.clip(frequency, mask.frequency[0], mask.frequency[-1])
+    return mask.at(inside, label.unit, of_channel=_unit_in_file(bench, label))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +113,8 @@ class _Beside:
 
     limit: Limit
     label: ChannelLabel
+    covers: tuple[float, float]
+    judged: tuple[float, float]
     centre: FloatArray
     mask: FloatArray
     mean: FloatArray
@@ -156,6 +154,8 @@ class _Beside:
                 high=number(self.surely_high),
                 limit_psd=number(self.mask),
                 verdict=verdict,
+                covers=self.covers,
+                judged=self.judged,
                 obstacle=obstacle,
             )
 
@@ -238,6 +238,8 @@ def _beside(
     return _Beside(
         limit=limit,
         label=label,
+        covers=(limit.mask.frequency[0], limit.mask.frequency[-1]),
+        judged=_judged(snapshot, limit, edges),
         centre=centre,
         mask=mask,
         mean=mean,
@@ -302,14 +304,28 @@ def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
     return None
 
 
+def _judged(snapshot: Snapshot, limit: Limit, edges: NDArray[np.int64]) -> tuple[float, float]:
+    """Return from and to which frequency a mask is judged; its own ends where it is to there."""
+    if edges.size < 2:
+        return math.nan, math.nan
+    frequency, (low, *_, high) = snapshot.frequency, limit.mask.frequency
+    first, last = float(frequency[edges[0]]), float(frequency[edges[-1] - 1])
+    spacing = float(frequency[1])
+    return (
+        low if low >= spacing else first,
+        high if high <= last + 2 * spacing else last,
+    )
+
+
 def _edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
     """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
 
     Bands above the frequency from which on nothing is known are left out.
     """
     frequency = snapshot.frequency
-    low = max(limit.frequency[0], float(frequency[1]))
-    high = min(limit.frequency[-1], float(frequency[-2]))
+    mask = limit.mask
+    low = max(mask.frequency[0], float(frequency[1]))
+    high = min(mask.frequency[-1], float(frequency[-2]))
     if high <= low:
         return np.empty(0, dtype=np.int64)
     n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))

@@ -64,6 +64,9 @@ class LimitResult:
         Mean over the band, and its interval, which holds for all channels and bands together.
     limit_psd : float
     verdict : Verdict
+    covers, judged : (float, float)
+        From and to which frequency the limit goes, and to which of them it was judged: as far as
+        the spectrum goes, and something is known. Hz; NaN where none was.
     obstacle : Obstacle or None
         None where the limit is decided.
     """
@@ -78,6 +81,8 @@ class LimitResult:
     high: float
     limit_psd: float
     verdict: Verdict
+    covers: tuple[float, float]
+    judged: tuple[float, float]
     obstacle: Obstacle | None = None
 
     @property

@@ -26,7 +26,7 @@ from tui.output.noise_parameters import (
     term_table,
 )
 from tui.output.results import curves_csv, remarks, result_table, result_title
-from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, what_to_do
+from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, not_judged, what_to_do
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def show_result(
             if each.verdict is not Verdict.PASS:
                 screen.print(limit_line(each), style=STYLES[each.verdict].removeprefix("bold "))
         screen.print(headline(found), style=STYLES[found.verdict])
-        for line in what_to_do(found):
+        for line in (*what_to_do(found), *not_judged(found)):
             screen.print(line)
     return found
 

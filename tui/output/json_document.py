@@ -203,6 +203,8 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
                 "method": each.method,
                 "verdict": each.verdict,
                 "obstacle": each.obstacle,
+                "limit_hz": list(each.covers),
+                "judged_hz": list(each.judged),
                 "frequency_hz": each.frequency,
                 "noise_psd": each.noise_psd,
                 "noise_psd_low": each.low,

@@ -88,6 +88,23 @@ def what_to_do(found: TestVerdict) -> list[str]:
     return lines + ([record_for(found.prediction)] if found.prediction is not None else [])
 
 
+def not_judged(found: TestVerdict) -> list[str]:
+    """Return where limits go beyond the spectrum and are not judged, a line a limit."""
+    lines = []
+    for name, covers, judged in dict.fromkeys(
+        (each.limit, each.covers, each.judged) for each in found.limits
+    ):
+        (low, high), (first, last) = covers, judged
+        parts = [f"below {first:.3g} Hz"] if low < first else []
+        parts += [f"above {last:.3g} Hz"] if last < high else []
+        if parts:
+            lines.append(
+                f"{name} is not judged {listed(parts)}, where there is no estimate: it goes from "
+                f"{low:.3g} to {high:.3g} Hz."
+            )
+    return lines
+
+
 def record_for(prediction: Prediction) -> str:
     """Return how long to record for a decision."""
     if prediction.seconds is not None:

@@ -12,7 +12,7 @@ from daq.results.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.output.formatting import ONE_SIDED, span
 from tui.output.results import flagged
-from tui.output.verdict_text import WORDS, headline, margin, what_to_do
+from tui.output.verdict_text import WORDS, headline, margin, not_judged, what_to_do
 from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from tui.report.figures.curves import noise_plots
 from tui.report.parts import Items, Paragraph, Part, Section, Table
@@ -42,7 +42,7 @@ def verdict(found: TestVerdict | None) -> Paragraph:
     """Return what it all comes to, in a sentence or two."""
     if found is None:
         return Paragraph("No verdict: the bench file has no limits.", "quiet")
-    text = " ".join([headline(found), *what_to_do(found)])
+    text = " ".join([headline(found), *what_to_do(found), *not_judged(found)])
     return Paragraph(text, _TONES[found.verdict])
 
 

@@ -210,7 +210,7 @@ psd = [[1, 2], [3, 4]]
         ("[simulation]\nspeed = 0\n", "simulation.speed = 0: expected a positive number"),
         (
             '[[limits]]\nname = "n"\nfrequency = [2, 1]\npsd = [1, 1]\n',
-            'limits["n"].frequency = [2.0, 1.0]: expected increasing',
+            'limits["n"]: 1 Hz after 2 Hz; expected increasing frequencies',
         ),
         (
             '[[limits]]\nname = "n"\nfrequency = [1, 2]\npsd = [1, 1]\nsensors=["d"]\n',

@@ -17,6 +17,7 @@ from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
+from tui.output.verdict_text import not_judged
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -237,3 +238,59 @@ def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:
     )
     found = verdict_on(in_micro_g, 6.5e-12)
     assert [each.name for each in found.having(Verdict.FAIL)] == ["C.X", "C.Y", "C.Z"]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "judged", "words"),
+    [
+        (1.0, 30.0, (1.0, 30.0), []),
+        (1.0, 100.0, (1.0, 100.0), []),  # the spectrum goes to 100 Hz
+        (1.0, 400.0, (1.0, 99.5), ["above 99.5 Hz", "from 1 to 400 Hz"]),
+        (0.01, 30.0, (0.5, 30.0), ["below 0.5 Hz", "from 0.01 to 30 Hz"]),
+        (0.01, 400.0, (0.5, 99.5), ["below 0.5 Hz and above 99.5 Hz"]),
+    ],
+)
+def test_where_a_mask_goes_beyond_the_spectrum_the_verdict_says_so(
+    low: float, high: float, judged: tuple[float, float], words: list[str]
+) -> None:
+    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", f"[{low}, {high}]")
+    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
+    found = judge(bench, made_snapshot(n_effective=5000.0), SETTINGS)
+    assert found is not None
+    assert found.verdict is Verdict.PASS
+    assert {(each.covers, each.judged) for each in found.limits} == {((low, high), judged)}
+    lines = not_judged(found)
+    assert len(lines) == bool(words)
+    assert all(word in lines[0] for word in words)
+
+
+def test_unusable_high_frequencies_are_not_judged_and_said() -> None:
+    """Resampling leaves nothing to be said above some frequency."""
+    snapshot = made_snapshot(n_effective=5000.0)
+    csm, known = snapshot.csm.copy(), snapshot.frequency <= 45
+    csm[~known] = np.nan
+    blank = np.where(known[:, None], 1.0, np.nan)
+    results = {
+        name: replace(noise, noise_psd=noise.noise_psd * blank, cov=noise.cov * blank)
+        for name, noise in snapshot.results.items()
+    }
+    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 90.0]")
+    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
+    found = judge(bench, replace(snapshot, csm=csm, results=results), SETTINGS)
+    assert found is not None
+    assert found.verdict is Verdict.PASS
+    (line,) = not_judged(found)
+    last = found.limits[0].judged[1]
+    assert 45 <= last < 45 * 2 ** (1 / 3)
+    assert f"above {last:.3g} Hz" in line
+
+
+def test_a_model_is_a_limit_in_any_unit() -> None:
+    """The ground's noise models are in m/s²; the channels of this bench are, too."""
+    more = '[[limits]]\nname = "loud"\nmodel = "ahnm"\n[[limits]]\nname = "quiet"\nmodel = "nlnm"'
+    text = resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8")
+    found = judge(parse(f"{text}\n{more}"), made_snapshot(n_effective=5000.0), SETTINGS)
+    assert found is not None
+    verdicts = {(each.limit, each.verdict) for each in found.limits}
+    # noise of -120 to -110 dB: below -91 dB in part, above -120 dB at 0.8 s, above the NLNM
+    assert verdicts == {("loud", Verdict.FAIL), ("quiet", Verdict.FAIL), ("loud", Verdict.PASS)}

@@ -18,7 +18,7 @@ from tui.application.test_view.panels import alerts
 from tui.output.diagnostics import summary
 from tui.output.formatting import clock_time, level, level_with_error
 from tui.output.results import remarks
-from tui.output.verdict_text import MARKS, STYLES, headline, limit_line, what_to_do
+from tui.output.verdict_text import MARKS, STYLES, headline, limit_line, not_judged, what_to_do
 from tui.output.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) 
         style = STYLES[found.verdict]
         yield Text(f"{MARKS[found.verdict]} {headline(found)}", style)
         yield from (Text(line, style.removeprefix("bold ")) for line in what_to_do(found))
+        yield from map(Text, not_judged(found))
         for each in sorted(found.limits, key=lambda each: each.verdict is Verdict.PASS):
             style = STYLES[each.verdict].removeprefix("bold ")
             yield Text(f"  {MARKS[each.verdict]} {limit_line(each)}", style)
