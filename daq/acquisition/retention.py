@@ -94,7 +94,7 @@ def remove_old(
         if created >= limit:
             continue
         try:
-            _remove_run(path)
+            remove_run(path)
         except OSError as error:
             failures.append(f"{error.filename or path}: cannot be removed: {error.strerror}")
         else:
@@ -104,8 +104,14 @@ def remove_old(
     return removed
 
 
-def _remove_run(path: Path) -> None:
-    """Remove the files of a run, the recording last: by it the others are found again."""
+def remove_run(path: Path) -> None:
+    """Remove the files of a run, the recording last: by it the others are found again.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be removed.
+    """
     for other in (journal_path(path), *(path.with_suffix(suffix) for suffix in OF_A_RUN)):
         other.unlink(missing_ok=True)
     path.unlink()

@@ -150,6 +150,17 @@ class Recording:
             entries = {method: member(group, method) for method in group}
             return {method: self._result(method, entry) for method, entry in entries.items()}
 
+    def result_attributes(self) -> dict[str, dict[str, Any]]:
+        """Return the attributes of the stored results by method, without reading their arrays.
+
+        Their checksum is not verified: it covers the arrays too.
+        """
+        with damage_named(self.path):
+            if "results" not in self._file:
+                return {}
+            group = member(self._file, "results")
+            return {method: dict(member(group, method).attrs) for method in group}
+
     def _result(
         self, method: str, entry: h5py.Group
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -5,25 +5,44 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from daq.recording.repair import write_results
+from daq.results.verdict import Verdict
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.reader import Recording
+    from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import FloatArray
 
 
-def store_results(path: str | Path, snapshot: Snapshot) -> None:
+def store_results(path: str | Path, snapshot: Snapshot, verdict: TestVerdict | None = None) -> None:
     """Write the results of all methods to ``/results`` of a recording, in one pass.
 
-    Earlier results are replaced. A crash leaves the recording with all results or with none.
+    Earlier results are replaced. A crash leaves the recording with all results or with none. The
+    verdict on the limits of the bench stands beside the result of every method.
 
     Raises
     ------
     RecordingError
         If a recorder is writing the file, or it cannot be written; it stays as it was.
     """
-    write_results(path, {method: result_arrays(snapshot, method) for method in snapshot.results})
+    said = {} if verdict is None else {"verdict": verdict.verdict.value}
+    results = {method: result_arrays(snapshot, method) for method in snapshot.results}
+    write_results(
+        path, {method: (arrays, about | said) for method, (arrays, about) in results.items()}
+    )
+
+
+def stored_verdict(recording: Recording) -> tuple[bool, Verdict | None]:
+    """Return whether a recording holds a result, and the verdict that was stored with it.
+
+    The verdict is None where the bench had no limits, or an earlier version wrote the result.
+    """
+    attributes = recording.result_attributes()
+    said = {str(each["verdict"]) for each in attributes.values() if "verdict" in each}
+    known = [Verdict(word) for word in said if word in set(Verdict)]
+    return bool(attributes), known[0] if len(known) == 1 else None
 
 
 def result_arrays(snapshot: Snapshot, method: str) -> tuple[dict[str, FloatArray], dict[str, Any]]:

@@ -31,10 +31,11 @@ from estimator.diagnostics.diagnose import diagnose
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from daq.bench.model import Bench
+    from daq.results.verdict import TestVerdict
     from estimator.types import FloatArray
 
 SETTINGS = Settings(
@@ -260,8 +261,21 @@ class ProgressCallback:
         self.told.append("start")
         return self.path
 
-    def keep(self, path: Path, snapshot: Snapshot) -> None:
+    @property
+    def folder(self) -> Path:
+        """Return where its recordings are."""
+        return self.path.parent
+
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Note the changes; return settings with them."""
+        self.told.append(f"about {path.name} {dict(changes)}")
+        return replace(SETTINGS, **changes), self.bench  # type: ignore[arg-type]
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Note it."""
+        assert verdict is None
         self.told.append(f"keep {path.name} {', '.join(snapshot.results)}")
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:

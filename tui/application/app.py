@@ -21,19 +21,23 @@ from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
 from tui.application.dialogs import MarkScreen, StartScreen, StopScreen
 from tui.application.messages import (
+    DeletionRequested,
     ErrorReported,
     Messenger,
+    OpeningRequested,
     Progress,
     RecordingOpened,
     SnapshotReady,
     StatusUpdated,
 )
+from tui.application.recordings_view.view import RecordingsView
 from tui.application.result_view.view import ResultView
 from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
 from tui.application.test_view.plot import PlainMonochrome
 from tui.application.test_view.view import TestView
 from tui.application.view import View
 from tui.output.formatting import clock_time
+from tui.runs.catalogue import delete_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -87,15 +91,22 @@ class HuddleApp(App[None]):
         self._start_at_once = start
         self._controls = controls
         self._ended = threading.Event()
+        self._bench = controls.bench
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
-        views: tuple[type[View], ...] = (BenchView, TestView, ResultView)
+        views: tuple[type[View], ...] = (BenchView, TestView, ResultView, RecordingsView)
         for view in views:
             self.add_mode(view.VIEW, partial(self._new_view, view))
         self.set_reactive(HuddleApp.state, self._state_of(path))
 
     def _state_of(self, path: Path | None) -> State:
         controls = self._controls
-        return State(controls.name, controls.bench, can_start=controls.can_start, path=path)
+        return State(
+            controls.name,
+            controls.bench,
+            folder=controls.folder,
+            can_start=controls.can_start,
+            path=path,
+        )
 
     def _new_view(self, kind: type[View]) -> View:
         return kind(self.state)
@@ -150,25 +161,33 @@ class HuddleApp(App[None]):
 
     @on(RecordingOpened)
     async def _on_following(self, message: RecordingOpened) -> None:
+        own = message.settings is None
+        settings = self._controls.settings if own else message.settings
+        self._bench = self._controls.bench if own else message.bench
         self.state = self._state_of(message.path)
         self._ended.set()
         self._ended = threading.Event()
-        self._follow(message.path, self._ended)
-        await self.action_view(TEST)
+        self._follow(message.path, settings, self._ended, is_kept=message.is_kept)
+        await self.action_view(message.view)
 
     @work(thread=True, group="follow")
-    def _follow(self, path: Path, ended: threading.Event) -> None:
-        messenger = Messenger(self, ended)
+    def _follow(
+        self, path: Path, settings: Settings | None, ended: threading.Event, *, is_kept: bool
+    ) -> None:
+        messenger, bench = Messenger(self, ended), self._bench
         with self._reading:
+            if ended.is_set():  # another one was opened meanwhile
+                return
             try:
-                result = follow(
-                    path, self._controls.settings, messenger, cancelled=ended, growth=GROWTH
-                )
+                result = follow(path, settings, messenger, cancelled=ended, growth=GROWTH)
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)
                 return
-            if result is not None and messenger.was_open:
-                self._try(partial(self._controls.keep, path, result))
+            if result is None or messenger.settings is None:
+                return
+            if is_kept or messenger.was_open:
+                verdict = judge(bench, result, messenger.settings)
+                self._try(partial(self._controls.keep, path, result, verdict))
 
     @on(StatusUpdated)
     def _on_looked(self, message: StatusUpdated) -> None:
@@ -187,7 +206,7 @@ class HuddleApp(App[None]):
             self.state,
             snapshot=snapshot,
             settings=message.settings,
-            verdict=judge(self._controls.bench, snapshot, message.settings),
+            verdict=judge(self._bench, snapshot, message.settings),
             note="",
         )
         if snapshot.closed and before is not None and not before.closed:
@@ -210,6 +229,35 @@ class HuddleApp(App[None]):
             self.state = replace(self.state, failure=message.text)
         else:
             self.notify(message.text, title="Error", severity="error", timeout=30, markup=False)
+
+    @on(OpeningRequested)
+    @work(thread=True, group="control")
+    def _on_opening(self, message: OpeningRequested) -> None:
+        found = self._try(partial(self._controls.about, message.path, message.changes))
+        if found is not None:
+            self.post_message(
+                RecordingOpened(message.path, message.view, *found, is_kept=not message.changes)
+            )
+
+    @on(DeletionRequested)
+    def _on_deletion(self, message: DeletionRequested) -> None:
+        if message.path == self.path:
+            if self.recording:
+                self.notify("It is being recorded: stop it first.", severity="warning")
+                return
+            self._ended.set()
+            self.state = self._state_of(None)
+        self._delete(message.path)
+
+    @work(thread=True, group="control")
+    def _delete(self, path: Path) -> None:
+        with self._reading:
+            self._try(partial(delete_recording, path))
+        self.call_from_thread(self._read_again)
+
+    def _read_again(self) -> None:
+        if isinstance(view := self.screen_stack[0], RecordingsView):
+            view.action_read()
 
     @property
     def path(self) -> Path | None:

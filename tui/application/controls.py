@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.verdict import TestVerdict
 
 
 class Controls(Protocol):
@@ -28,6 +30,11 @@ class Controls(Protocol):
     @property
     def bench(self) -> Bench | None:
         """The bench, for its limits."""
+        ...
+
+    @property
+    def folder(self) -> Path:
+        """Where the recordings are."""
         ...
 
     @property
@@ -51,7 +58,19 @@ class Controls(Protocol):
         """Ask the recorder of a file to record a remark."""
         ...
 
-    def keep(self, path: Path, snapshot: Snapshot) -> None:
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Return settings for the estimate of any recording, with changes, and its bench. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If it cannot be read, or the changes do not fit it.
+        """
+        ...
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Write the result into a recording whose end has been seen here. Blocks."""
         ...
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
 
 EVERYWHERE = (
-    ("1 2 3", "the views: bench, test, result"),
+    ("1 2 3 4", "the views: bench, test, result, recordings"),
     ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording goes on, and is found again"),
 )

@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING
 
 from textual.message import Message
 
+from tui.application.state import TEST
+
 if TYPE_CHECKING:
     import threading
+    from collections.abc import Mapping
     from pathlib import Path
 
     from textual.app import App
 
+    from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from tui.runs.catalogue import Entry
 
 
 @dataclass
@@ -23,6 +28,37 @@ class RecordingOpened(Message):
     """A recording was opened and is followed from now on."""
 
     path: Path
+    view: str = TEST
+    """The view that shows it."""
+    settings: Settings | None = None
+    """Of the estimate; those of the application, if not given."""
+    bench: Bench | None = None
+    """What it was recorded with; that of the application, if neither is given."""
+    is_kept: bool = False
+    """Whether its result is written into it, where it holds none."""
+
+
+@dataclass
+class OpeningRequested(Message):
+    """A recording is to be opened, with changes of the settings of its estimate."""
+
+    path: Path
+    changes: Mapping[str, object]
+    view: str
+
+
+@dataclass
+class DeletionRequested(Message):
+    """A recording is to be deleted; that has been confirmed."""
+
+    path: Path
+
+
+@dataclass
+class CatalogueRead(Message):
+    """The recordings of the folder."""
+
+    entries: tuple[Entry, ...]
 
 
 @dataclass
@@ -71,11 +107,14 @@ class Messenger:
     ----------
     was_open : bool
         Whether the recording was growing when it was opened.
+    settings : Settings or None
+        Of the latest snapshot.
     """
 
     def __init__(self, app: App[None], ended: threading.Event) -> None:
         self._app, self._ended = app, ended
         self.was_open = False
+        self.settings: Settings | None = None
 
     def status(self, status: RecordingStatus) -> None:
         """Tell how the sensors are doing."""
@@ -84,6 +123,7 @@ class Messenger:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Show an estimate."""
+        self.settings = settings
         self._post(SnapshotReady(snapshot, settings))
 
     def progress(self, done: int, total: int) -> None:

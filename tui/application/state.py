@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from daq.recording.monitor import RecordingStatus
     from daq.results.verdict import TestVerdict
 
-BENCH, TEST, RESULT = VIEWS = ("bench", "test", "result")
-TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result"}
+BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
+TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Recordings"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +27,8 @@ class State:
     name : str
         Of the bench, or of the recording.
     bench : Bench or None
+    folder : Path or None
+        Where the recordings are.
     can_start : bool
         Whether a recording can be started from here.
     path : Path or None
@@ -47,6 +49,7 @@ class State:
 
     name: str
     bench: Bench | None = None
+    folder: Path | None = None
     can_start: bool = False
     path: Path | None = None
     now: RecordingStatus | None = None

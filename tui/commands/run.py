@@ -22,6 +22,7 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
+from daq.results.limits import judge
 from daq.results.precision import precision
 from daq.results.store import store_results
 from tui.commands.estimate import exit_with, show_result
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from daq.results.verdict import TestVerdict
 
 _LOGGER = logging.getLogger(__name__)
 STATUS_INTERVAL = 1.0
@@ -91,7 +93,7 @@ def run_test(
         with defer_interrupt(recorder.request_stop) as interruption:
             snapshot = result_of(recorder, settings, duration=duration, until_cov=until_cov)
             # First into the recording, whatever becomes of screens and other files.
-            stored = _Stored(out, snapshot)
+            stored = _Stored(out, snapshot, judge(bench, snapshot, settings))
             found = show_result(
                 snapshot,
                 settings,
@@ -126,10 +128,10 @@ def run_test(
 class _Stored:
     """Writes the results into the recording, and raises later what kept it from that."""
 
-    def __init__(self, out: Path, snapshot: Snapshot) -> None:
+    def __init__(self, out: Path, snapshot: Snapshot, found: TestVerdict | None) -> None:
         self._error: RecordingError | None = None
         try:
-            store_results(out, snapshot)
+            store_results(out, snapshot, found)
         except RecordingError as error:
             self._error = error
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
+    from daq.results.verdict import TestVerdict
 
 ALWAYS = ("three-sensor", "three-channel")
 """Cheap methods, shown for comparison with the chosen ones."""
@@ -54,6 +55,11 @@ class BenchControls:
         """The bench's name."""
         return self.bench.name
 
+    @property
+    def folder(self) -> Path:
+        """Where the bench file wants recordings."""
+        return self.bench.recording_directory
+
     def start(self) -> Path:
         """Start a recorder; return its file once it exists."""
         out = recording_path(self.bench, SystemClock().now())
@@ -74,12 +80,18 @@ class BenchControls:
         """Ask the recorder of a file to record a remark."""
         ask(path, "mark", text)
 
-    def keep(self, path: Path, snapshot: Snapshot) -> None:
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Return the settings of a recording's own bench, with changes, and that bench."""
+        return about(path, changes)
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Write the result into the recording, unless it holds one."""
         with Recording.open(path) as recording:
             if recording.results():
                 return
-        store_results(path, snapshot)
+        store_results(path, snapshot, verdict)
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report."""
@@ -105,6 +117,11 @@ class RecordingControls:
         """The file's name."""
         return self.path.stem
 
+    @property
+    def folder(self) -> Path:
+        """The folder of the recording."""
+        return self.path.parent
+
     def start(self) -> Path:
         """Raise an error: a recording cannot be started again."""
         raise HuddleError("this is a recording; huddle tui BENCH starts one")
@@ -121,12 +138,33 @@ class RecordingControls:
         """Ask the recorder to record a remark."""
         ask(path, "mark", text)
 
-    def keep(self, path: Path, snapshot: Snapshot) -> None:
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Return the settings of a recording's own bench, with changes, and that bench."""
+        return about(path, changes)
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Do nothing: the process that records writes the result."""
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report beside the recording."""
         return _report(path, snapshot, settings)
+
+
+def about(path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
+    """Return the settings for a recording, with changes and methods for comparison; its bench.
+
+    Raises
+    ------
+    HuddleError
+        If it cannot be read, or the changes do not fit it.
+    """
+    try:
+        settings, bench = settings_for(path, **changes)
+    except typer.BadParameter as error:
+        raise HuddleError(error.message) from None
+    return _with_comparison(settings, changes), bench
 
 
 def _report(

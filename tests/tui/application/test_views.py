@@ -11,7 +11,7 @@ from tests.tui.application.test_app import NARROW, ended, running, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tui.application.app import HuddleApp
 from tui.application.messages import SnapshotReady
-from tui.application.state import RESULT, TEST, VIEWS
+from tui.application.state import RESULT, TEST, TITLES, VIEWS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +47,7 @@ async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
         await pilot.press("question_mark")
         await shown(pilot, app, *ended())
         assert app.current_mode == TEST
-        assert "3 shows its result" in screen_text(app)
+        assert "The test has ended" in screen_text(app)
         await pilot.press("escape")
         await shown(pilot, app, *running())
         await shown(pilot, app, *ended())
@@ -89,7 +89,7 @@ async def test_the_top_line_keeps_what_matters_when_it_is_narrow(
         await shown(pilot, app, *running())
         line = screen_text(app).splitlines()[0]
         assert "● recording  1:40" in line
-        assert sum(title in line for title in ("1 Bench", "2 Test", "3 Result")) == named
+        assert sum(f" {n} {TITLES[name]}" in line for n, name in enumerate(VIEWS, start=1)) == named
 
 
 async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback) -> None:

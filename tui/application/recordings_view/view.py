@@ -1,0 +1,215 @@
+"""The Recordings view: lists, filters, opens, estimates again and deletes recordings."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar
+
+from rich.text import Text
+from textual import on, work
+from textual.binding import Binding, BindingType
+from textual.widgets import DataTable, Input, Static
+
+from tui.application.dialogs import QuestionScreen
+from tui.application.messages import CatalogueRead, DeletionRequested, OpeningRequested
+from tui.application.recordings_view.rows import COLUMNS, about, matches, row, size
+from tui.application.settings_form import SettingsForm
+from tui.application.state import RECORDINGS, RESULT, TEST
+from tui.application.view import MUTED, View
+from tui.runs.catalogue import catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from textual.app import ComposeResult
+
+    from tui.application.state import State
+    from tui.runs.catalogue import Entry
+
+
+class RecordingTable(DataTable[Text]):
+    """The list; enter opens a recording."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("enter", "select_cursor", "Open")]
+
+
+class FilterLine(Input):
+    """Words that a recording must have; escape forgets them."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "screen.clear_filter", "Clear")]
+
+
+class RecordingsView(View):
+    """What is in the folder of the bench."""
+
+    VIEW = RECORDINGS
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("slash", "filter", "Filter", key_display="/"),
+        Binding("e", "estimate", "Estimate again"),
+        Binding("delete", "delete", "Delete", key_display="del"),
+        Binding("r", "read", "Read again"),
+    ]
+    KEYS = (
+        ("↑ ↓ enter", "choose and open a recording: its result, or its test while it grows"),
+        ("/", "show only recordings with these words: bench, date, verdict, file, operator"),
+        ("e", "open it and estimate with other settings"),
+        ("del", "delete it with its results and reports; asked before"),
+        ("r", "read the folder again"),
+    )
+
+    def __init__(self, state: State) -> None:
+        super().__init__(state)
+        self._entries: tuple[Entry, ...] = ()
+        self._known: dict[object, Entry] = {}
+        self._listed: list[Entry] = []
+        self._gone = threading.Event()
+        self._is_read = False
+
+    def parts(self) -> ComposeResult:
+        """Yield the list, the filter, and one line on the chosen recording."""
+        yield RecordingTable(id="recordings", cursor_type="row", zebra_stripes=False)
+        yield FilterLine(id="filter", placeholder="words, such as: lab pass 2026-11", compact=True)
+        yield Static(id="about")
+
+    def on_mount(self) -> None:
+        """Name the columns."""
+        self.query_one(RecordingTable).add_columns(*COLUMNS)
+        super().on_mount()
+
+    def on_screen_resume(self) -> None:
+        """Read what has changed in the folder."""
+        self.action_read()
+
+    def on_unmount(self) -> None:
+        """End reading."""
+        self._gone.set()
+
+    def draw(self) -> None:
+        """Mark the recording that is shown."""
+        self._list()
+
+    # --------------------------------------------------------------------- reading
+
+    def action_read(self) -> None:
+        """Read the folder."""
+        self._read()
+
+    @work(thread=True, exclusive=True, group="catalogue")
+    def _read(self) -> None:
+        folder = self.state.folder
+        known = {entry.path: entry for entry in self._entries}
+        found = (
+            []
+            if folder is None
+            else catalogue(folder, known, besides=self.state.path, cancelled=self._gone.is_set)
+        )
+        if not self._gone.is_set():
+            self.post_message(CatalogueRead(tuple(found)))
+
+    @on(CatalogueRead)
+    def _on_read(self, message: CatalogueRead) -> None:
+        self._entries, self._is_read = message.entries, True
+        self._list()
+
+    def _list(self) -> None:
+        """Write the rows; the cursor stays on its recording."""
+        table, chosen = self.query_one(RecordingTable), self._chosen()
+        wanted = self.query_one(FilterLine).value
+        self._listed = [entry for entry in self._entries if matches(entry, wanted)]
+        table.clear()
+        for entry in self._listed:
+            table.add_row(*row(entry, shown=entry.path == self.state.path))
+        paths = [entry.path for entry in self._listed]
+        if chosen is not None and chosen.path in paths:
+            table.move_cursor(row=paths.index(chosen.path), animate=False)
+        self._write_about()
+        self.refresh_bindings()
+
+    def _chosen(self) -> Entry | None:
+        row = self.query_one(RecordingTable).cursor_row
+        return self._listed[row] if 0 <= row < len(self._listed) else None
+
+    @on(DataTable.RowHighlighted)
+    def _on_highlighted(self) -> None:
+        self._write_about()
+        self.refresh_bindings()
+
+    def _write_about(self) -> None:
+        chosen = self._chosen()
+        if chosen is not None:
+            text = about(chosen)
+        elif self._entries:
+            text = Text(f"none of {len(self._entries)} recordings has these words", MUTED)
+        else:
+            text = Text(f"no recordings in {self.state.folder}" if self._is_read else "reading …")
+        self.query_one("#about", Static).update(text)
+
+    # -------------------------------------------------------------------- filtering
+
+    def action_filter(self) -> None:
+        """Ask for words."""
+        self.add_class("-filter")
+        self.query_one(FilterLine).focus()
+
+    def action_clear_filter(self) -> None:
+        """Show all recordings again."""
+        self.query_one(FilterLine).value = ""
+        self.remove_class("-filter")
+        self.query_one(RecordingTable).focus()
+
+    @on(Input.Changed)
+    def _on_words(self) -> None:
+        self._list()
+
+    @on(Input.Submitted)
+    def _on_words_done(self) -> None:
+        self.query_one(RecordingTable).focus()
+
+    # -------------------------------------------------------------------- recordings
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Offer only what can be done with the chosen recording."""
+        del parameters
+        if action not in {"estimate", "delete"}:
+            return True
+        chosen = self._chosen() if self._entries else None
+        if chosen is None or chosen.is_growing:
+            return False
+        return action == "delete" or not chosen.problem
+
+    @on(DataTable.RowSelected)
+    def _on_selected(self) -> None:
+        self._open({})
+
+    def _open(self, changes: Mapping[str, object]) -> None:
+        chosen = self._chosen()
+        if chosen is not None and not chosen.problem:
+            view = TEST if chosen.is_growing else RESULT
+            self.post_message(OpeningRequested(chosen.path, changes, view))
+
+    def action_estimate(self) -> None:
+        """Ask for settings, and open the recording with them."""
+        chosen = self._chosen()
+        if chosen is None:
+            return
+
+        def estimate(changes: Mapping[str, object] | None) -> None:
+            if changes is not None:
+                self._open(changes)
+
+        self.app.push_screen(SettingsForm(chosen.path.name, None), estimate)
+
+    def action_delete(self) -> None:
+        """Delete the chosen recording, once that has been confirmed."""
+        chosen = self._chosen()
+        if chosen is None:
+            return
+        question = f"Delete {chosen.path.name} ({size(chosen.size)}), its results and its reports?"
+        self.app.push_screen(
+            QuestionScreen("delete", question, does="deletes"), partial(self._delete, chosen)
+        )
+
+    def _delete(self, chosen: Entry, really: bool | None) -> None:
+        if really:
+            self.post_message(DeletionRequested(chosen.path))
