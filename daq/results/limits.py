@@ -32,6 +32,7 @@ from daq.results.partners import without_partners
 from daq.results.verdict import SHRINKS, LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
 from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.misfit import SharedNoise
 from estimator.self_noise.band_means import band_means, decision_interval
 
 if TYPE_CHECKING:
@@ -265,6 +266,8 @@ def _errors(snapshot: Snapshot, centre: FloatArray) -> FloatArray:
         here = (centre >= advice.band[0]) & (centre <= advice.band[1])
         if isinstance(advice, ModelMisfit):
             error = np.where(here, np.maximum(error, advice.error), error)
+        elif isinstance(advice, SharedNoise):
+            error = np.where(here, np.maximum(error, advice.harm), error)
         elif isinstance(advice, TooFewDimensions):
             error = np.where(here, np.inf, error)
     return error

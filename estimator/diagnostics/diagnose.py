@@ -23,12 +23,19 @@ from estimator.diagnostics.relative_response import (
 )
 from estimator.diagnostics.rules import advise
 from estimator.diagnostics.shared_motion import shared_motion
+from estimator.diagnostics.shared_noise import shared_noise
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.chi_square import critical_value
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maximum, maximise
-from estimator.likelihood.goodness_of_fit import ModelTest, model_test, p_values, pool
+from estimator.likelihood.goodness_of_fit import (
+    HANN_HALF,
+    ModelTest,
+    model_test,
+    p_values,
+    pool,
+)
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise.band_means import median_of_columns
 from estimator.self_noise.coherency import (
@@ -163,9 +170,8 @@ def diagnose(
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     fit = _fit(matrix, there, d, n_effective)
-    model, untested = _test(
-        fit if q == d else _fit(matrix, there, q, n_effective), there, n_effective, len(csm)
-    )
+    tested = fit if q == d else _fit(matrix, there, q, n_effective)
+    model, untested = _test(tested, there, n_effective, len(csm))
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
@@ -189,6 +195,16 @@ def diagnose(
         )
         for inside in (number == b for b in np.unique(number))
     )
+    shared = None
+    if isinstance(tested, Maximum) and q >= d:
+        shared = shared_noise(
+            tested,
+            [number == b for b in np.unique(number)],
+            dims=there.dims,
+            n_effective=n_effective,
+            neighbours=HANN_HALF if neighbours is None else neighbours,
+        )
+        shared = None if shared is None else shared.among(there.channels, sum(dims))
     alive = np.ix_(range(len(csm)), there.channels, there.channels)
     responses = _responses(csm[alive], frequency, there, vertical, canonical)
     return Diagnostics(
@@ -211,6 +227,7 @@ def diagnose(
             n_factors=q,
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
+            shared=shared,
         ),
     )
 

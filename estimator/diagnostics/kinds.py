@@ -33,6 +33,8 @@ class AdviceKind(enum.StrEnum):
     """The model has fewer dimensions than the sensors sense, and does not explain the averages."""
     MODEL_MISFIT = "model-misfit"
     """One common motion does not explain the averages."""
+    SHARED_NOISE = "shared-noise"
+    """Channels share noise: those of one sensor, or of two."""
     MOTION_ACROSS = "motion-across"
     """Sensors of fewer than three channels miss motion across their planes or axes."""
     MISSING_DIMENSION = "missing-dimension"

@@ -12,6 +12,7 @@ sensors of fewer channels. See `docs/decisions/0012`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -33,9 +34,10 @@ from estimator.diagnostics.advice import (
     WeakMotion,
 )
 from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.misfit import SharedNoise
 from estimator.diagnostics.orientation import orientation
 from estimator.diagnostics.shared_motion import outsiders
-from estimator.likelihood.goodness_of_fit import rejected_below
+from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.live_channels import presence
 from estimator.self_noise.result import Flag
 
@@ -44,7 +46,9 @@ if TYPE_CHECKING:
 
     from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.relative_response import RelativeResponse
+    from estimator.diagnostics.shared_noise import SharedPairs
     from estimator.self_noise.coherency import Coherency
+    from estimator.types import FloatArray
 
 TYPICAL = 10.0
 CROSSING = 20.0
@@ -64,6 +68,7 @@ def advise(
     n_factors: int,
     n_effective: float,
     nyquist: float,
+    shared: SharedPairs | None = None,
 ) -> tuple[Advice, ...]:
     """Say what there is to know about a test, worst first.
 
@@ -80,6 +85,8 @@ def advise(
     n_effective : float
     nyquist : float
         Hz.
+    shared : SharedPairs, optional
+        Pairs of channels that share noise: what they explain is no further misfit.
 
     Returns
     -------
@@ -91,8 +98,9 @@ def advise(
         *(
             _too_few_dimensions(bands, n_factors)
             if n_factors < max(alive, default=0)
-            else _incoherence(bands, dims, n_factors, n_effective)
+            else _incoherence(_unexplained(bands, shared), dims, n_factors, n_effective)
         ),
+        *([] if shared is None else _shared_noise(bands, shared, dims)),
         *_sensor_space(bands, dims),
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
@@ -247,6 +255,48 @@ def _incoherence(
             largest_error=largest,
             is_wrong=error >= LARGE_ERROR,
         )
+
+
+def _unexplained(
+    bands: tuple[BandDiagnosis, ...], shared: SharedPairs | None
+) -> tuple[BandDiagnosis, ...]:
+    """Return bands with what shared noise leaves of the model test."""
+    if shared is None:
+        return bands
+    return tuple(
+        replace(band, test=less(band.test, explained))
+        for band, explained in zip(bands, shared.explained.tolist(), strict=True)
+    )
+
+
+def _shared_noise(
+    bands: tuple[BandDiagnosis, ...], shared: SharedPairs, dims: tuple[int, ...]
+) -> Iterator[Advice]:
+    """Return the pairs that share noise, those of the same sensors together."""
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    sensors = [tuple(sorted({int(sensor_of[i]), int(sensor_of[j])})) for i, j in shared.pairs]
+    bias = np.fmax(np.abs(shared.three_sensor), np.abs(shared.maximum_likelihood))
+    for pair in dict.fromkeys(sensors):
+        here = [number for number, each in enumerate(sensors) if each == pair]
+        found = SharedNoise(
+            level=Level.NOTE,
+            sensors=pair,
+            band=_span([bands[n] for n in shared.bands]),
+            channels=tuple(shared.pairs[n] for n in here),
+            amounts=tuple(float(shared.amount[n]) for n in here),
+            errors=tuple(float(shared.error[n]) for n in here),
+            three_sensor=_largest(shared.three_sensor),
+            maximum_likelihood=_largest(shared.maximum_likelihood),
+            channel=int(np.nanargmax(bias)) if np.isfinite(bias).any() else shared.pairs[0][0],
+        )
+        level = Level.WARNING if found.harm >= SMALL_ERROR else Level.NOTE
+        yield replace(found, level=Level.PROBLEM if found.harm >= LARGE_ERROR else level)
+
+
+def _largest(bias: FloatArray) -> float:
+    """Return the number of largest magnitude; NaN where none is known."""
+    known = bias[np.isfinite(bias)]
+    return float(known[np.argmax(np.abs(known))]) if len(known) else float("nan")
 
 
 def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:

@@ -7,7 +7,7 @@ and for tilt, noise common to two channels (a cable, a digitizer), and clock err
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,6 +68,17 @@ class BandTest:
     degrees: float
     p_value: float
     n_frequencies: int
+    spread: float = 1.0
+    """Variance of the sum over that of as many independent statistics."""
+
+
+def less(test: BandTest, explained: float) -> BandTest:
+    """Return the test without the part of its statistic that is explained."""
+    statistic = max(0.0, test.statistic - explained)
+    if not (explained and math.isfinite(test.p_value)):
+        return test
+    p_value = upper_tail(test.degrees / test.spread, statistic / test.spread)
+    return replace(test, statistic=statistic, p_value=p_value)
 
 
 def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
@@ -214,7 +225,7 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
     pairs = np.array([np.sum(taken[h:] & taken[:-h]) for h in range(1, len(r) + 1)])
     spread = 1 + 2 * float(pairs @ r**2) / count
     p_value = upper_tail(degrees / spread, total / spread)
-    return BandTest(total, degrees, p_value, count)
+    return BandTest(total, degrees, p_value, count, spread)
 
 
 HANN_HALF = neighbour_correlation(get_window("hann", 64), 32, 1000)

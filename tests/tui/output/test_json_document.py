@@ -39,7 +39,7 @@ def test_advice_has_its_kind_its_numbers_and_its_words() -> None:
     }  # fmt: skip
     assert len(diagnostics["per_frequency"]["coherence"][0]) == 3
     assert set(diagnostics["bands"][0]["test"]) == {
-        "statistic", "degrees", "p_value", "n_frequencies",
+        "statistic", "degrees", "p_value", "n_frequencies", "spread",
     }  # fmt: skip
 
 

@@ -2,3 +2,5 @@
 
 Chosen by the type of the advice; never parsed.
 """
+
+from tui.output.advice import misfit as misfit  # registers its sentences

@@ -30,6 +30,7 @@ from estimator.diagnostics.advice import (
     WeakMotion,
 )
 from estimator.diagnostics.kinds import AdviceKind, Level
+from estimator.diagnostics.misfit import SharedNoise
 from tui.output.advice.sentences import Names, explain
 from tui.output.advice.summary import summarise
 
@@ -77,7 +78,31 @@ ROTATED = Rotated(
 SKEWED = NotOrthogonal(level=Level.NOTE, sensors=(0, 1), band=BAND, deviation_deg=5.74)
 GAIN = Gain(level=Level.NOTE, sensors=(0, 1), band=BAND, channel=4, counterpart=1, ratio=1.05)
 LEADS = Delay(level=Level.WARNING, sensors=(0, 1), band=BAND, delay=-0.02, delay_samples=-0.8)
+SHARED = SharedNoise(
+    level=Level.WARNING,
+    sensors=(0, 1),
+    band=BAND,
+    channels=((0, 3), (1, 4)),
+    amounts=(0.1, -0.08),
+    errors=(0.004, 0.003),
+    three_sensor=-0.07,
+    maximum_likelihood=0.06,
+    channel=3,
+)
 SAID: list[tuple[Advice, tuple[str, ...]]] = [
+    (
+        SHARED,
+        (
+            "Sensors a and b share noise at 2–8 Hz (a.x and b.x 10 ± 0.4 %, a.y and b.y -8 ± 0.3 %",
+            "The three-sensor noise is too low by up to 7 % and the maximum likelihood noise is",
+            "too high by up to 6 % (worst in b.x)",
+            "digitizer",
+        ),
+    ),
+    (
+        replace(SHARED, sensors=(0,), channels=((0, 1),), amounts=(0.1,), errors=(0.01,)),
+        ("Channels of a share noise", "a.x and a.y 10 ± 1 %"),
+    ),
     (
         NoSignal(
             level=Level.PROBLEM,

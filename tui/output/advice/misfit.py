@@ -1,0 +1,64 @@
+"""Sentences for what one common motion does not explain, where it is known what that is."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.misfit import SharedNoise
+from tui.output.advice.alerts import alert
+from tui.output.advice.sentences import Explanation, explain, where
+from tui.output.formatting import listed, percent
+
+if TYPE_CHECKING:
+    from tui.output.advice.sentences import Names
+
+
+@explain.register(SharedNoise)
+def _shared_noise(advice: SharedNoise, names: Names) -> Explanation:
+    within = len(advice.sensors) == 1
+    amounts = [
+        f"{pair} {100 * amount:.2g} ± {100 * error:.1g} %"
+        for pair, amount, error in zip(
+            _pairs(advice, names), advice.amounts, advice.errors, strict=True
+        )
+    ]
+    whose = (
+        f"Channels of {names.list_sensors(advice.sensors)}"
+        if within
+        else f"Sensors {names.list_sensors(advice.sensors)}"
+    )
+    return Explanation(
+        f"{whose} share noise at {where(advice)} ({', '.join(amounts)} of the noise). "
+        f"{_effect(advice, names)}",
+        "Check what these channels have in common: digitizer, power supply, ground, cable, mount.",
+    )
+
+
+def _pairs(advice: SharedNoise, names: Names) -> list[str]:
+    return [f"{names.channels[one]} and {names.channels[other]}" for one, other in advice.channels]
+
+
+def _effect(advice: SharedNoise, names: Names) -> str:
+    found = []
+    for method, bias in (
+        ("three-sensor", advice.three_sensor),
+        ("maximum likelihood", advice.maximum_likelihood),
+    ):
+        if not math.isnan(bias):
+            size = percent(abs(bias))
+            off = f"too {'high' if bias > 0 else 'low'} by up to {size}"
+            found.append(f"the {method} noise is {off if abs(bias) > 1e-3 else 'not biased'}")
+    if not found:
+        return "The noise estimates may be wrong by as much."
+    text = f"{listed(found)} (worst in {names.channels[advice.channel]})."
+    return text[0].upper() + text[1:]
+
+
+@alert.register(SharedNoise)
+def _alert(advice: SharedNoise, names: Names) -> str:
+    harm = (
+        "" if advice.level is Level.NOTE else f", which biases estimates by {percent(advice.harm)}"
+    )
+    return f"{listed(_pairs(advice, names))} share noise{harm}"
