@@ -19,6 +19,7 @@ from daq.bench.units import canonical
 from daq.errors import ArrayError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches
 from daq.formats.memory import RecordingInMemory, SensorInMemory
+from daq.formats.readers.waveforms import stream_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,9 +95,7 @@ def recording_of_arrays(
 
 def _sensors(sensors: object, rate: object, channels: Sequence[str] | None) -> list[_Sensor]:
     if _is_stream(sensors):
-        from daq.formats.miniseed import sensors_of  # noqa: PLC0415 - for those who have ObsPy
-
-        found = sensors_of(_whole(sensors), NAME)
+        found = _of_stream(sensors)
         return [_of_traces(foreign, rate, channels) for foreign in found]
     if not isinstance(sensors, Mapping):
         raise ArrayError(
@@ -116,9 +115,7 @@ def _sensor(name: object, value: Any, rate: object, channels: Sequence[str] | No
             raise ArrayError(f"fs: no sampling rate of sensor {name!r}; expected one for each")
         rate = rate[name]
     if _is_stream(value):
-        from daq.formats.miniseed import sensors_of  # noqa: PLC0415 - for those who have ObsPy
-
-        found = sensors_of(_whole(value), NAME)
+        found = _of_stream(value)
         if len(found) != 1:
             listed = ", ".join(foreign.name for foreign in found) or "none"
             raise ArrayError(
@@ -254,35 +251,25 @@ def _is_stream(value: Any) -> bool:  # noqa: ANN401 - whatever it is
     return hasattr(value, "traces") or hasattr(value, "stats")
 
 
-def _whole(value: Any) -> Any:  # noqa: ANN401 - ObsPy has no types
-    """Return a Stream that may be changed, without masked samples."""
-    from daq.formats.miniseed import load_obspy  # noqa: PLC0415 - for those who have it
+def _of_stream(value: Any) -> tuple[ForeignSensor, ...]:  # noqa: ANN401 - ObsPy has no types
+    """Return the sensors of a Stream, Trace, or list of Traces; masked samples are gaps."""
+    from daq.formats.sources import sensors_of_parts  # noqa: PLC0415 - for those who need it
 
-    obspy = load_obspy()
     traces = [value] if hasattr(value, "stats") else value
-    return obspy.Stream([obspy.Trace(each.data, each.stats) for each in traces]).split()
+    whole = [part for each in traces for part in each.split()]
+    return sensors_of_parts([stream_part(whole, NAME)])
 
 
 def _of_traces(foreign: ForeignSensor, rate: object, channels: Sequence[str] | None) -> _Sensor:
-    """Return the sensor of traces, cut where samples are not finite."""
     name = foreign.name
     if isinstance(rate, Mapping):
         rate = rate.get(name)
     known = _rate(name, rate, foreign.sampling_rate)
-    stretches = tuple(
-        finite
-        for stretch in foreign.stretches
-        for finite in finite_stretches(
-            stretch.counts, start_utc_ns=stretch.start_utc_ns, sampling_rate=foreign.sampling_rate
-        )
-    )
     names = foreign.channels
     if channels is not None:
         names = _channel_names(name, len(foreign.channels), channels)
-    whole = replace(
-        foreign, sampling_rate=known, stretches=_not_empty(name, stretches), channels=names
-    )
-    return _Sensor(whole, sum(each.n_samples for each in stretches), "", timed=True)
+    whole = replace(foreign, sampling_rate=known, channels=names)
+    return _Sensor(whole, sum(each.n_samples for each in whole.stretches), "", timed=True)
 
 
 def _check_together(given: Sequence[_Sensor]) -> None:

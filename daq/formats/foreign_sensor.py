@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -12,6 +12,10 @@ from daq.bench.model import check_name
 from daq.errors import ImportFormatError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
     from daq.protocols.block import CountsArray
 
 NS_PER_S = 1_000_000_000
@@ -20,6 +24,18 @@ MIN_RATE, MAX_RATE = 1e-6, 1e7
 """In Hz."""
 FIRST_DATE_NS = 10**17
 """Times before March 1973 are those of files without a date."""
+
+
+class RowSource(Protocol):
+    """Samples that are read when they are sliced."""
+
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+
+    def __getitem__(self, rows: Any) -> NDArray[Any]:  # noqa: ANN401 - as arrays take it
+        """Return rows, shape (n_rows, n_channels)."""
+
+    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,16 +47,31 @@ class Stretch:
     start_utc_ns : int
         UTC of the first sample, in ns since 1970.
     counts : ndarray, shape (n_samples, n_channels)
-        Raw values, integers or floats.
+        Raw values, integers or floats; or what gives them when it is sliced.
+    knot_rows, knot_times_ns : float64, shape (n_knots,), optional
+        Rows and their times after the first row, where the clock runs off the nominal rate;
+        linear between and beyond them.
     """
 
     start_utc_ns: int
-    counts: CountsArray
+    counts: CountsArray | RowSource
+    knot_rows: NDArray[np.float64] | None = None
+    knot_times_ns: NDArray[np.float64] | None = None
 
     @property
     def n_samples(self) -> int:
         """Number of samples."""
         return int(self.counts.shape[0])
+
+    def times_ns(self, rows: Sequence[int], sampling_rate: float) -> list[int]:
+        """Return UTC of rows, in ns; `sampling_rate` is nominal, in Hz."""
+        if self.knot_rows is None or self.knot_times_ns is None:
+            after = [round(row * NS_PER_S / sampling_rate) for row in rows]
+        else:
+            at = np.asarray(rows, dtype=np.float64)
+            exact = piecewise_linear(at, self.knot_rows, self.knot_times_ns)
+            after = [round(each) for each in exact.tolist()]
+        return [self.start_utc_ns + each for each in after]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,16 +120,31 @@ class ForeignSensor:
                     f"{where}: {what} name {name[:80]!r}: {error}; rename it in the file"
                 ) from None
 
-    def first_sample(self, stretch: Stretch) -> int:
-        """Index of a stretch's first sample on the grid that begins with the first stretch."""
-        elapsed_ns = stretch.start_utc_ns - self.stretches[0].start_utc_ns
-        return round(elapsed_ns * self.sampling_rate / NS_PER_S)
+    def first_samples(self) -> list[int]:
+        """Return the index of the first sample of each stretch, counted from the first stretch.
+
+        By the nominal rate. A clock that runs off it moves what follows; no gap is shorter than a
+        sample.
+        """
+        begin = self.stretches[0].start_utc_ns
+        found: list[int] = []
+        moved = end = 0
+        for stretch in self.stretches:
+            elapsed_ns = stretch.start_utc_ns - begin
+            first = round(elapsed_ns * self.sampling_rate / NS_PER_S) + moved
+            if found and first <= end:
+                moved, first = moved + end + 1 - first, end + 1
+            found.append(first)
+            end = first + stretch.n_samples
+            if stretch.knot_rows is not None:
+                (last,) = stretch.times_ns([stretch.n_samples], self.sampling_rate)
+                moved = end - round((last - begin) * self.sampling_rate / NS_PER_S)
+        return found
 
     def dated_spans_ns(self) -> list[tuple[int, int]]:
         """Return UTC of the first and last sample of each stretch; nothing if there is no date."""
-        ns_per_sample = NS_PER_S / self.sampling_rate
         return [
-            (s.start_utc_ns, s.start_utc_ns + round((s.n_samples - 1) * ns_per_sample))
+            (s.start_utc_ns, s.times_ns([s.n_samples - 1], self.sampling_rate)[0])
             for s in self.stretches
             if self.stretches[0].start_utc_ns >= FIRST_DATE_NS
         ]
@@ -130,3 +176,12 @@ def finite_stretches(
         Stretch(start_utc_ns + round(int(first) * NS_PER_S / sampling_rate), counts[first:end])
         for first, end in edges.reshape(-1, 2)
     )
+
+
+def piecewise_linear(
+    at: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Interpolate linearly through knots, and extrapolate from the outer two at either end."""
+    segment = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    slope = np.diff(y) / np.diff(x)
+    return np.asarray(y[segment] + (at - x[segment]) * slope[segment])

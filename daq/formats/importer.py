@@ -6,9 +6,8 @@ Each contiguous stretch is written as blocks that state the UTC of their first s
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
+from heapq import merge
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,27 +16,30 @@ from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Channel, Sensor, check_name
 from daq.errors import ImportFormatError, WrongSettingError
-from daq.formats.csv_reader import read_delimited
-from daq.formats.foreign_sensor import NS_PER_S
-from daq.formats.npz import read_mat, read_npz
+from daq.formats.assembly import Columns
+from daq.formats.sources import open_sources
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
 from daq.recording.file_format import SensorLayout
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from daq.formats.foreign_sensor import ForeignSensor
+    from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.formats.response import Responses
+    from daq.formats.sources import Selection
 
-_LOGGER = logging.getLogger(__name__)
-DELIMITED = frozenset({".csv", ".tsv", ".txt"})
+_ROWS_AT_ONCE = 16 * BLOCK_ROWS
+_NAMES_KEPT = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What became of one sensor: ``missing`` samples lie in ``n_gaps`` gaps."""
+    """What became of one sensor: ``missing`` samples lie in ``n_gaps`` gaps.
+
+    ``resampled`` channels were sampled at other instants than the first channel.
+    """
 
     sensor: str
     channels: tuple[str, ...]
@@ -46,23 +48,46 @@ class Imported:
     n_samples: int
     n_gaps: int
     missing: int
+    resampled: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ImportResult:
+    """What was imported, and what was not.
+
+    Attributes
+    ----------
+    sensors : tuple of Imported
+    problems : tuple of str
+        One sentence for each file or channel that could not be used.
+    left_aside : dict of str to str
+        Channels that were not imported, with the reason.
+    """
+
+    sensors: tuple[Imported, ...]
+    problems: tuple[str, ...] = ()
+    left_aside: dict[str, str] = field(default_factory=dict)
 
 
 def import_files(
-    sources: Sequence[Path],
+    sources: Sequence[str | Path],
     out: Path,
     *,
     bench: Bench | None = None,
     response: Path | None = None,
     sampling_rate: float | None = None,
     estimate: EstimateSettings | None = None,
-) -> tuple[Imported, ...]:
+    selection: Selection | None = None,
+) -> ImportResult:
     """Write a recording from files of other programs.
+
+    Samples are read while they are written, so memory does not grow with the length of the data.
 
     Parameters
     ----------
-    sources : sequence of Path
-        ``.npz``, ``.mat`` and CSV (``.csv``, ``.tsv``, ``.txt``); anything else is read by ObsPy.
+    sources : sequence of str or Path
+        Files of any format that :mod:`daq.formats.readers` knows, or folders ``sds://ROOT``. A
+        sensor may be in several files.
     out : Path
         Recording to write; must not exist.
     bench : Bench, optional
@@ -75,19 +100,20 @@ def import_files(
     estimate : EstimateSettings, optional
         How the recording is to be estimated, unless said otherwise later; as the bench says, if not
         given.
+    selection : Selection, optional
+        Channels, span of time, and what is done where files overlap.
 
     Raises
     ------
     ImportFormatError
-        A file is not understood, or files, bench and response do not fit together.
+        No file is understood, or files, bench and response do not fit together.
     RecordingError
         The recording cannot be written.
     WrongSettingError
         `estimate` does not fit the sensors.
     """
-    found = _by_name(_read(sources, sampling_rate))
-    for sensor in found.values():
-        sensor.check()
+    opened = open_sources(sources, selection, sampling_rate=sampling_rate)
+    found = opened.sensors
     if bench is not None:
         found = _ordered(found, bench)
     responses = None
@@ -103,46 +129,19 @@ def import_files(
         written,
         sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
         created=HostTime(start, start),
-        attributes={"origin": ", ".join(path.name for path in sources)},
+        attributes={"origin": _origin(sources)},
         chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
     ) as writer:
-        return tuple(_write(writer, sensor) for sensor in found.values())
+        _write(writer, tuple(found.values()))
+    return ImportResult(
+        tuple(_imported(sensor) for sensor in found.values()), opened.problems, opened.left_aside
+    )
 
 
-def _read(sources: Sequence[Path], sampling_rate: float | None) -> list[ForeignSensor]:
-    found: list[ForeignSensor] = []
-    waveforms: list[Path] = []
-    for path in sources:
-        if not path.is_file():
-            raise ImportFormatError(f"{path}: no such file")
-        if path.suffix.lower() == ".npz":
-            found += read_npz(path, sampling_rate)
-        elif path.suffix.lower() == ".mat":
-            found += read_mat(path, sampling_rate)
-        elif path.suffix.lower() in DELIMITED:
-            found += read_delimited(path, sampling_rate)
-        else:
-            waveforms.append(path)
-            continue
-        _LOGGER.info("%s read", path, extra={"file": str(path)})
-    if waveforms:
-        from daq.formats.miniseed import read_waveforms  # noqa: PLC0415 - ObsPy is an extra
-
-        found += read_waveforms(waveforms)
-        _LOGGER.info("%d waveform files read", len(waveforms), extra={"files": len(waveforms)})
-    return found
-
-
-def _by_name(sensors: list[ForeignSensor]) -> dict[str, ForeignSensor]:
-    by_name: dict[str, ForeignSensor] = {}
-    for sensor in sensors:
-        other = by_name.setdefault(sensor.name, sensor)
-        if other is not sensor:
-            raise ImportFormatError(
-                f"sensor {sensor.name!r} is in {other.source} and in {sensor.source}; "
-                "expected each sensor once"
-            )
-    return by_name
+def _origin(sources: Sequence[str | Path]) -> str:
+    names = [str(source).rstrip("/").rpartition("/")[2] for source in sources]
+    more = len(names) - _NAMES_KEPT
+    return ", ".join(names[:_NAMES_KEPT]) + (f" and {more} more" if more > 0 else "")
 
 
 def _ordered(found: dict[str, ForeignSensor], bench: Bench) -> dict[str, ForeignSensor]:
@@ -247,31 +246,100 @@ def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:
     )
 
 
-def _write(writer: ArrayWriter, sensor: ForeignSensor) -> Imported:
-    missing = 0
-    placed = [(sensor.first_sample(stretch), stretch) for stretch in sensor.stretches]
-    for (first, stretch), (following, _) in pairwise(placed):
-        end = first + stretch.n_samples
-        writer.gap(sensor.name, end, following - end, reason=f"not in {sensor.source}")
-        missing += following - end
-    for first, stretch in placed:
-        begin = stretch.start_utc_ns - writer.created.utc_ns
-        rows = [*range(0, stretch.n_samples, BLOCK_ROWS), stretch.n_samples]
-        times = [begin + round(row * NS_PER_S / sensor.sampling_rate) for row in rows]
-        writer.samples(
+def _write(writer: ArrayWriter, sensors: Sequence[ForeignSensor]) -> None:
+    """Write sensors one after another; those that are in the same files together, by time."""
+    for group in _sharing_files(sensors):
+        sequences = [_rows_to_write(sensor) for sensor in group]
+        for rows in merge(*sequences, key=lambda each: each.start_ns):
+            _write_rows(writer, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Rows of a stretch that are written at once, and the samples missing before them."""
+
+    sensor: ForeignSensor
+    stretch: Stretch
+    first_sample: int
+    first: int
+    end: int
+    start_ns: int
+    missing: int
+
+
+def _rows_to_write(sensor: ForeignSensor) -> Iterator[_Rows]:
+    expected = 0
+    for first_sample, stretch in zip(sensor.first_samples(), sensor.stretches, strict=True):
+        for first in range(0, stretch.n_samples, _ROWS_AT_ONCE):
+            end = min(first + _ROWS_AT_ONCE, stretch.n_samples)
+            (start_ns,) = stretch.times_ns([first], sensor.sampling_rate)
+            missing = first_sample + first - expected
+            yield _Rows(sensor, stretch, first_sample + first, first, end, start_ns, missing)
+            expected = first_sample + end
+
+
+def _write_rows(writer: ArrayWriter, rows: _Rows) -> None:
+    sensor, stretch = rows.sensor, rows.stretch
+    if rows.missing:
+        writer.gap(
             sensor.name,
-            stretch.counts,
-            first_sample=first,
-            received_ns=times[1:],
-            utc_ns=times[:-1],
-            restart=True,
+            rows.first_sample - rows.missing,
+            rows.missing,
+            reason=f"not in {sensor.source}",
         )
+    edges = [*range(rows.first, rows.end, BLOCK_ROWS), rows.end]
+    times = stretch.times_ns(edges, sensor.sampling_rate)
+    after = [time - writer.created.utc_ns for time in times]
+    writer.samples(
+        sensor.name,
+        stretch.counts[rows.first : rows.end],
+        first_sample=rows.first_sample,
+        received_ns=after[1:],
+        utc_ns=after[:-1],
+        restart=rows.first == 0,
+    )
+
+
+def _sharing_files(sensors: Iterable[ForeignSensor]) -> list[list[ForeignSensor]]:
+    """Group sensors that are in the same parts of files."""
+    groups: list[tuple[set[int], list[ForeignSensor]]] = []
+    for sensor in sensors:
+        parts = {
+            id(piece.part)
+            for stretch in sensor.stretches
+            if isinstance(stretch.counts, Columns)
+            for column in stretch.counts.columns
+            for piece in column.run.pieces
+        }
+        members = [sensor]
+        for group in [each for each in groups if each[0] & parts]:
+            groups.remove(group)
+            parts |= group[0]
+            members = group[1] + members
+        groups.append((parts, members))
+    return [members for _, members in groups]
+
+
+def _imported(sensor: ForeignSensor) -> Imported:
+    first_samples = sensor.first_samples()
+    ends = [
+        first + stretch.n_samples
+        for first, stretch in zip(first_samples, sensor.stretches, strict=True)
+    ]
+    resampled = {
+        channel
+        for stretch in sensor.stretches
+        if isinstance(stretch.counts, Columns)
+        for channel, column in zip(sensor.channels, stretch.counts.columns, strict=True)
+        if column.shift is None
+    }
     return Imported(
         sensor=sensor.name,
         channels=sensor.channels,
         sampling_rate=sensor.sampling_rate,
         start_utc_ns=sensor.stretches[0].start_utc_ns,
         n_samples=sum(stretch.n_samples for stretch in sensor.stretches),
-        n_gaps=len(placed) - 1,
-        missing=missing,
+        n_gaps=len(sensor.stretches) - 1,
+        missing=sum(first - end for first, end in zip(first_samples[1:], ends[:-1], strict=True)),
+        resampled=tuple(channel for channel in sensor.channels if channel in resampled),
     )

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.errors import RecordingError
-from daq.formats.foreign_sensor import NS_PER_S
 from daq.protocols.block import BlockFlag, HostTime
 from daq.recording.array_writer import BLOCK_ROWS
 from daq.recording.file_format import BLOCK_DTYPE, GAP_DTYPE
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
-    from daq.formats.foreign_sensor import ForeignSensor
+    from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.protocols.block import Event
 
 
@@ -64,11 +63,11 @@ class SensorInMemory:
         lengths = [stretch.n_samples for stretch in foreign.stretches]
         self._first_rows = np.concatenate([[0], np.cumsum(lengths)])
         self.n_samples = int(self._first_rows[-1])
-        first_samples = [foreign.first_sample(stretch) for stretch in foreign.stretches]
+        first_samples = foreign.first_samples()
         self.blocks = BlocksInMemory(
             np.concatenate(
                 [
-                    _blocks(first, int(row), stretch.n_samples, stretch.start_utc_ns, foreign)
+                    _blocks(first, int(row), stretch, foreign.sampling_rate)
                     for stretch, first, row in zip(
                         foreign.stretches, first_samples, self._first_rows, strict=False
                     )
@@ -135,11 +134,11 @@ class RecordingInMemory:
 
 
 def _blocks(
-    first_sample: int, first_row: int, n_samples: int, start_utc_ns: int, foreign: ForeignSensor
+    first_sample: int, first_row: int, stretch: Stretch, sampling_rate: float
 ) -> NDArray[np.void]:
     """Return blocks that state the UTC of their first sample, and arrive with their last."""
-    edges = np.array([*range(0, n_samples, BLOCK_ROWS), n_samples])
-    times = [start_utc_ns + round(int(row) * NS_PER_S / foreign.sampling_rate) for row in edges]
+    rows = [*range(0, stretch.n_samples, BLOCK_ROWS), stretch.n_samples]
+    edges, times = np.array(rows), stretch.times_ns(rows, sampling_rate)
     blocks = np.zeros(len(edges) - 1, BLOCK_DTYPE)
     blocks["first_sample"] = first_sample + edges[:-1]
     blocks["first_row"] = first_row + edges[:-1]

@@ -21,7 +21,7 @@ import numpy as np
 
 from daq.bench.model import PolesZeros
 from daq.errors import ImportFormatError
-from daq.formats.miniseed import load_obspy
+from daq.formats.readers.waveforms import load_obspy
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

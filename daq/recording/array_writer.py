@@ -26,6 +26,8 @@ BLOCK_ROWS = 4096
 """Default number of samples in a block."""
 CHUNK_SECONDS = 10.0
 _NS_PER_S = 1_000_000_000
+_COMMIT_BYTES = 1 << 24
+"""Samples after which those written before are made safe, so that none are kept in memory."""
 
 
 class ArrayWriter:
@@ -66,6 +68,7 @@ class ArrayWriter:
         chunk_seconds: float = CHUNK_SECONDS,
     ) -> None:
         self.created = created
+        self._uncommitted = 0
         self._rates = {sensor.name: sensor.sampling_rate for sensor in sensors}
         self._writer = RecordingWriter.create(
             path,
@@ -135,11 +138,16 @@ class ArrayWriter:
                 else int(received_ns[number])
             )
             starts_anew = number == 0 and (first_sample == 0 if restart is None else restart)
+            samples = counts[row:end]
+            self._uncommitted += samples.nbytes
+            if self._uncommitted > _COMMIT_BYTES:
+                self._writer.commit()
+                self._uncommitted = 0
             self._writer.append(
                 Block(
                     sensor=sensor,
                     first_sample=first_sample + row,
-                    counts=counts[row:end],
+                    counts=samples,
                     received=self._at(received),
                     device_counter=(
                         None if utc_ns is None else self.created.utc_ns + int(utc_ns[number])

@@ -60,6 +60,7 @@ _ASLEEP = 0.05  # seconds that a block may come too early before the host must h
 _RATE_OFF = 0.02  # share by which a rate may be off
 _RECENT = 120.0  # seconds that a host may be held up, all its blocks late, and not have slept
 _UTC_JUMP = 0.01  # samples
+_DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
@@ -135,8 +136,7 @@ class ArrivalTimes:
             return
         self._line = self._unmeasured = None
         flags = blocks["flags"]
-        first = blocks["first_sample"].astype(np.int64)
-        length = blocks["n_samples"].astype(np.int64)
+        first, length = (blocks[name].astype(np.int64) for name in ("first_sample", "n_samples"))
         begins = not self._epoch_starts
         if begins:
             self._device_utc = bool(flags[0] & BlockFlag.DEVICE_UTC)
@@ -158,7 +158,8 @@ class ArrivalTimes:
             late -= np.cumsum(leaps)
             step -= leaps
             self._leapt += float(leaps.sum())
-            breaks = np.abs(step) > _UTC_JUMP / self.sampling_rate
+            drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
+            breaks = np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate
         else:
             breaks = ((flags & int(_BREAKS)) != 0) | self._too_early(index, late)
         breaks[0] |= begins

@@ -103,7 +103,8 @@ def _parameter(name: str) -> inspect.Parameter:
     )
 
 
-def _read(name: str, given: Any) -> object:  # noqa: ANN401 - text, texts, or yes or no
+def read_option(name: str, given: Any) -> object:  # noqa: ANN401 - text, texts, or yes or no
+    """Return the value of a field of EstimateSettings; None if it is not given."""
     if given is None or given == []:
         return None
     if OPTIONS[name].is_switch:
@@ -120,16 +121,18 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command all options of an estimate.
 
     The command receives their values as ``**wanted``, by field of
-    `daq.bench.estimate_settings.EstimateSettings`; None where an option is not given.
+    `daq.bench.estimate_settings.EstimateSettings`; None where an option is not given. A parameter
+    of the command with the name of a field takes the place of that option.
     """
     first, *others = inspect.signature(command).parameters.values()
     own = [each for each in others if each.kind is not each.VAR_KEYWORD]
+    added = [name for name in OPTIONS if name not in {each.name for each in own}]
 
     @wraps(command)
     def with_options(**given: Any) -> None:  # noqa: ANN401 - values of options
-        wanted = {name: _read(name, given.pop(name)) for name in OPTIONS}
+        wanted = {name: read_option(name, given.pop(name)) for name in added}
         command(**given, **wanted)
 
-    signature = inspect.Signature([first, *own, *map(_parameter, OPTIONS)])
+    signature = inspect.Signature([first, *own, *map(_parameter, added)])
     vars(with_options)["__signature__"] = signature
     return with_options

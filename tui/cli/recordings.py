@@ -18,6 +18,7 @@ from tui.cli.options import (
     FilesArgument,
     JsonOption,
     StartOption,
+    read_option,
     with_estimate_options,
 )
 
@@ -104,15 +105,16 @@ def report(
 
 @examples(
     "huddle import *.mseed --response RESP.XX.ABC.00.HNZ --out lab.h5",
+    "huddle import day*.mseed --channels 'HH?' --overlap first --out month.h5",
+    "huddle import sds://archive --net XX --start 2026-11-01 --end 2026-11-08 --out week.h5",
     "huddle import samples.csv --bench lab.toml --out lab.h5",
-    "huddle import arrays.npz --sampling-rate 200 --out lab.h5",
 )
 @with_logging
 @with_estimate_options
 def import_(
     sources: Annotated[
-        list[Path],
-        typer.Argument(metavar="SRC", help="miniSEED, .npz, .mat or .csv files."),
+        list[str],
+        typer.Argument(metavar="SRC", help="Files, or sds://ROOT for an archive of day files."),
     ],
     *,
     out: Annotated[
@@ -141,10 +143,46 @@ def import_(
             help="Sampling rate, if the files do not give it.",
         ),
     ] = None,
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--channels",
+            metavar="PATTERN",
+            help="Channels to import, such as 'HH?' or 'XX.ABC.*.HHZ,XX.DEF.*.HHZ'."
+            " Default: all but those of the instrument's state of health.",
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="UTC", help="First time to import: 2026-11-21T03:00:00."),
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--end", metavar="UTC", help="End of the time to import.")
+    ] = None,
+    overlap: Annotated[
+        str | None,
+        typer.Option(
+            "--overlap",
+            metavar="refuse|first|last",
+            help="Where files overlap with different samples: refuse the channel (default), or keep"
+            " the samples of the file that starts first or last. A number, such as 0.75, is the"
+            " overlap of segments.",
+        ),
+    ] = None,
+    net: Annotated[
+        str, typer.Option("--net", metavar="CODE", help="Network in an SDS archive, or a pattern.")
+    ] = "*",
+    sta: Annotated[str, typer.Option("--sta", metavar="CODE", help="Station, as --net.")] = "*",
+    loc: Annotated[
+        str, typer.Option("--loc", metavar="CODE", help="Location, as --net; -- if empty.")
+    ] = "*",
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Convert files of other programs into a recording.
+
+    A sensor may be in several files. Files of any length take little memory. A file or channel that
+    cannot be used is listed at the end; the others are imported, and the exit code is 3.
 
     [b]miniSEED[/b]  a sensor is network.station.location, a channel is its code
 
@@ -153,15 +191,24 @@ def import_(
 
     [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
     """
-    from tui.commands.import_ import import_recording
+    from tui.commands.import_ import import_recording, selected
 
+    segments = None if overlap in {None, "refuse", "first", "last"} else overlap
     import_recording(
         sources,
         out=out,
         bench=bench,
         response=response,
         sampling_rate=sampling_rate,
+        selection=selected(
+            channels=channels or [],
+            start=start,
+            end=end,
+            overlap=overlap if segments is None else None,
+            codes=(net, sta, loc),
+        ),
         json=json,
+        overlap=read_option("overlap", segments),
         **wanted,
     )
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, cast
 
+import typer
 from rich.table import Table
 
 from daq.bench.loading import parse
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
-from tui.output.console import for_people, write_json
+from daq.formats.sources import Selection
+from tui.output.console import for_people, notices, write_json
+from tui.output.exit_codes import ExitCode
 from tui.output.formatting import several, utc
 from tui.runs.estimate_settings import chosen
 
@@ -18,36 +22,96 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from daq.formats.importer import ImportResult
+
+
+def selected(
+    *,
+    channels: Sequence[str],
+    start: str | None,
+    end: str | None,
+    overlap: str | None,
+    codes: tuple[str, str, str],
+) -> Selection:
+    """Return what is to be taken from files.
+
+    Raises
+    ------
+    typer.BadParameter
+        A time is not understood, or the end is not after the start.
+    """
+    start_ns, end_ns = _instant_ns("--start", start), _instant_ns("--end", end)
+    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+        raise typer.BadParameter(f"--end {end}: expected a time after --start {start}")
+    networks, stations, locations = codes
+    return Selection(
+        channels=[part.strip() for each in channels for part in each.split(",") if part.strip()],
+        start_ns=start_ns,
+        end_ns=end_ns,
+        overlap=cast("Any", overlap or "refuse"),
+        networks=networks,
+        stations=stations,
+        locations=locations,
+    )
+
+
+def _instant_ns(flag: str, text: str | None) -> int | None:
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{flag} {text!r}: expected UTC as in 2026-11-21 or 2026-11-21T03:00:00"
+        ) from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
+
 
 def import_recording(
-    sources: Sequence[Path],
+    sources: Sequence[str | Path],
     *,
     out: Path,
     bench: Path | None,
     response: Path | None,
     sampling_rate: float | None,
+    selection: Selection | None = None,
     json: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Write a recording from files of other programs, and show what it holds.
 
     Options of the estimate become part of the bench file in the recording.
+
+    Raises
+    ------
+    typer.Exit
+        With the code of trouble, if a file or channel could not be used.
     """
     described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
     given = any(value is not None for value in wanted.values())
     settings = chosen(Settings.of(described), **wanted) if given else None
-    imported = import_files(
+    result = import_files(
         sources,
         out,
         bench=described,
         estimate=settings,
         response=response,
         sampling_rate=sampling_rate,
+        selection=selection,
     )
+    _show(result, out, json)
+    write_json(json, {"recording": str(out), **asdict(result)})
+    if result.problems:
+        raise typer.Exit(ExitCode.TROUBLE)
+
+
+def _show(result: ImportResult, out: Path, json: str | None) -> None:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("sensor", "channels", "rate", "start (UTC)", "samples", "gaps"):
         table.add_column(column, justify="right" if column in {"samples", "gaps"} else "left")
-    for entry in imported:
+    for entry in result.sensors:
         table.add_row(
             entry.sensor,
             " ".join(entry.channels),
@@ -58,5 +122,15 @@ def import_recording(
         )
     screen = for_people(json)
     screen.print(table)
+    for entry in result.sensors:
+        if entry.resampled:
+            screen.print(
+                f"{entry.sensor}: resampled to the instants of {entry.channels[0]}:"
+                f" {' '.join(entry.resampled)}"
+            )
+    for reason in sorted(set(result.left_aside.values())):
+        names = [name for name, why in result.left_aside.items() if why == reason]
+        screen.print(f"left aside ({reason}): {' '.join(sorted(names))}")
+    for problem in result.problems:
+        notices().print(f"not imported: {problem}", soft_wrap=True)
     screen.print(f"{out} written; next: huddle estimate {out}")
-    write_json(json, {"recording": str(out), "sensors": [asdict(entry) for entry in imported]})

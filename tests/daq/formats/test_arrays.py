@@ -185,7 +185,9 @@ def test_streams_that_do_not_fit_are_refused() -> None:
         recording_of_arrays(stream(HNX=samples()[:, 0]), 50)
     slow = stream(HNX=samples()[:, 0], HNY=samples()[:, 0])
     slow[0].stats.sampling_rate = 50
-    with pytest.raises(ImportFormatError, match="expected one sampling rate for its channels"):
+    with pytest.raises(
+        ImportFormatError, match="several sampling rates: 100 Hz in HNY; 50 Hz in HNX"
+    ):
         recording_of_arrays({"A": slow})
 
 

@@ -48,7 +48,7 @@ def test_samples_times_and_bench_survive(tmp_path: Path) -> None:
     arrays = write_npz(tmp_path / "a.npz")
     bench = parse(BENCH)
     imported = import_files([tmp_path / "a.npz"], tmp_path / "a.h5", bench=bench)
-    assert [(e.sensor, e.n_samples, e.n_gaps) for e in imported] == [
+    assert [(e.sensor, e.n_samples, e.n_gaps) for e in imported.sensors] == [
         ("A", 40_000, 0),
         ("B", 40_000, 0),
     ]
@@ -75,7 +75,7 @@ def test_samples_times_and_bench_survive(tmp_path: Path) -> None:
 def test_a_gap_stays_a_gap_of_its_length(tmp_path: Path) -> None:
     rows = [f"{k / 10:.1f},{k},{-k}" for k in range(1000) if not 300 <= k < 317]
     (tmp_path / "a.csv").write_text("time,A.X [m/s],B.X [m/s]\n" + "\n".join(rows) + "\n")
-    (first, _) = import_files([tmp_path / "a.csv"], tmp_path / "a.h5")
+    first, _ = import_files([tmp_path / "a.csv"], tmp_path / "a.h5").sensors
     assert (first.n_gaps, first.missing, first.sampling_rate) == (1, 17, 10.0)
     with Recording.open(tmp_path / "a.h5") as recording:
         (gap,) = recording.sensor("A").gaps
@@ -140,15 +140,16 @@ def test_stationxml_gives_each_channel_its_own(tmp_path: Path) -> None:
 
 def test_what_does_not_fit_is_said_and_leaves_no_file(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", 10)
-    write_npz(tmp_path / "b.npz", 10)
+    np.savez(tmp_path / "b.npz", sampling_rate=50.0, A=np.arange(20).reshape(10, 2))
+    np.savez(tmp_path / "c.npz", sampling_rate=50.0, A=np.ones((10, 2)))
     out = tmp_path / "a.h5"
     bench = parse(BENCH.replace('"B"', '"C"'))
     with pytest.raises(ImportFormatError, match="the bench file has the sensors A, C"):
         import_files([tmp_path / "a.npz"], out, bench=bench)
     with pytest.raises(ImportFormatError, match="expected each sensor once"):
-        import_files([tmp_path / "a.npz", tmp_path / "b.npz"], out)
+        import_files([tmp_path / "b.npz", tmp_path / "c.npz"], out)
     with pytest.raises(ImportFormatError, match="no such file"):
-        import_files([tmp_path / "c.npz"], out)
+        import_files([tmp_path / "d.npz"], out)
     with pytest.raises(ImportFormatError, match="expected a RESP or StationXML"):
         import_files([tmp_path / "a.npz"], out, response=tmp_path / "a.npz")
     assert not out.exists()

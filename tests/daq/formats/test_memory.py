@@ -14,7 +14,7 @@ from daq.estimation.settings import Settings
 from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
 from daq.formats.importer import import_files
 from daq.formats.memory import RecordingInMemory, SensorInMemory
-from daq.formats.npz import read_npz
+from daq.formats.readers.npz import read_npz
 
 if TYPE_CHECKING:
     from pathlib import Path

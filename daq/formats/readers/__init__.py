@@ -1,0 +1,1 @@
+"""One module for each family of files, and the library that reads it."""

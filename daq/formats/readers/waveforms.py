@@ -1,0 +1,113 @@
+"""Waveform formats that ObsPy reads: SAC, GSE2, GCF, SEG-2, SEG-Y and others.
+
+A sensor is ``network.station.location``, its channels are the channel codes. In SEG-2 and SEG-Y
+every trace is a sensor with one channel, named by the number of the trace.
+"""
+
+from __future__ import annotations
+
+import glob
+import warnings
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from daq.errors import ImportFormatError
+from daq.formats.traces import FilePart, LoadedPart, Trace
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+FORMATS = (
+    *("MSEED", "SAC", "GSE2", "GSE1", "SLIST", "TSPAIR", "SEGY", "SEG2", "WAV", "KNET"),
+    *("KINEMETRICS_EVT", "REFTEK130", "AH", "GCF"),
+)
+"""Waveform formats that are read, by ObsPy's names, in the order in which they are tried."""
+_NUMBERED = {"SEGY", "SEG2"}
+"""Formats whose traces have numbers and no codes."""
+
+Stream: TypeAlias = Any  # ObsPy has no types
+
+
+def load_obspy() -> Any:  # noqa: ANN401 - ObsPy has no types
+    """Import ObsPy.
+
+    Raises
+    ------
+    ImportFormatError
+        It is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # its own, about importlib.metadata
+            import obspy  # noqa: PLC0415 - takes 0.2 s, and is an extra
+    except ImportError as error:
+        raise ImportFormatError(
+            "this format is read by ObsPy, which is not installed; "
+            "run: pip install 'huddle-bench[formats]'"
+        ) from error
+    return obspy
+
+
+def waveform_format(path: Path) -> str:
+    """Return ObsPy's name for the format of a file.
+
+    ObsPy must not try all its formats: one of them is a pickle, which runs what it holds, and some
+    open other files that are named in the first.
+
+    Raises
+    ------
+    ImportFormatError
+        If it is none of `FORMATS`.
+    """
+    for name in FORMATS:
+        for found in entry_points(group=f"obspy.plugin.waveform.{name}", name="isFormat"):
+            if found.load()(str(path)):
+                return name
+    known = ", ".join(FORMATS)
+    raise ImportFormatError(f"unknown format; expected one of {known}, not compressed")
+
+
+def waveform_parts(path: Path) -> Iterator[FilePart]:
+    """Yield a file as one part."""
+    load_obspy()
+    yield FilePart(path, _read)
+
+
+def _read(path: Path) -> Sequence[Trace]:
+    obspy = load_obspy()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            name = waveform_format(path)
+            stream = obspy.read(glob.escape(str(path)), format=name, check_compression=False)
+            traces = _traces(stream, path.stem, numbered=name in _NUMBERED)
+    except Exception as error:
+        raise ImportFormatError(f"{path}: ObsPy cannot read it: {error}") from error
+    return traces
+
+
+def stream_part(stream: Stream, source: str) -> LoadedPart:
+    """Return the traces of a stream that is in memory."""
+    return LoadedPart(source, _traces(stream, source, numbered=False))
+
+
+def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:
+    found = []
+    for number, trace in enumerate(stream, start=1):
+        stats = trace.stats
+        codes = [code for code in (stats.network, stats.station, stats.location) if code]
+        sensor = str(number) if numbered else ".".join(codes) or fallback
+        found.append(
+            Trace(
+                sensor=sensor,
+                channel="1" if numbered else stats.channel or str(number),
+                start_ns=int(stats.starttime.ns),
+                sampling_rate=float(stats.sampling_rate),
+                samples=np.asarray(trace.data),
+                fdsn=bool(codes) and not numbered,
+            )
+        )
+    return found

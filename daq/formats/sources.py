@@ -1,0 +1,280 @@
+"""Files of other programs, opened as sensors whose samples are read when they are needed.
+
+A file or channel that cannot be used is kept as a problem, and the others are opened. Channels that
+hold the state of the instrument, and those that were not asked for, are left aside.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from daq.errors import ImportFormatError
+from daq.formats.assembly import assembled
+from daq.formats.foreign_sensor import FIRST_DATE_NS
+from daq.formats.readers.registry import parts_of
+from daq.formats.readers.sds import SCHEME, sds_files
+from daq.formats.traces import PartCache, pieces_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from daq.formats.channel_runs import Overlap
+    from daq.formats.foreign_sensor import ForeignSensor
+    from daq.formats.traces import Part, Piece, Trace
+
+    Progress: TypeAlias = Callable[[str], None]
+
+_LOGGER = logging.getLogger(__name__)
+_STATE_BANDS = "AO"
+"""Administrative and opaque channels (SEED manual, appendix A)."""
+_STATE_INSTRUMENTS = "CEKM"
+"""Calibration input, electronic test point, temperature, mass position."""
+_CODE_LENGTH = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What is taken from files.
+
+    Attributes
+    ----------
+    channels : sequence of str
+        Patterns such as ``HH?`` or ``XX.ABC.*.HHZ``; all that measure motion, if there are none.
+    start_ns, end_ns : int, optional
+        UTC from which, and before which, samples are taken.
+    overlap : {"refuse", "first", "last"}
+        Which samples are taken where files overlap and differ.
+    networks, stations, locations : str, optional
+        Patterns of codes in SDS folders.
+    """
+
+    channels: Sequence[str] = ()
+    start_ns: int | None = None
+    end_ns: int | None = None
+    overlap: Overlap = "refuse"
+    networks: str = "*"
+    stations: str = "*"
+    locations: str = "*"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedSources:
+    """Sensors by name, and what is not in them.
+
+    Attributes
+    ----------
+    sensors : dict of str to ForeignSensor
+    problems : tuple of str
+        One sentence for each file or channel that could not be used.
+    left_aside : dict of str to str
+        Channels that are not imported, with the reason.
+    """
+
+    sensors: dict[str, ForeignSensor]
+    problems: tuple[str, ...] = ()
+    left_aside: dict[str, str] = field(default_factory=dict)
+
+
+def open_sources(
+    sources: Sequence[str | Path],
+    selection: Selection | None = None,
+    *,
+    sampling_rate: float | None = None,
+) -> OpenedSources:
+    """Open files of other programs; every sensor may be in several of them.
+
+    Parameters
+    ----------
+    sources : sequence of str or Path
+        Files, or folders ``sds://ROOT`` of the SeisComP Data Structure.
+    selection : Selection, optional
+    sampling_rate : float, optional
+        In Hz, where a file does not say.
+
+    Raises
+    ------
+    ImportFormatError
+        Nothing could be opened; with the reason for each file.
+    """
+    selection = selection or Selection()
+    cache = PartCache()
+    index = _Index(selection)
+    problems: list[str] = []
+    n_files = 0
+    for order, path in enumerate(_files(sources, selection)):
+        n_files += 1
+        try:
+            for part in _parts(path, sampling_rate):
+                index.add(part, cache, order, problems)
+        except (ImportFormatError, OSError) as error:
+            problems.append(_message(path, error))
+            continue
+        _LOGGER.info("%s read", path, extra={"file": str(path)})
+    sensors: dict[str, ForeignSensor] = {}
+    for name in index.names:
+        try:
+            sensor = index.sensor(name, cache, problems)
+            sensor.check()
+        except ImportFormatError as error:
+            problems.append(str(error))
+        else:
+            sensors[name] = sensor
+    if not sensors:
+        raise ImportFormatError("\n".join(problems) or _nothing(index, n_files, selection))
+    return OpenedSources(sensors, tuple(problems), index.left_aside)
+
+
+def _files(sources: Sequence[str | Path], selection: Selection) -> Iterable[Path]:
+    for source in sources:
+        if str(source).startswith(SCHEME):
+            yield from sds_files(str(source), selection)
+        else:
+            yield Path(source)
+
+
+def _parts(path: Path, sampling_rate: float | None) -> Iterator[Part]:
+    if path.is_dir():
+        raise ImportFormatError(
+            f"{path}: a folder; expected files, or sds://{path} for an archive of day files"
+        )
+    if not path.is_file():
+        raise ImportFormatError(f"{path}: no such file")
+    yield from parts_of(path, sampling_rate)
+
+
+def _message(path: Path, error: Exception) -> str:
+    text = str(error)
+    return text if str(path) in text else f"{path}: {text}"
+
+
+def _nothing(index: _Index, n_files: int, selection: Selection) -> str:
+    if not n_files:
+        return "no files found for these codes and times; check the folder, --start and --end"
+    aside = "; ".join(f"{name} ({reason})" for name, reason in index.left_aside.items())
+    asked = ", ".join(selection.channels)
+    chosen = f" of --channels {asked}" if asked else ""
+    return f"no samples{chosen} in {n_files} files; they hold {aside or 'nothing'}"
+
+
+class _Index:
+    """The pieces that files hold, by sensor and channel."""
+
+    def __init__(self, selection: Selection) -> None:
+        self._selection = selection
+        self._pieces: dict[str, dict[str, list[Piece]]] = {}
+        self._units: dict[tuple[str, str], str] = {}
+        self._coded: set[str] = set()
+        self.left_aside: dict[str, str] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """Sensors, in the order in which files were given; those with codes in that of codes."""
+        return sorted(
+            self._pieces, key=lambda name: (name in self._coded, name * (name in self._coded))
+        )
+
+    def add(self, part: Part, cache: PartCache, order: int, problems: list[str]) -> None:
+        """Take a part; one that cannot be read is a problem."""
+        try:
+            traces = cache.traces(part)
+        except ImportFormatError as error:
+            problems.append(str(error))
+            return
+        for trace, piece in pieces_of(part, traces, order):
+            name = f"{trace.sensor}.{trace.channel}"
+            reason = self._reason_against(trace)
+            if reason:
+                self.left_aside[name] = reason
+                continue
+            cut = self._within_span(piece)
+            if cut is None:
+                continue
+            key = trace.sensor, trace.channel
+            if self._units.setdefault(key, trace.unit) != trace.unit:
+                problems.append(
+                    f"{part.source}: {name} in {trace.unit or 'counts'}, in another file in"
+                    f" {self._units[key] or 'counts'}; expected one unit"
+                )
+                continue
+            if trace.fdsn:
+                self._coded.add(trace.sensor)
+            self._pieces.setdefault(trace.sensor, {}).setdefault(trace.channel, []).append(cut)
+
+    def sensor(self, name: str, cache: PartCache, problems: list[str]) -> ForeignSensor:
+        """Return a sensor; a channel that contradicts itself is a problem, the others are taken.
+
+        Raises
+        ------
+        ImportFormatError
+            No channel is left, or they do not fit together.
+        """
+        channels = self._pieces[name]
+        if name in self._coded:
+            channels = dict(sorted(channels.items()))
+        if len(channels) > 1:
+            for channel in list(channels):
+                try:
+                    self._assembled(name, {channel: channels[channel]}, cache)
+                except ImportFormatError as error:
+                    problems.append(str(error))
+                    channels = {key: channels[key] for key in channels if key != channel}
+        if not channels:
+            raise ImportFormatError(f"sensor {name!r}: none of its channels can be used")
+        return self._assembled(name, channels, cache)
+
+    def _assembled(
+        self, name: str, channels: dict[str, list[Piece]], cache: PartCache
+    ) -> ForeignSensor:
+        units = [self._units[name, channel] for channel in channels]
+        known = [unit or "counts" for unit in units] if any(units) else []
+        return assembled(name, channels, known, self._selection.overlap, cache)
+
+    def _reason_against(self, trace: Trace) -> str:
+        code = trace.channel
+        if self._selection.channels:
+            full = f"{trace.sensor}.{code}"
+            asked = self._selection.channels
+            if any(fnmatchcase(each, pattern) for each in (code, full) for pattern in asked):
+                return ""
+            return "not in --channels"
+        if not trace.fdsn or len(code) != _CODE_LENGTH:
+            return ""
+        if code[0] in _STATE_BANDS or code[1] in _STATE_INSTRUMENTS:
+            return "state of health"
+        return ""
+
+    def _within_span(self, piece: Piece) -> Piece | None:
+        """Return the samples within the span of time asked for, if there are any."""
+        start, end = self._selection.start_ns, self._selection.end_ns
+        if (start is None and end is None) or piece.start_ns < FIRST_DATE_NS:
+            return piece
+        interval = piece.interval_ns
+        first = 0 if start is None else max(0, -int((piece.start_ns - start) // interval))
+        last = piece.n_samples
+        if end is not None:
+            last = min(last, -int((piece.start_ns - end) // interval))
+        if first >= last:
+            return None
+        return piece if last - first == piece.n_samples else piece.cut(first, last)
+
+
+def sensors_of_parts(parts: Iterable[Part]) -> tuple[ForeignSensor, ...]:
+    """Return the sensors of parts that are in memory.
+
+    Raises
+    ------
+    ImportFormatError
+        With what is wrong.
+    """
+    cache, problems = PartCache(), list[str]()
+    index = _Index(Selection(channels=("*",)))
+    for order, part in enumerate(parts):
+        index.add(part, cache, order, problems)
+    sensors = tuple(index.sensor(name, cache, problems) for name in index.names)
+    if problems:
+        raise ImportFormatError(problems[0])
+    return sensors

@@ -1,0 +1,56 @@
+"""``huddle import``: what a person and a program are told."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+from typer.testing import CliRunner
+
+from daq.recording.reader import Recording
+from tests.daq.formats.test_sources import counts, write_records
+from tui.cli.main import app
+from tui.output.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_the_rest_is_imported_and_what_is_not_is_listed(tmp_path: Path) -> None:
+    for channel in ("HHZ", "VMZ"):
+        write_records(tmp_path / "a", counts(600, 1), channel=channel)
+    (tmp_path / "b").write_text("no waveforms")
+    sources = [str(tmp_path / "a"), str(tmp_path / "b")]
+    found = CliRunner().invoke(
+        app, ["import", *sources, "-o", str(tmp_path / "a.h5"), "--json", "-"]
+    )
+    assert found.exit_code == ExitCode.TROUBLE
+    document = json.loads(found.stdout)
+    assert [sensor["n_samples"] for sensor in document["sensors"]] == [600]
+    assert document["left_aside"] == {"XX.ABC.00.VMZ": "state of health"}
+    assert "unknown format" in document["problems"][0]
+    assert "left aside (state of health): XX.ABC.00.VMZ" in found.stderr
+    assert "not imported: " in found.stderr
+
+
+def test_overlap_is_a_choice_of_files_or_a_number_for_segments(tmp_path: Path) -> None:
+    write_records(tmp_path / "a", counts(600, 1))
+    write_records(tmp_path / "b", counts(600, 2))
+    files = [str(tmp_path / "a"), str(tmp_path / "b")]
+
+    def run(*options: str) -> int:
+        (tmp_path / "a.h5").unlink(missing_ok=True)
+        return CliRunner().invoke(app, ["import", *options, "-o", str(tmp_path / "a.h5")]).exit_code
+
+    assert run(*files) == ExitCode.TROUBLE
+    assert run(*files, "--overlap", "last") == ExitCode.DONE
+    with Recording.open(tmp_path / "a.h5") as recording:
+        np.testing.assert_array_equal(recording.sensors[0].counts()[:, 0], counts(600, 2))
+    assert run(files[0], "--overlap", "0.75") == ExitCode.DONE
+    with Recording.open(tmp_path / "a.h5") as recording:
+        assert recording.bench is not None
+        assert recording.bench.estimate.overlap == 0.75
+    assert run(*files, "--overlap", "most") == ExitCode.USAGE
+    assert run(files[0], "--start", "noon") == ExitCode.USAGE
+    assert run(files[0], "--start", "2026-11-21", "--end", "2026-11-20") == ExitCode.USAGE
