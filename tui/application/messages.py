@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
+    from tui.application.state import Reference
     from tui.runs.catalogue import Entry
 
 
@@ -45,6 +46,20 @@ class OpeningRequested(Message):
     path: Path
     changes: Mapping[str, object]
     view: str
+
+
+@dataclass
+class ReferenceRequested(Message):
+    """A recording is to be compared with what is shown; None: no longer."""
+
+    path: Path | None
+
+
+@dataclass
+class ReferenceReady(Message):
+    """The estimate of the recording to compare with."""
+
+    reference: Reference
 
 
 @dataclass

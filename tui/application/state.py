@@ -19,6 +19,15 @@ TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Re
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """An earlier recording that the one shown is compared with: its path and its estimate."""
+
+    path: Path
+    snapshot: Snapshot
+    settings: Settings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
     """What is known of the bench and of the recording that is followed.
 
@@ -35,8 +44,10 @@ class State:
         The recording.
     now, snapshot, settings : RecordingStatus, Snapshot and Settings, or None
         What is known of it.
+    judged_by : Bench or None
+        Whose limits are for the recording: the bench that it was recorded with.
     verdict : TestVerdict or None
-        On the limits, of `snapshot`.
+        On these limits, of `snapshot`.
     trouble : str
         Why the recording is no longer followed.
     failure : str
@@ -45,6 +56,8 @@ class State:
         Notice in place of the progress.
     is_starting : bool
         Whether a recorder is being started.
+    reference : Reference or None
+        What the recording is compared with.
     """
 
     name: str
@@ -55,11 +68,13 @@ class State:
     now: RecordingStatus | None = None
     snapshot: Snapshot | None = None
     settings: Settings | None = None
+    judged_by: Bench | None = None
     verdict: TestVerdict | None = None
     trouble: str = ""
     failure: str = ""
     note: str = ""
     is_starting: bool = False
+    reference: Reference | None = None
 
     @property
     def has_result(self) -> bool:

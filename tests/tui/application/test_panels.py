@@ -10,12 +10,12 @@ from daq.results.band_summary import decibels
 from tests.tui.example_snapshot import RATE, SETTINGS, diagnosed, made_now, made_snapshot
 from tui.application.test_view.details import details
 from tui.application.test_view.panels import (
-    Choice,
     alerts,
     noise_in_band,
     progress_line,
     sensor_table,
 )
+from tui.application.test_view.plotted import Choice
 from tui.output.console import console
 
 CHOICE = Choice(methods=("three-sensor",))

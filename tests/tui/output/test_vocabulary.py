@@ -8,7 +8,8 @@ import pytest
 
 from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot
-from tui.application.test_view.panels import Choice, noise_in_band, sensor_table
+from tui.application.test_view.panels import noise_in_band, sensor_table
+from tui.application.test_view.plotted import Choice
 from tui.output.console import console
 from tui.output.results import remarks
 from tui.output.vocabulary import FLAG_WORDS, WITHOUT_ESTIMATE

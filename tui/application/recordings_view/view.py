@@ -12,7 +12,12 @@ from textual.binding import Binding, BindingType
 from textual.widgets import DataTable, Input, Static
 
 from tui.application.dialogs import QuestionScreen
-from tui.application.messages import CatalogueRead, DeletionRequested, OpeningRequested
+from tui.application.messages import (
+    CatalogueRead,
+    DeletionRequested,
+    OpeningRequested,
+    ReferenceRequested,
+)
 from tui.application.recordings_view.rows import COLUMNS, about, matches, row, size
 from tui.application.settings_form import SettingsForm
 from tui.application.state import RECORDINGS, RESULT, TEST
@@ -46,14 +51,16 @@ class RecordingsView(View):
     VIEW = RECORDINGS
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("slash", "filter", "Filter", key_display="/"),
-        Binding("e", "estimate", "Estimate again"),
+        Binding("e", "estimate", "Estimate"),
+        Binding("c", "compare", "Compare"),
         Binding("delete", "delete", "Delete", key_display="del"),
-        Binding("r", "read", "Read again"),
+        Binding("r", "read", "Read again", show=False),
     ]
     KEYS = (
         ("↑ ↓ enter", "choose and open a recording: its result, or its test while it grows"),
         ("/", "show only recordings with these words: bench, date, verdict, file, operator"),
         ("e", "open it and estimate with other settings"),
+        ("c", "compare it with what is shown: curves in 2, differences in 3"),
         ("del", "delete it with its results and reports; asked before"),
         ("r", "read the folder again"),
     )
@@ -117,9 +124,16 @@ class RecordingsView(View):
         table, chosen = self.query_one(RecordingTable), self._chosen()
         wanted = self.query_one(FilterLine).value
         self._listed = [entry for entry in self._entries if matches(entry, wanted)]
+        reference = self.state.reference
         table.clear()
         for entry in self._listed:
-            table.add_row(*row(entry, shown=entry.path == self.state.path))
+            table.add_row(
+                *row(
+                    entry,
+                    shown=entry.path == self.state.path,
+                    is_reference=reference is not None and entry.path == reference.path,
+                )
+            )
         paths = [entry.path for entry in self._listed]
         if chosen is not None and chosen.path in paths:
             table.move_cursor(row=paths.index(chosen.path), animate=False)
@@ -171,10 +185,12 @@ class RecordingsView(View):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done with the chosen recording."""
         del parameters
-        if action not in {"estimate", "delete"}:
+        if action not in {"estimate", "delete", "compare"}:
             return True
         chosen = self._chosen() if self._entries else None
         if chosen is None or chosen.is_growing:
+            return False
+        if action == "compare" and chosen.path == self.state.path:
             return False
         return action == "delete" or not chosen.problem
 
@@ -199,6 +215,12 @@ class RecordingsView(View):
                 self._open(changes)
 
         self.app.push_screen(SettingsForm(chosen.path.name, None), estimate)
+
+    def action_compare(self) -> None:
+        """Compare the chosen recording with what is shown."""
+        chosen = self._chosen()
+        if chosen is not None:
+            self.post_message(ReferenceRequested(chosen.path))
 
     def action_delete(self) -> None:
         """Delete the chosen recording, once that has been confirmed."""

@@ -9,16 +9,25 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, channel_means, data_means
+from daq.results.band_summary import band_of, channel_means, data_means, judged_method
+from daq.results.comparison import compare
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from daq.results.verdict import Verdict
 from tui.application.dialogs import item
-from tui.application.test_view.panels import alerts
+from tui.application.test_view.panels import alerts, known_to
 from tui.output.diagnostics import summary
-from tui.output.formatting import clock_time, level, level_with_error
+from tui.output.formatting import clock_time, level, level_with_error, percent, signed
 from tui.output.results import remarks
-from tui.output.verdict_text import MARKS, STYLES, headline, limit_line, not_judged, what_to_do
+from tui.output.verdict_text import (
+    MARKS,
+    STYLES,
+    headline,
+    limit_line,
+    margin,
+    not_judged,
+    what_to_do,
+)
 from tui.output.vocabulary import PARTNER_WORDS
 
 if TYPE_CHECKING:
@@ -28,13 +37,15 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.verdict import TestVerdict
+    from daq.results.comparison import Difference
+    from daq.results.verdict import LimitResult, TestVerdict
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
+WIDE = 110  # columns from which there is room for what can be missed
 
 
-def result(state: State) -> RenderableType:
+def result(state: State, *, width: int) -> RenderableType:
     """Return the end of a test: verdict, every channel's noise, advice, and where it all lies."""
     now, snapshot, settings, path = state.now, state.snapshot, state.settings, state.path
     if snapshot is None or settings is None:
@@ -44,7 +55,8 @@ def result(state: State) -> RenderableType:
     parts += ["", *wrong] if wrong else []
     parts.append("")
     if snapshot.results:
-        parts += [_channels(snapshot, settings), ""]
+        parts += [_channels(state, snapshot, settings, width=width)]
+        parts += [*_notes(state, snapshot, settings), ""]
     parts += [item(line) for line in (*remarks(snapshot), *summary(snapshot))]
     if path is not None:
         parts += ["", Text.assemble(("recording  ", MUTED), str(path.resolve()))]
@@ -64,24 +76,25 @@ def _verdict(snapshot: Snapshot, settings: Settings, found: TestVerdict | None) 
         yield Text(f"{MARKS[found.verdict]} {headline(found)}", style)
         yield from (Text(line, style.removeprefix("bold ")) for line in what_to_do(found))
         yield from map(Text, not_judged(found))
-        for each in sorted(found.limits, key=lambda each: each.verdict is Verdict.PASS):
-            style = STYLES[each.verdict].removeprefix("bold ")
-            yield Text(f"  {MARKS[each.verdict]} {limit_line(each)}", style)
+        known = [each for each in found.limits if math.isfinite(each.margin_low_db)]
+        if known:
+            worst = min(known, key=lambda each: each.margin_low_db)
+            yield Text(f"Least margin: {limit_line(worst)}.")
     reached = precision(snapshot, settings)
     if reached.target is not None and not math.isnan(reached.cov):
         mark, style = ("✓", "green") if reached.is_reached else ("✗", "yellow")
-        text = f"{mark} c.o.v. {reached.cov:.3f}, target {reached.target:g}"
+        text = f"{mark} {known_to(reached)}"
         if not reached.is_reached and reached.total is not None:
             text += f": would have taken {clock_time(reached.total)} in all"
         yield Text(text, style)
 
 
-def _channels(snapshot: Snapshot, settings: Settings) -> Table:
+def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: int) -> Table:
     method, noise = next(iter(snapshot.results.items()))
     band = band_of(settings, snapshot)
-    data = data_means(snapshot, band)
+    data, cov = data_means(snapshot, band), channel_covs(snapshot, settings, method)
     means = channel_means(noise, snapshot, settings, band)
-    cov = channel_covs(snapshot, settings, method)
+    margins, differences = _margins(state.verdict), _differences(state)
     table = Table(
         box=None,
         pad_edge=False,
@@ -91,23 +104,99 @@ def _channels(snapshot: Snapshot, settings: Settings) -> Table:
         title_justify="left",
         title_style="bold",
     )
+    is_wide = width >= WIDE
     table.add_column("channel", no_wrap=True)
-    for title in ("data", "noise, 95 %", "from", "to", "c.o.v."):
+    is_full = is_wide or not (margins and differences)
+    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["known to"] if is_full else [])]
+    titles += ["margin, dB", *(["at"] if is_full else [])] if margins else ["from", "to"]
+    titles += [f"against {_reference(state)}"] if differences else []
+    for title in titles:
         table.add_column(title, justify="right", no_wrap=True)
     alone = without_partners(snapshot, band)
     for column, label in enumerate(snapshot.channels):
+        name = Text(label.name, "bold")
+        recorded = [level(float(data[column]))] if is_wide else []
         if column in alone:
-            words = PARTNER_WORDS[alone[column]]
-            table.add_row(Text(label.name, "bold"), level(float(data[column])), Text(words, BAD))
+            table.add_row(name, *recorded, Text(PARTNER_WORDS[alone[column]], BAD))
             continue
-        mean = means[column]
-        low, high = float(mean.low[0]), float(mean.high[0])
-        table.add_row(
-            Text(label.name, "bold"),
-            level(float(data[column])),
-            level_with_error(float(mean.mean[0]), high),
-            level(low),
-            level(high),
-            "?" if math.isnan(cov[column]) else f"{cov[column]:.3f}",
-        )
+        low, high = float(means[column].low[0]), float(means[column].high[0])
+        cells: list[str | Text] = [
+            *recorded,
+            level_with_error(float(means[column].mean[0]), high),
+        ]
+        if is_full:
+            cells.append("?" if math.isnan(cov[column]) else percent(cov[column]))
+        key = label.sensor, label.channel
+        if not margins:
+            cells += [level(low), level(high)]
+        elif key in margins:
+            worst = margins[key]
+            style = STYLES[worst.verdict].removeprefix("bold ")
+            cells.append(Text(f"{MARKS[worst.verdict]} {margin(worst)}".replace(" dB", ""), style))
+            cells += [f"{worst.frequency:.3g} Hz" if worst.known else ""] if is_full else []
+        else:
+            cells += [Text("no limit", MUTED), *([""] if is_full else [])]
+        if differences:
+            cells.append(difference_text(differences.get(key)))
+        table.add_row(name, *cells)
     return table
+
+
+def _margins(found: TestVerdict | None) -> dict[tuple[str, str], LimitResult]:
+    """Return for each channel the limit that it does worst beside, by verdict, then by margin."""
+    order = (Verdict.PASS, Verdict.NOT_DECIDED, Verdict.FAIL)
+    worst: dict[tuple[str, str], LimitResult] = {}
+    for each in () if found is None else found.limits:
+        key = each.sensor, each.channel
+        before = worst.get(key)
+        rank = order.index(each.verdict), -each.margin_low_db
+        if before is None or rank > (order.index(before.verdict), -before.margin_low_db):
+            worst[key] = each
+    return worst
+
+
+def _differences(state: State) -> dict[tuple[str, str], Difference]:
+    reference, snapshot, settings = state.reference, state.snapshot, state.settings
+    if reference is None or snapshot is None or settings is None:
+        return {}
+    return compare(snapshot, settings, reference.snapshot, reference.settings)
+
+
+def difference_text(difference: Difference | None) -> Text:
+    """Return a difference in dB with its interval: bold where the interval excludes equal noise."""
+    if difference is None:
+        return Text("no such channel", MUTED)
+    if math.isnan(difference.db):
+        return Text("?", MUTED)
+    low, high = difference.low_db, difference.high_db
+    text = signed(round(difference.db, 2) + 0.0, "+.2f")  # no "-0.00"
+    if math.isinf(low) or math.isinf(high):
+        text += " (not bounded)"
+    else:
+        up, down = high - difference.db, difference.db - low
+        text += f" ±{up:.2f}" if down < 1.1 * up else f" +{up:.2f} −{down:.2f}"
+    return Text(text, "bold" if difference.is_certain else "")
+
+
+def _notes(state: State, snapshot: Snapshot, settings: Settings) -> Iterator[Text]:
+    """Yield what the table does not say of itself."""
+    reference = state.reference
+    if reference is not None:
+        differences = _differences(state)
+        if differences:
+            n_certain = sum(each.is_certain for each in differences.values())
+            said = f"{n_certain} of {len(differences)} channels differ by more than their interval"
+            yield Text(f"against {_reference(state)}: 95 % interval of each channel; {said}", MUTED)
+        else:
+            why = (
+                f"units differ: {snapshot.unit} and {reference.snapshot.unit}"
+                if snapshot.unit != reference.snapshot.unit
+                else "no channel, method or band in common"
+            )
+            yield Text(f"{_reference(state)} cannot be compared: {why}", "yellow")
+    if judged_method(snapshot, settings) not in snapshot.results:
+        yield Text(f"{judged_method(snapshot, settings)} gives no result here", "yellow")
+
+
+def _reference(state: State) -> str:
+    return "" if state.reference is None else state.reference.path.stem

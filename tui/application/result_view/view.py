@@ -9,13 +9,18 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
+from tui.application.messages import OpeningRequested, ReferenceRequested
 from tui.application.result_view.result_text import result
+from tui.application.settings_form import SettingsForm
 from tui.application.state import RESULT
 from tui.application.view import MUTED, View
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import RenderableType
     from textual.app import ComposeResult
+    from textual.events import Resize
 
 
 class ResultView(View):
@@ -23,11 +28,17 @@ class ResultView(View):
 
     VIEW = RESULT
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("w", "app.report", "Write report"),
+        Binding("w", "app.report", "Report"),
+        Binding("o", "app.open_report", "Open"),
+        Binding("e", "estimate", "Estimate"),
+        Binding("c", "compare", "Compare"),
         Binding("s", "app.start", "Start"),
     ]
     KEYS = (
         ("w", "write the report beside the recording"),
+        ("o", "open the report in a browser; written first, if it is not there"),
+        ("e", "estimate the recording again with other settings"),
+        ("c", "compare: choose an earlier recording, c there; c again ends it"),
         ("s", "start the next recording of this bench"),
         ("↑ ↓", "scroll"),
     )
@@ -41,9 +52,39 @@ class ResultView(View):
         """Draw the state."""
         self.query_one("#text", Static).update(self._text())
 
+    def on_resize(self, event: Resize) -> None:
+        """Fit the terminal's size."""
+        super().on_resize(event)
+        self.show(self.state)
+
     def _text(self) -> RenderableType:
         state = self.state
         if state.snapshot is None or state.settings is None or not state.has_result:
-            words = state.note or "No result yet: a test has one when its recording has ended."
-            return Text(words, MUTED)
-        return result(state)
+            words = "No result yet: a test has one when its recording has ended."
+            return Text(state.trouble or state.note or words, MUTED)
+        return result(state, width=self.app.size.width)
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Offer only what can be done now."""
+        del parameters
+        return self.state.has_result if action in {"estimate", "compare"} else True
+
+    async def action_compare(self) -> None:
+        """Choose a recording to compare with, or compare no longer."""
+        if self.state.reference is not None:
+            self.post_message(ReferenceRequested(None))
+            return
+        await self.run_action("app.view('recordings')")
+        self.app.notify("Choose a recording to compare with: c", timeout=8)
+
+    def action_estimate(self) -> None:
+        """Ask for settings, and estimate the recording again."""
+        path = self.state.path
+        if path is None:
+            return
+
+        def estimate(changes: Mapping[str, object] | None) -> None:
+            if changes is not None:
+                self.post_message(OpeningRequested(path, changes, RESULT))
+
+        self.app.push_screen(SettingsForm(path.name, self.state.settings), estimate)

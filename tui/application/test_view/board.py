@@ -10,6 +10,7 @@ from textual.widgets import Static
 
 from tui.application.test_view import clocks, panels
 from tui.application.test_view.plot import DriftPlot, PsdPlot
+from tui.application.test_view.plotted import Choice, curves, plot_title
 from tui.application.view import TALL
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class Board(Vertical):
     def __init__(self) -> None:
         super().__init__()
         self._shown: State | None = None
-        self._choice = panels.Choice()
+        self._choice = Choice()
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
         self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
@@ -52,7 +53,7 @@ class Board(Vertical):
         self._drawn = None
         self.call_after_refresh(self._draw)
 
-    def show(self, shown: State, choice: panels.Choice) -> None:
+    def show(self, shown: State, choice: Choice) -> None:
         """Show this."""
         before, self._shown = self._choice, shown
         self._choice = choice
@@ -125,9 +126,9 @@ class Board(Vertical):
         shown = self._shown
         if shown is None or shown.snapshot is None or shown.settings is None:
             return
-        snapshot, settings, choice = shown.snapshot, shown.settings, self._choice
+        snapshot, choice = shown.snapshot, self._choice
         psd, drift = self.query_one(PsdPlot), self.query_one(DriftPlot)
-        drawn = (id(snapshot), choice, (drift if choice.clocks else psd).size)
+        drawn = (id(snapshot), id(shown.reference), choice, (drift if choice.clocks else psd).size)
         if drawn == self._drawn:
             return
         self._drawn = drawn
@@ -137,8 +138,8 @@ class Board(Vertical):
             drift.show(lines)
         else:
             psd.visible = snapshot.n_segments > 0
-            self._write("#title", panels.plot_title(snapshot, choice))
-            psd.show(panels.curves(snapshot, settings, choice, n_points=psd.n_points))
+            self._write("#title", plot_title(snapshot, choice))
+            psd.show(curves(shown, choice, n_points=psd.n_points))
 
     def _write(self, selector: str, text: RenderableType, *, n_lines: int = 1) -> None:
         """Write a part of the screen; its layout changes only with its height."""

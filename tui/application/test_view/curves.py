@@ -102,6 +102,38 @@ def noise_curve(
     )
 
 
+def mask_curve(
+    frequency: FloatArray,
+    psd: FloatArray,
+    *,
+    span: tuple[float, float],
+    n_points: int,
+    label: str,
+    style: str,
+    marker: str,
+) -> Curve:
+    """Return a limit as a curve without an interval; NaN outside its frequencies.
+
+    `psd` is that of ``frequency[1:]``.
+    """
+    edges = log_edges(frequency, n_points)
+    centre = _centres(frequency, edges)
+    level = np.interp(centre, np.log10(frequency[1:]), decibels(psd))
+    inside = (centre >= np.log10(span[0]) - 1e-9) & (centre <= np.log10(span[1]) + 1e-9)
+    nothing = np.full(centre.size, np.nan)
+    return Curve(
+        label=label,
+        style=style,
+        band_style=style,
+        marker=marker,
+        log_frequency=centre,
+        level_db=np.where(inside, level, np.nan),
+        low_db=nothing,
+        high_db=nothing,
+        negative=np.zeros(centre.size, dtype=bool),
+    )
+
+
 def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
     """Return log10 of the middle of each band, on a logarithmic axis."""
     return np.asarray(np.log10(frequency[edges[:-1]] * frequency[edges[1:] - 1]) / 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,14 +11,13 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.recording.sensor_state import SensorState
-from daq.results.band_summary import band_of, channel_means, correlation_of, decibels
+from daq.results.band_summary import band_of, channel_means, decibels
 from daq.results.partners import without_partners
 from daq.results.precision import precision
 from estimator.diagnostics.kinds import Level
-from tui.application.test_view.curves import data_curve, noise_curve
 from tui.output.advice.alerts import alert
 from tui.output.advice.sentences import Names
-from tui.output.formatting import clock_time, roughly, several, signed, time_left
+from tui.output.formatting import clock_time, percent, roughly, several, signed, time_left
 from tui.output.results import faulty_channels, why_no_segment
 from tui.output.verdict_text import STYLES as STYLES_OF_VERDICTS
 from tui.output.verdict_text import headline, record_for
@@ -32,64 +30,13 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
     from daq.results.partners import WithoutPartner
+    from daq.results.precision import Precision
     from daq.results.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
-    from tui.application.test_view.curves import Curve
+    from tui.application.test_view.plotted import Choice
 
-DATA_STYLE, MUTED = "#7d8799", "#9aa5b8"
-STYLES = {
-    "three-sensor": ("#4cc9f0", "#1d6f8c", "●"),
-    "three-channel": ("#f4a261", "#8a5a34", "×"),
-    "maximum-likelihood": ("#c297ff", "#5f4890", "◆"),
-    "two-channel": ("#e9d86b", "#7f7638", "+"),
-}
-"""Colours of each method, of its curve and of its 95 % band, and what marks the curve."""
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """What the technician looks at: a channel, methods by name, or clocks in place of noise."""
-
-    channel: int = 0
-    methods: tuple[str, ...] = ()
-    clocks: bool = False
-
-
-def curves(snapshot: Snapshot, settings: Settings, choice: Choice, *, n_points: int) -> list[Curve]:
-    """Return the curves of the chosen channel: its data below, the chosen estimates above."""
-    if snapshot.n_segments == 0:
-        return []
-    column, frequency = choice.channel, snapshot.frequency
-    shown = [
-        data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
-    ]
-    correlation, added = correlation_of(settings), snapshot.added_by_clocks
-    for method in choice.methods:
-        if method not in snapshot.results:
-            continue
-        noise = snapshot.results[method]
-        style, band_style, marker = STYLES[method]
-        shown.append(
-            noise_curve(
-                frequency,
-                noise.noise_psd[:, column],
-                noise.cov[:, column],
-                correlation=correlation,
-                n_points=n_points,
-                label=method,
-                style=style,
-                band_style=band_style,
-                marker=marker,
-                added=None if added is None else added[:, column],
-            )
-        )
-    return shown
-
-
-def plot_title(snapshot: Snapshot, choice: Choice) -> str:
-    """Return what the plot shows, with its unit."""
-    label = snapshot.channels[choice.channel]
-    return f"{label.sensor} {label.channel}   power spectral density re 1 ({snapshot.unit})²/Hz"
+MUTED = "#9aa5b8"
+MIN_BAR = 6  # cells
 
 
 def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
@@ -277,7 +224,7 @@ def progress_line(
     if snapshot.n_dropped:
         parts.append(f"{snapshot.n_dropped} excluded")
     if not math.isnan(cov):
-        parts.append(f"c.o.v. {cov:.3f}" + (f" → {target:g}" if target else ""))
+        parts.append(known_to(reached))
     left = reached.seconds_left
     if left is not None:
         left = max(0.0, left - _gone_on(now, snapshot))
@@ -292,9 +239,11 @@ def progress_line(
         parts.append(f"ends in {roughly(now.ends_in)}")
     left = min((each for each in (left, now.ends_in) if each is not None), default=None)
     text = " · ".join(parts)
+    if len(text) + MIN_BAR + 3 > width and len(parts) > 1 and left is not None:
+        text = " · ".join(parts[1:])  # the bar says more than the number of segments
     line = Text()
     room = width - len(text) - 3
-    if left is not None and not snapshot.closed and room >= 6:
+    if left is not None and not snapshot.closed and room >= MIN_BAR:
         done = snapshot.elapsed / max(snapshot.elapsed + left, 1e-9)
         filled = round(done * room)
         line.append("━" * filled, "#4cc9f0")
@@ -302,6 +251,12 @@ def progress_line(
         line.append("  ")
     line.append(text)
     return line
+
+
+def known_to(reached: Precision) -> str:
+    """Return how well the noise at one frequency is known, and how well that is wanted."""
+    wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"
+    return f"known to {percent(reached.cov)}{wanted}"
 
 
 def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:

@@ -12,7 +12,7 @@ from tui.application.dialogs import TextScreen
 from tui.application.state import TEST
 from tui.application.test_view.board import Board
 from tui.application.test_view.details import details
-from tui.application.test_view.panels import Choice
+from tui.application.test_view.plotted import Choice
 from tui.application.view import View
 
 if TYPE_CHECKING:

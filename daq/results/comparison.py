@@ -1,0 +1,97 @@
+"""The noise of one test beside that of an earlier one: differences with their intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.results.band_summary import band_of, channel_means, decibels
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import BandMeans
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """By how many dB the noise of a channel is above that of an earlier test, in a band.
+
+    Attributes
+    ----------
+    sensor, channel : str
+    db : float
+        NaN where one of the two means is not positive.
+    low_db, high_db : float
+        The 95 % interval; infinite where an end of one of the two intervals is not above zero.
+    """
+
+    sensor: str
+    channel: str
+    db: float
+    low_db: float
+    high_db: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the interval leaves no room for equal noise."""
+        return self.low_db > 0 or self.high_db < 0
+
+
+def compare(
+    snapshot: Snapshot, settings: Settings, earlier: Snapshot, earlier_settings: Settings
+) -> dict[tuple[str, str], Difference]:
+    """Return the differences of the channels that both tests have, by sensor and channel.
+
+    Both are judged by the first method that both have, in the band that both have. Nothing can be
+    compared, and the result is empty, where units differ, or bands or methods have nothing in
+    common.
+    """
+    methods = [name for name in snapshot.results if name in earlier.results]
+    mine, theirs = band_of(settings, snapshot), band_of(earlier_settings, earlier)
+    band = max(mine[0], theirs[0]), min(mine[1], theirs[1])
+    if not methods or snapshot.unit != earlier.unit or band[0] >= band[1]:
+        return {}
+    method = methods[0]
+    now = channel_means(snapshot.results[method], snapshot, settings, band)
+    before = {
+        (label.sensor, label.channel): mean
+        for label, mean in zip(
+            earlier.channels,
+            channel_means(earlier.results[method], earlier, earlier_settings, band),
+            strict=True,
+        )
+    }
+    return {
+        (label.sensor, label.channel): difference(
+            label.sensor, label.channel, mean, before[label.sensor, label.channel]
+        )
+        for label, mean in zip(snapshot.channels, now, strict=True)
+        if (label.sensor, label.channel) in before
+    }
+
+
+def difference(sensor: str, channel: str, now: BandMeans, before: BandMeans) -> Difference:
+    """Return the difference of two independent means with its interval.
+
+    The interval of a difference follows from the intervals of both (MOVER): G. Y. Zou and
+    A. Donner, *Construction of confidence limits about effect measures*, Statistics in Medicine 27
+    (2008).
+    """
+    (mean, low, high), (old, old_low, old_high) = (
+        (decibels(float(each.mean[0])), _bound(float(each.low[0])), _bound(float(each.high[0])))
+        for each in (now, before)
+    )
+    middle = mean - old
+    return Difference(
+        sensor,
+        channel,
+        middle,
+        middle - math.hypot(mean - low, old_high - old),
+        middle + math.hypot(high - mean, old - old_low),
+    )
+
+
+def _bound(psd: float) -> float:
+    return -math.inf if psd <= 0 else decibels(psd)

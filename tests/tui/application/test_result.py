@@ -1,0 +1,105 @@
+"""The Result view: verdict, margins, comparison with an earlier recording, another estimate."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.model import Limit
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
+from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
+from tui.application.app import HuddleApp
+from tui.application.messages import ReferenceReady
+from tui.application.reference import reference_of
+from tui.application.state import RECORDINGS, RESULT, Reference
+from tui.simulation.write_recording import simulate_recording
+
+if TYPE_CHECKING:
+    from textual.pilot import Pilot
+
+LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    return ProgressCallback(tmp_path / "run.h5", bench=bench)
+
+
+def earlier(folder: Path, **changes: object) -> Reference:
+    """Return a reference of which one channel was quieter."""
+    snapshot = made_snapshot(n_effective=1500.0, closed=True)
+    noise = snapshot.results["three-sensor"]
+    scale = [0.5] + 8 * [1.0]
+    quieter = replace(
+        noise, noise_psd=noise.noise_psd * scale, low=noise.low * scale, high=noise.high * scale
+    )
+    snapshot = replace(snapshot, results={"three-sensor": quieter}, **changes)  # type: ignore[arg-type]
+    return Reference(folder / "lab-8.h5", snapshot, SETTINGS)
+
+
+async def at_result(pilot: Pilot[None], app: HuddleApp) -> None:
+    """Let a test end."""
+    await shown(pilot, app, *running())
+    await shown(pilot, app, *ended())
+    assert app.current_mode == RESULT
+
+
+@pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
+async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await at_result(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-result-limits")
+        await shown(pilot, app, ReferenceReady(earlier(told.folder)))
+        await assert_looks_as_before(pilot, f"{name}-result-compared")
+        await pilot.press("2")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-test-compared")
+
+
+async def test_what_cannot_be_compared_says_why_and_c_ends_it(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await at_result(pilot, app)
+        await shown(pilot, app, ReferenceReady(earlier(told.folder, unit="m/s")))
+        assert "cannot be compared: units differ: m/s² and m/s" in screen_text(app)
+        await pilot.press("c")
+        await shown(pilot, app)
+        assert "compared" not in screen_text(app)
+        await pilot.press("c")
+        assert app.current_mode == RECORDINGS  # to choose one
+
+
+async def test_another_estimate_starts_from_the_settings_shown(told: ProgressCallback) -> None:
+    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
+    async with app.run_test(size=NARROW) as pilot:
+        await app.workers.wait_for_complete()
+        await at_result(pilot, app)
+        await pilot.press("e")
+        await shown(pilot, app)
+        assert "three-sensor,three-channel" in screen_text(app)
+        await pilot.press("tab", *"4s", "enter")
+        await app.workers.wait_for_complete()
+        await shown(pilot, app)
+    assert told.told == ["about run.h5 {'segment': 4.0}"]
+
+
+def test_the_reference_is_estimated_with_the_settings_of_what_is_shown(tmp_path: Path) -> None:
+    path = tmp_path / "old.h5"
+    bench = Path(str(resources.files("tui.resources").joinpath("demo.toml")))
+    simulate_recording(str(bench), out=path, duration=20.0, json=None)
+    settings = replace(SETTINGS, segment=1.0)
+    found = reference_of(path, settings, lambda *_: (None, None), ended=threading.Event())
+    assert found is not None
+    assert found.snapshot.results.keys() == set(SETTINGS.methods)
+    assert found.snapshot.frequency[1] == 1.0
+    ended = threading.Event()
+    ended.set()
+    assert reference_of(path, settings, lambda *_: (None, None), ended=ended) is None
