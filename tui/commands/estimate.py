@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.estimation.estimation import estimate
+from daq.recording.reader import Recording
 from daq.results.limits import judge
 from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
@@ -27,7 +28,7 @@ from tui.output.noise_parameters import (
 )
 from tui.output.results import curves_csv, remarks, result_table, result_title
 from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, not_judged, what_to_do
-from tui.runs.estimate_settings import settings_for
+from tui.runs.estimate_settings import settings_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,16 +96,19 @@ def estimated(
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> tuple[Snapshot, Settings, Bench | None]:
     """Estimate recordings, showing the progress; return also the settings and the first bench."""
-    settings, bench = settings_for(files[0], start=start, end=end, **wanted)
-    with progress(
-        TextColumn("segments"),
-        BarColumn(),
-        TextColumn("{task.completed} of {task.total}"),
-        TimeRemainingColumn(),
-    ) as bar:
+    with (
+        Recording.open(files[0]) as first,  # once, for its settings and for the estimate
+        progress(
+            TextColumn("segments"),
+            BarColumn(),
+            TextColumn("{task.completed} of {task.total}"),
+            TimeRemainingColumn(),
+        ) as bar,
+    ):
+        settings, bench = settings_of(first, start=start, end=end, **wanted)
         task = bar.add_task("")
         snapshot = estimate(
-            files,
+            [first, *files[1:]],
             settings,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )

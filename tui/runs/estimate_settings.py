@@ -38,10 +38,26 @@ def settings_for(
         If an option does not fit the others or the sensors.
     """
     with Recording.open(file) as recording:
-        bench = recording.bench
-        settings = chosen(Settings.of(bench), **wanted)
-        check_fit(settings, recording.sensors)
-        created = recording.created
+        return settings_of(recording, start=start, end=end, **wanted)
+
+
+def settings_of(
+    recording: Recording,
+    *,
+    start: str | None = None,
+    end: str | None = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> tuple[Settings, Bench | None]:
+    """Return the settings for an open recording, and its bench.
+
+    Raises
+    ------
+    typer.BadParameter
+        If an option does not fit the others or the sensors.
+    """
+    bench, created = recording.bench, recording.created
+    settings = chosen(Settings.of(bench), **wanted)
+    check_fit(settings, recording.sensors)
     return replace(settings, start=_instant(start, created), end=_instant(end, created)), bench
 
 

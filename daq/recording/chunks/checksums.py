@@ -15,7 +15,7 @@ Only where the two differ is each block checked by itself.
 from __future__ import annotations
 
 import zlib
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _POLYNOMIAL = 0xEDB88320  # of CRC-32, reflected
+_PLACES = np.arange(32, dtype=np.uint32)
+_BITS = np.uint32(1) << _PLACES
 _ROW_BYTES = BLOCK_DTYPE.itemsize - BLOCK_DTYPE["crc32"].itemsize
 
 
@@ -83,32 +85,32 @@ def _joined(crcs: NDArray[np.uint32], n_bytes: int) -> int:
 @lru_cache(maxsize=512)
 def _advance(n_bytes: int) -> NDArray[np.uint32]:
     """Return tables, shape (4, 256), that advance each byte of a CRC by zero bytes."""
-    columns = _power(n_bytes)
-    values = np.arange(256)
-    table = np.zeros((4, 256), np.uint32)
-    for number, column in enumerate(columns):
-        place, bit = divmod(number, 8)
-        table[place] ^= np.where((values >> bit) & 1, np.uint32(column), np.uint32(0))
-    return table
+    every_byte = np.arange(256, dtype=np.uint32) << (8 * np.arange(4, dtype=np.uint32))[:, None]
+    return _applied(_power(n_bytes), every_byte)
 
 
-def _power(n_bytes: int) -> list[int]:
-    """Return the columns of the matrix that advances a CRC by zero bytes."""
-    base = [_POLYNOMIAL, *(1 << bit for bit in range(31))]  # by one bit
-    result = [1 << bit for bit in range(32)]
-    n_bits = 8 * n_bytes
+def _power(n_bytes: int) -> NDArray[np.uint32]:
+    """Return the columns of the matrix that advances a CRC by zero bytes, shape (32,)."""
+    result = _BITS
+    n_bits, place = 8 * n_bytes, 0
     while n_bits:
         if n_bits & 1:
-            result = [_applied(base, column) for column in result]
-        base = [_applied(base, column) for column in base]
+            result = _applied(_doubled(place), result)
         n_bits >>= 1
+        place += 1
     return result
 
 
-def _applied(matrix: list[int], vector: int) -> int:
-    product = 0
-    for column in matrix:
-        if vector & 1:
-            product ^= column
-        vector >>= 1
-    return product
+@cache
+def _doubled(place: int) -> NDArray[np.uint32]:
+    """Return the columns of the matrix that advances a CRC by 2**place zero bits."""
+    if place == 0:
+        return np.concatenate([[np.uint32(_POLYNOMIAL)], _BITS[:-1]])
+    half = _doubled(place - 1)
+    return _applied(half, half)
+
+
+def _applied(matrix: NDArray[np.uint32], vectors: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return the product of a matrix, by its columns, with each vector of bits."""
+    bits = (vectors[..., None] >> _PLACES) & np.uint32(1)
+    return np.asarray(np.bitwise_xor.reduce(bits * matrix, axis=-1), np.uint32)
