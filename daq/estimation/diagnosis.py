@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Channel
     from daq.estimation.noise_estimates import Dimensions
     from daq.timing.clock_model import ClockState
+    from estimator.diagnostics.stability import SegmentCourse
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
 
@@ -121,12 +122,14 @@ def diagnosis(
     *,
     dimensions: Dimensions | None = None,
     faulty: Collection[int] = (),
+    course: SegmentCourse | None = None,
 ) -> tuple[Diagnosis | None, Untested | None]:
     """Diagnose the test.
 
     The model tested has as many dimensions as were asked for, or as the largest sensor has
     channels where `dimensions` were chosen by the motion. Of `faulty` channels, by column, it is
     known that they are clipped, or were dead for a while: no sensitivity of theirs is called wrong.
+    `course` is that of the segments of the only band.
 
     Returns
     -------
@@ -157,6 +160,7 @@ def diagnosis(
                     n_factors=n_factors,
                     neighbours=neighbours(band),
                     vertical=vertical,
+                    course=course if len(bands) == 1 else None,
                 )
             except InsufficientDataError:
                 few = len(dims) < 3
@@ -176,6 +180,7 @@ def diagnosis(
             for advice in each.advice
             if (each is clearest or not advice.sensors) and not _is_explained(advice, faulty)
         ),
+        stability=found[0].stability if len(found) == 1 else None,
         per_frequency=FrequencyDiagnosis(
             coherence=_over(bands, [each.coherence for each in found]),
             condition=_over(bands, [each.condition for each in found]),

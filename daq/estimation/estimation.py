@@ -37,6 +37,7 @@ from daq.estimation.noise_estimates import (
     up_to,
 )
 from daq.estimation.recording_set import check_same, check_span, open_another
+from daq.estimation.segment_course import segment_course
 from daq.estimation.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
@@ -317,6 +318,7 @@ class Estimation:
             self._passes[0].aligned.channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
+            course=segment_course(self._passes, self._passes[0].aligned.channels, self._unit),
         )
         return Findings(clipped, stood_still, found, untested)
 

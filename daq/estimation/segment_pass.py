@@ -14,6 +14,7 @@ from daq.alignment.delay_estimation import DelayEstimator
 from daq.estimation.flatline import FlatlineDetector, stands_still
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
+from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
@@ -79,7 +80,10 @@ class Pass:
         elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
         # The other processors read ahead.
-        self._all = CrossSpectra(self.welch, self.n_channels, threads=1)
+        single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
+        self.single = None if wanted.octaves or wanted.reject else single
+        self._kept_at: list[NDArray[np.int64]] = []
+        self._all = CrossSpectra(self.welch, self.n_channels, threads=1, segments=self.single)
         self._selected: CrossSpectra | None = None
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
@@ -104,6 +108,12 @@ class Pass:
         if self.octaves is not None:
             return self.octaves.n_segments
         return self._n_taken if self._undisturbed is None else self.spectra.n_segments
+
+    @property
+    def kept_at(self) -> NDArray[np.int64]:
+        """Grid samples at which the segments of `single` begin."""
+        at = np.concatenate(self._kept_at) if self._kept_at else np.empty(0, np.int64)
+        return at if self.single is None else at[:: self.single.every]
 
     @property
     def n_complete(self) -> int:
@@ -151,6 +161,7 @@ class Pass:
                 self._fed = first * hop + len(samples)
             elif self._undisturbed is None:
                 self._all.add(samples, starts)
+                self._kept_at.append(first * hop + starts)
             else:
                 self._undisturbed.add(samples, starts)
                 self._selected = None

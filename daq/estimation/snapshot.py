@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
     from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.relative_response import RelativeResponse
+    from estimator.diagnostics.stability import Stability
     from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
@@ -184,6 +185,8 @@ class Diagnosis:
     advice : tuple of Advice
         Worst first within each octave.
     per_frequency : FrequencyDiagnosis
+    stability : Stability or None
+        None with too few segments, where each octave has its own, or with rejection.
     """
 
     n_factors: int
@@ -192,6 +195,7 @@ class Diagnosis:
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
     per_frequency: FrequencyDiagnosis
+    stability: Stability | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

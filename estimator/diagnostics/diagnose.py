@@ -24,6 +24,8 @@ from estimator.diagnostics.relative_response import (
 from estimator.diagnostics.rules import advise
 from estimator.diagnostics.shared_motion import shared_motion
 from estimator.diagnostics.shared_noise import shared_noise
+from estimator.diagnostics.stability import Stability, stability
+from estimator.diagnostics.time_rules import changes
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.chi_square import critical_value
@@ -32,6 +34,7 @@ from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     ModelTest,
+    calmed,
     model_test,
     p_values,
     pool,
@@ -49,6 +52,7 @@ from estimator.self_noise.live_channels import Presence, presence
 
 if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
+    from estimator.diagnostics.stability import SegmentCourse
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
 LOST = 0.5
@@ -90,6 +94,8 @@ class Diagnostics:
         Of the pairs that can be compared: of sensors with all their channels.
     advice : tuple of Advice
         Worst first.
+    stability : Stability or None
+        None without segments, or with too few.
     """
 
     frequency: FloatArray
@@ -104,6 +110,7 @@ class Diagnostics:
     bands: tuple[BandDiagnosis, ...]
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
+    stability: Stability | None = None
 
 
 def diagnose(
@@ -115,6 +122,7 @@ def diagnose(
     n_factors: int | None = None,
     neighbours: FloatArray | None = None,
     vertical: int | None = None,
+    course: SegmentCourse | None = None,
 ) -> Diagnostics:
     """Diagnose a huddle test.
 
@@ -139,6 +147,9 @@ def diagnose(
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
     vertical : int, optional
         Which channel of every sensor is vertical, for the horizontal angles.
+    course : SegmentCourse, optional
+        The segments one by one, all channels: shows disturbances and changes, for which the tests
+        are then corrected.
 
     Returns
     -------
@@ -195,14 +206,24 @@ def diagnose(
         )
         for inside in (number == b for b in np.unique(number))
     )
-    shared = None
+    shared, steady = None, None
+    between = HANN_HALF if neighbours is None else neighbours
     if isinstance(tested, Maximum) and q >= d:
+        if course is not None:
+            alive_course = replace(course, spectra=course.spectra[:, :, list(there.channels)])
+            steady = stability(
+                alive_course, tested, frequency, n_effective=n_effective, neighbours=between
+            )
+        if steady is not None:
+            steady = steady.among(there.channels, sum(dims))
+            found = tuple(replace(b, test=calmed(b.test, steady.inflation)) for b in found)
         shared = shared_noise(
             tested,
             [number == b for b in np.unique(number)],
             dims=there.dims,
             n_effective=n_effective,
-            neighbours=HANN_HALF if neighbours is None else neighbours,
+            neighbours=between,
+            inflation=1.0 if steady is None else steady.inflation,
         )
         shared = None if shared is None else shared.among(there.channels, sum(dims))
     alive = np.ix_(range(len(csm)), there.channels, there.channels)
@@ -228,7 +249,13 @@ def diagnose(
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
             shared=shared,
+            further=(
+                ()
+                if steady is None or course is None
+                else tuple(changes(steady, course.times, np.repeat(np.arange(len(dims)), dims)))
+            ),
         ),
+        stability=steady,
     )
 
 

@@ -43,3 +43,50 @@ class SharedNoise(Advice):
         """Larger of the two biases, as a fraction of the noise."""
         known = [abs(x) for x in (self.three_sensor, self.maximum_likelihood) if not math.isnan(x)]
         return max(known, default=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DisturbedSegments(Advice):
+    """Single segments differ from all others in what is no common motion.
+
+    Attributes
+    ----------
+    n_disturbed, n_segments : int
+    times : tuple of float
+        Starts of the first of them, seconds from the start.
+    excess : float
+        What they add to the noise, as a fraction, at the frequencies where it is most.
+    channel : int
+        The channel that shows most of it.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.DISTURBED_SEGMENTS
+    n_disturbed: int
+    n_segments: int
+    times: tuple[float, ...]
+    excess: float
+    channel: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseChanges(Advice):
+    """The noise of a channel differs between parts of the recording.
+
+    Attributes
+    ----------
+    channel : int
+    deviation : float
+        Standard deviation between parts, as a fraction of the noise.
+    expected : float
+        The same of steady noise.
+    n_parts : int
+    inflation : float
+        By which the model test and the tests of shared noise are corrected.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.NOISE_CHANGES
+    channel: int
+    deviation: float
+    expected: float
+    n_parts: int
+    inflation: float

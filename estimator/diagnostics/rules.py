@@ -69,6 +69,7 @@ def advise(
     n_effective: float,
     nyquist: float,
     shared: SharedPairs | None = None,
+    further: tuple[Advice, ...] = (),
 ) -> tuple[Advice, ...]:
     """Say what there is to know about a test, worst first.
 
@@ -87,6 +88,8 @@ def advise(
         Hz.
     shared : SharedPairs, optional
         Pairs of channels that share noise: what they explain is no further misfit.
+    further : tuple of Advice
+        What is known besides.
 
     Returns
     -------
@@ -108,6 +111,7 @@ def advise(
     ]
     found = [
         *_absent(given, dims),
+        *further,
         *strangers,
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
         *(advice for response in responses for advice in orientation(response, dims, nyquist)),

@@ -81,6 +81,15 @@ def less(test: BandTest, explained: float) -> BandTest:
     return replace(test, statistic=statistic, p_value=p_value)
 
 
+def calmed(test: BandTest, inflation: float) -> BandTest:
+    """Return the test where residuals scatter by `inflation` more than of steady noise."""
+    if inflation == 1 or not math.isfinite(test.p_value):
+        return test
+    statistic = test.statistic / inflation
+    p_value = upper_tail(test.degrees / test.spread, statistic / test.spread)
+    return replace(test, statistic=statistic, p_value=p_value)
+
+
 def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     """Test the common-motion model at every frequency.
 

@@ -24,6 +24,7 @@ from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
+    from estimator.spectra.segment_spectra import SegmentSpectra
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
@@ -96,14 +97,24 @@ class CrossSpectra:
     n_channels : int
     threads : int
         How many `add` may use: 1 where other threads of the caller's have the processors already.
+    segments : SegmentSpectra, optional
+        Receives the spectra of the single segments.
     """
 
-    def __init__(self, settings: WelchSettings, n_channels: int, *, threads: int = THREADS) -> None:
+    def __init__(
+        self,
+        settings: WelchSettings,
+        n_channels: int,
+        *,
+        threads: int = THREADS,
+        segments: SegmentSpectra | None = None,
+    ) -> None:
         if n_channels < 1:
             raise EstimatorError(f"{n_channels} channels: at least one is needed")
         self.settings = settings
         self.n_channels = n_channels
         self._threads = threads
+        self._single = segments
         self.n_segments = 0
         length = settings.segment_length
         self._window = get_window(settings.window, length)
@@ -142,14 +153,20 @@ class CrossSpectra:
             return
         workers = min(self._threads, -(-len(starts) // self._block))
         if workers == 1:
-            self._sum += self._total(samples, starts)
+            self._take(*self._total(samples, starts))
         else:
             with ThreadPoolExecutor(workers) as pool:
-                for total in pool.map(
+                for total, single in pool.map(
                     functools.partial(self._total, samples), np.array_split(starts, workers)
                 ):
-                    self._sum += total
+                    self._take(total, single)
         self.n_segments += len(starts)
+
+    def _take(self, total: ComplexArray, single: list[ComplexArray]) -> None:
+        self._sum += total
+        if self._single is not None:
+            for spectra in single:
+                self._single.add(spectra)
 
     def check(self, samples: FloatArray, starts: IntArray) -> None:
         """Raise what `add` would raise, and add nothing."""
@@ -165,8 +182,13 @@ class CrossSpectra:
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
             )
 
-    def _total(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
-        """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels)."""
+    def _total(
+        self, samples: FloatArray, starts: IntArray
+    ) -> tuple[ComplexArray, list[ComplexArray]]:
+        """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels).
+
+        And the spectra of the segments at the frequencies that are kept, if any are.
+        """
         length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
         block = min(self._block, len(starts))
         frames = np.empty((block, length, n_channels))
@@ -175,6 +197,7 @@ class CrossSpectra:
         # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
         # so that BLAS does half the work.
         gram = np.zeros((n_freqs, 2 * n_channels, 2 * n_channels))
+        single: list[ComplexArray] = []
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
             n = len(rows)
@@ -184,8 +207,10 @@ class CrossSpectra:
                 segments = np.multiply(segments, self._taper, out=frames[:n])
             np.fft.rfft(segments, axis=1, out=spectra[:n])
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
+            if self._single is not None:
+                single.append(spectra[:n, self._single.bins])
             if len(starts) == 1:  # to sum it and take it apart again would cost more
-                return spectra[0, :, :, None] * spectra[0, :, None, :].conj()
+                return spectra[0, :, :, None] * spectra[0, :, None, :].conj(), single
             parts = spectra[:n].view(np.float64)
             for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
                 some = slice(low, low + FREQUENCIES_PER_BLOCK)
@@ -195,7 +220,7 @@ class CrossSpectra:
         total = np.empty_like(self._sum)
         total.real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
         total.imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
-        return total
+        return total, single
 
     @property
     def n_effective(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from daq.estimation.snapshot import Diagnosis, Snapshot
+    from estimator.diagnostics.stability import Stability
     from estimator.likelihood.dimension import BandDimension
 
 _LEGEND = (
@@ -101,6 +103,9 @@ def details(snapshot: Snapshot) -> list[RenderableType]:
     if snapshot.octaves:
         parts += [_heading("Segments of each octave"), _octaves(snapshot)]
     names = Names.of(snapshot)
+    if found.stability is not None:
+        between, table = _repeatability(found.stability, names)
+        parts += [_heading(f"Repeatability of the noise between {between}"), table]
     parts += [Text(f"{advice.level}: {explain(advice, names)}") for advice in found.advice]
     parts += [Text(line) for line in _dimensions(snapshot.diagnostics.dimensions)]
     return parts
@@ -150,6 +155,24 @@ def _octaves(snapshot: Snapshot) -> Table:
             f"{octave.n_effective:.0f}",
         )
     return table
+
+
+def _repeatability(found: Stability, names: Names) -> tuple[str, Table]:
+    """Return what is compared, and the scatter of each channel's noise beside that of steady noise.
+
+    Recordings where there are several, parts of the recording otherwise.
+    """
+    scatter = found.parts if found.runs is None else found.runs
+    table = _table("band (Hz)", *names.channels, "if steady")
+    for low, high, deviation, expected in zip(
+        found.low, found.high, scatter.deviation, scatter.expected, strict=True
+    ):
+        steady = expected[np.isfinite(expected)]
+        numbers = [*deviation.tolist(), float(np.median(steady)) if len(steady) else math.nan]
+        cells = ["?" if math.isnan(each) else f"{100 * each:.1f} %" for each in numbers]
+        table.add_row(f"{low:.3g}–{high:.3g}", *cells)
+    what = "parts of the recording" if found.runs is None else "recordings"
+    return f"{scatter.n_parts} {what} (standard deviation)", table
 
 
 def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:

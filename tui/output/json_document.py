@@ -254,6 +254,7 @@ def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
         "bands": found.bands,
         "responses": found.responses,
         "advice": [_advice(each, names) for each in found.advice],
+        "stability": found.stability,
         "n_factors": found.n_factors,
         "pairs": [(sensors[one], sensors[two]) for one, two in found.pairs],
         "per_frequency": found.per_frequency,

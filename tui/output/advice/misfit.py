@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.output.advice.alerts import alert
 from tui.output.advice.sentences import Explanation, explain, where
 from tui.output.formatting import listed, percent
@@ -54,6 +54,44 @@ def _effect(advice: SharedNoise, names: Names) -> str:
         return "The noise estimates may be wrong by as much."
     text = f"{listed(found)} (worst in {names.channels[advice.channel]})."
     return text[0].upper() + text[1:]
+
+
+@explain.register(DisturbedSegments)
+def _disturbed(advice: DisturbedSegments, names: Names) -> Explanation:
+    several = advice.n_disturbed > 1
+    more = advice.n_disturbed - len(advice.times)
+    times = ", ".join(f"{time:.0f} s" for time in advice.times)
+    return Explanation(
+        f"{advice.n_disturbed} of {advice.n_segments} segments "
+        f"{'differ' if several else 'differs'} from all others in what is no common motion, most "
+        f"in {names.channels[advice.channel]} (from the start: {times}"
+        f"{f' and {more} more' if more else ''}). They add up to {percent(advice.excess)} to the "
+        "noise.",
+        "Exclude disturbed segments (--reject).",
+    )
+
+
+@explain.register(NoiseChanges)
+def _changes(advice: NoiseChanges, names: Names) -> Explanation:
+    corrected = (
+        f" Tests allow for it: residuals scatter {advice.inflation:.2g} times as much."
+        if advice.inflation > 1
+        else ""
+    )
+    return Explanation(
+        f"The noise changes during the recording, most in {names.channels[advice.channel]} at "
+        f"{where(advice)}: by {percent(advice.deviation)} between {advice.n_parts} parts "
+        f"({percent(advice.expected)} if it were steady). The estimate is the mean.{corrected}",
+        "Estimate parts of the recording by themselves (--start, --end).",
+    )
+
+
+@alert.register(DisturbedSegments)
+def _disturbed_alert(advice: DisturbedSegments, names: Names) -> str:
+    return (
+        f"{advice.n_disturbed} disturbed segments, most in {names.channels[advice.channel]}: "
+        f"noise up to {percent(advice.excess)} too high; use --reject"
+    )
 
 
 @alert.register(SharedNoise)

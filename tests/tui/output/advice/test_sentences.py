@@ -30,7 +30,7 @@ from estimator.diagnostics.advice import (
     WeakMotion,
 )
 from estimator.diagnostics.kinds import AdviceKind, Level
-from estimator.diagnostics.misfit import SharedNoise
+from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.output.advice.sentences import Names, explain
 from tui.output.advice.summary import summarise
 
@@ -102,6 +102,39 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
     (
         replace(SHARED, sensors=(0,), channels=((0, 1),), amounts=(0.1,), errors=(0.01,)),
         ("Channels of a share noise", "a.x and a.y 10 ± 1 %"),
+    ),
+    (
+        DisturbedSegments(
+            level=Level.WARNING,
+            sensors=(1,),
+            n_disturbed=7,
+            n_segments=240,
+            times=(295.0, 300.0),
+            excess=0.4,
+            channel=4,
+        ),
+        (
+            "7 of 240 segments differ",
+            "most in b.y (from the start: 295 s, 300 s and 5 more)",
+            "add up to 40 % to the noise",
+            "--reject",
+        ),
+    ),
+    (
+        NoiseChanges(
+            level=Level.NOTE,
+            sensors=(1,),
+            band=BAND,
+            channel=4,
+            deviation=0.45,
+            expected=0.1,
+            n_parts=12,
+            inflation=1.36,
+        ),
+        (
+            "most in b.y at 2–8 Hz: by 45 % between 12 parts (10 % if it were steady)",
+            "scatter 1.4 times as much",
+        ),
     ),
     (
         NoSignal(

@@ -1,0 +1,46 @@
+"""The segments of recordings one by one, as far as they are kept."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.estimation.noise_estimates import responses
+from estimator.diagnostics.stability import SegmentCourse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.estimation.noise_estimates import Channels
+    from daq.estimation.segment_pass import Pass
+
+
+def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> SegmentCourse | None:
+    """Return the segments of all recordings; None where each octave has its own, or none is kept.
+
+    Times count from the start of the first recording.
+    """
+    spectra, times, runs = [], [], []
+    every = max((each.single.every for each in passes if each.single is not None), default=1)
+    origin = passes[0].aligned.start_utc_ns
+    for run, each in enumerate(passes):
+        if each.single is None:
+            return None
+        some = slice(None, None, every // each.single.every)
+        found, at = each.single.values()[some], each.kept_at[some]
+        later = (each.aligned.start_utc_ns - origin) * 1e-9
+        spectra.append(found)
+        times.append(later + at / each.welch.sampling_rate)
+        runs.append(np.full(len(found), run))
+    first = passes[0]
+    if first.single is None or not sum(map(len, spectra)):
+        return None
+    bins = first.single.bins
+    response = responses(first.welch.frequencies[bins], channels, unit)
+    return SegmentCourse(
+        spectra=np.concatenate(spectra) / response,
+        bins=bins,
+        times=np.concatenate(times),
+        runs=np.concatenate(runs),
+    )

@@ -1,0 +1,81 @@
+"""Spectra of single segments at a few frequencies: what averages do not show of their course."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from estimator.types import ComplexArray, IntArray
+
+KEPT_FREQUENCIES = 48
+MOST_SEGMENTS = 8192
+"""Beyond these every second one is kept, then every fourth, and so on."""
+
+
+def kept_bins(n_freqs: int) -> IntArray:
+    """Return bins that are kept: spaced by ratio, as far as they are distinct.
+
+    Parameters
+    ----------
+    n_freqs : int
+        Frequencies of a spectrum, from 0 to half the sampling rate.
+
+    Returns
+    -------
+    int64, shape (n_kept,)
+        Without the two lowest bins and the highest tenth.
+    """
+    highest = int(0.9 * (n_freqs - 1))
+    if highest <= 2:
+        return np.empty(0, np.int64)
+    return np.unique(np.round(np.geomspace(2, highest, KEPT_FREQUENCIES))).astype(np.int64)
+
+
+class SegmentSpectra:
+    """Spectra of the segments one by one, at `bins` only.
+
+    Parameters
+    ----------
+    bins : int64, shape (n_kept,)
+    n_channels : int
+
+    Attributes
+    ----------
+    every : int
+        Every how many-th segment is kept.
+    """
+
+    def __init__(self, bins: IntArray, n_channels: int) -> None:
+        self.bins = bins
+        self.every = 1
+        self._n_channels = n_channels
+        self._n_seen = 0
+        self._parts: list[NDArray[np.complex64]] = []
+        self._n_kept = 0
+
+    def add(self, spectra: ComplexArray) -> None:
+        """Add the spectra of segments, in the order of time.
+
+        Parameters
+        ----------
+        spectra : complex, shape (n_segments, n_kept, n_channels)
+        """
+        number = self._n_seen + np.arange(len(spectra))
+        self._n_seen += len(spectra)
+        some = spectra[number % self.every == 0].astype(np.complex64)
+        self._parts.append(some)
+        self._n_kept += len(some)
+        while self._n_kept > MOST_SEGMENTS:
+            self._parts = [self.values()[::2]]
+            self._n_kept = len(self._parts[0])
+            self.every *= 2
+
+    def values(self) -> NDArray[np.complex64]:
+        """Return what is kept, shape (n_segments, n_kept, n_channels); not scaled to a density."""
+        if not self._parts:
+            return np.empty((0, len(self.bins), self._n_channels), np.complex64)
+        return np.concatenate(self._parts)
