@@ -131,6 +131,13 @@ NOISE_MODELS: Mapping[str, Mask] = {
     "ahnm": _straight("AHNM", _AHNM),
 }
 """Published models, by the name that the bench file and the command line know."""
+SOURCES: Mapping[str, str] = {
+    "NLNM": "Peterson (1993), low noise",
+    "NHNM": "Peterson (1993), high noise",
+    "ALNM": "Cauzzi and Clinton (2013), quiet strong-motion stations",
+    "AHNM": "Cauzzi and Clinton (2013), noisy strong-motion stations",
+}
+"""Source and meaning of each published model, by its name in figures."""
 
 
 def check_points(frequency: Sequence[float], values: Sequence[float]) -> None:

@@ -312,7 +312,8 @@ def _judged(snapshot: Snapshot, limit: Limit, edges: NDArray[np.int64]) -> tuple
     if edges.size < 2:
         return math.nan, math.nan
     frequency, (low, *_, high) = snapshot.frequency, limit.mask.frequency
-    first, last = float(frequency[edges[0]]), float(frequency[edges[-1] - 1])
+    first = float(frequency[edges[0]])
+    last = min(float(frequency[edges[-1] - 1]), highest_known(snapshot) or math.inf)
     spacing = float(frequency[1])
     return (
         low if low >= spacing else first,

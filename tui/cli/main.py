@@ -133,6 +133,7 @@ _PANELS = {
     "Recordings": (
         recordings.estimate,
         recordings.report,
+        recordings.plot,
         recordings.import_,
         recordings.repair,
     ),

@@ -57,6 +57,15 @@ DurationOption: TypeAlias = Annotated[
         help="Length of the recording, such as 90s, 20min or 3h (default: from the bench file).",
     ),
 ]
+ModelsOption: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--models",
+        metavar="NAMES",
+        help="Noise models to draw, separated by commas: nlnm, nhnm, alnm, ahnm, or CSV files"
+        " with a header such as: frequency (Hz), noise (µg/√Hz).",
+    ),
+]
 StartOption: TypeAlias = Annotated[
     str | None,
     typer.Option(

@@ -1,4 +1,4 @@
-"""``estimate``, ``report``, ``import``, ``simulate``, ``repair``."""
+"""``estimate``, ``report``, ``plot``, ``import``, ``simulate``, ``repair``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -17,6 +17,7 @@ from tui.cli.options import (
     FileArgument,
     FilesArgument,
     JsonOption,
+    ModelsOption,
     StartOption,
     read_option,
     with_estimate_options,
@@ -70,6 +71,7 @@ def estimate(
 @examples(
     "huddle report night.h5",
     "huddle report night.h5 --out night.pdf --band 1:20",
+    "huddle report night.h5 --models nlnm,nhnm,brochure.csv",
     "huddle report monday.h5 tuesday.h5 --method all --out week.html",
 )
 @with_estimate_options
@@ -85,6 +87,7 @@ def report(
             help="Report to write, .html or .pdf (default: beside the recording).",
         ),
     ] = None,
+    models: ModelsOption = "",
     start: StartOption = None,
     end: EndOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -100,7 +103,45 @@ def report(
     """
     from tui.commands.report import report_recordings
 
-    report_recordings(files, out=out, start=start, end=end, **wanted)
+    report_recordings(files, out=out, models=models, start=start, end=end, **wanted)
+
+
+@examples(
+    "huddle plot night.h5 -o noise.svg",
+    "huddle plot night.h5 -o noise.pdf --models nlnm,nhnm --width 85",
+    "huddle plot night.h5 -o noise.png --method all --models brochure.csv",
+)
+@with_estimate_options
+def plot(
+    files: FilesArgument,
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Figure to write, .svg, .png or .pdf (default: beside the recording).",
+        ),
+    ] = None,
+    models: ModelsOption = "",
+    width: Annotated[
+        float,
+        typer.Option("--width", metavar="MM", min=80, max=500, help="Width of the figure in mm."),
+    ] = 180.0,
+    start: StartOption = None,
+    end: EndOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Draw the self-noise of every channel as a figure for publication.
+
+    The curves are those of the report: recorded spectrum, self-noise with its
+    95 % interval, every other method with --method all, limits of the bench
+    file, and noise models.
+    """
+    from tui.commands.plot import plot_recordings
+
+    plot_recordings(files, out=out, width=width, models=models, start=start, end=end, **wanted)
 
 
 @examples(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from daq.bench.mask_file import masks_named
 from daq.results.limits import judge
 from tui.commands.estimate import estimated, exit_with
 from tui.output.console import check_places, console, notices
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from daq.bench.masks import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
 
@@ -28,6 +30,7 @@ def report_recordings(
     files: Sequence[Path],
     *,
     out: Path | None,
+    models: str,
     start: str | None,
     end: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
@@ -39,9 +42,10 @@ def report_recordings(
     typer.Exit
         With 1 if a limit is not met, with 4 if that is not decided, after the report was written.
     """
+    masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
     snapshot, settings, bench = estimated(files, start=start, end=end, **wanted)
-    write_report(snapshot, out, recordings=files, settings=settings, screen=console())
+    write_report(snapshot, out, recordings=files, settings=settings, models=masks, screen=console())
     exit_with(judge(bench, snapshot, settings))
 
 
@@ -68,6 +72,7 @@ def write_report(
     *,
     recordings: Sequence[Path],
     settings: Settings,
+    models: Sequence[Mask] = (),
     screen: Console,
 ) -> None:
     """Write a report, and print its verdict and name.
@@ -80,6 +85,6 @@ def write_report(
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
     with notices().status("writing the report"):
-        report = write(snapshot, out, recordings=recordings, settings=settings)
+        report = write(snapshot, out, recordings=recordings, settings=settings, models=models)
     screen.print(report.verdict.text, style=_COLOURS.get(report.verdict.tone))
     screen.print(f"{out} written", soft_wrap=True)

@@ -24,6 +24,7 @@ from tui.report.wording import is_known, local_time, plain_number, utc_time
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.masks import Mask
     from daq.bench.model import Channel
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -42,7 +43,12 @@ _CLOCKS = {
 }
 
 
-def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -> Report:
+def report_of(
+    snapshot: Snapshot,
+    settings: Settings,
+    found: Sequence[Source],
+    models: Sequence[Mask] = (),
+) -> Report:
     """Return the whole report.
 
     Parameters
@@ -53,6 +59,8 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
         It was made with.
     found : sequence of Source
         The recordings it was made from.
+    models : sequence of Mask
+        Noise models to show beside the noise.
     """
     bench = found[0].bench
     judged = judge(bench, snapshot, settings)
@@ -69,7 +77,7 @@ def report_of(snapshot: Snapshot, settings: Settings, found: Sequence[Source]) -
         _test_section(found),
         _sensors_section(snapshot, found),
         limits_section(snapshot, judged),
-        noise_section(snapshot, settings, bench),
+        noise_section(snapshot, settings, bench, models),
         parameters_section(snapshot, settings, bench),
         advice_section(snapshot),
         model_test_section(snapshot, settings),

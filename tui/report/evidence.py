@@ -17,8 +17,8 @@ from tui.output.diagnostics import summary, why_untested
 from tui.output.formatting import several, span, utc
 from tui.output.results import faulty_channels, left_out
 from tui.output.vocabulary import clock_source
-from tui.report.figures.curves import model_test_plot
 from tui.report.figures.drift import drift_plot
+from tui.report.figures.model_test import model_test_plot
 from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.wording import (
     NOTHING,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from daq.bench.masks import SOURCES
 from daq.results.band_summary import band_of, channel_means, data_means, decibels
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
@@ -19,8 +20,9 @@ from tui.report.parts import Items, Paragraph, Part, Section, Table
 from tui.report.wording import decibel, plain_number, scientific
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
+    from daq.bench.masks import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -84,7 +86,9 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))
 
 
-def noise_section(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> Section:
+def noise_section(
+    snapshot: Snapshot, settings: Settings, bench: Bench | None, models: Sequence[Mask] = ()
+) -> Section:
     """Return tables and plots of the noise of every channel."""
     if not snapshot.results:
         return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
@@ -110,12 +114,19 @@ def noise_section(snapshot: Snapshot, settings: Settings, bench: Bench | None) -
             f"Below: one-sided power spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and "
             f"its root in ({snapshot.unit})/√Hz (right). Each point is a mean over its share of "
             "the axis. Dotted: the band of the table. Where the interval reaches the bottom, the "
-            "noise is known only to be below its upper end. Hatched: nothing can be said.",
+            "noise is known only to be below its upper end. Hatched: nothing can be said."
+            + _about_models(models),
             "quiet",
         )
     )
-    parts += noise_plots(snapshot, settings, bench)
+    parts += noise_plots(snapshot, settings, bench, models)
     return Section("Self-noise", tuple(parts))
+
+
+def _about_models(models: Sequence[Mask]) -> str:
+    """Return what noise models are shown, and from where they are."""
+    found = [f"{each.name}: {SOURCES.get(each.name, 'mask from a file')}" for each in models]
+    return f" Noise models: {'; '.join(found)}." if found else ""
 
 
 def _band_table(snapshot: Snapshot, settings: Settings) -> Table:

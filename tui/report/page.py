@@ -10,12 +10,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from tui.report.figures import drawing
+from tui.report.figures.curves import WIDTH
 
 if TYPE_CHECKING:
     from tui.report.parts import Plot, Report
-
-WIDTH = 7.1
-"""Of a plot, in inches: that of A4 between its margins."""
 
 _LIGHT = {
     "ink": drawing.INK,
@@ -25,6 +23,7 @@ _LIGHT = {
     "limit": drawing.LIMIT,
     "nothing": drawing.NOTHING,
     "quantisation": drawing.QUANTISATION,
+    "model": drawing.MODEL,
     **{f"line{number}": colour for number, colour in enumerate(drawing.LINES)},
 }
 _DARK_LINES = (
@@ -38,6 +37,7 @@ _DARK = {
     "limit": "#ff7566",
     "nothing": "#6d6240",
     "quantisation": "#b8a48e",
+    "model": "#aab4be",
     **{f"line{number}": colour for number, colour in enumerate(_DARK_LINES)},
 }
 

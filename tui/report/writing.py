@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
 from daq.results.sources import sources
+from tui.output.console import write_whole
 from tui.report.contents import report_of
 from tui.report.page import page
 from tui.report.paper import write_paper
@@ -16,6 +16,7 @@ from tui.report.paper import write_paper
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.masks import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.report.parts import Report
@@ -34,6 +35,7 @@ def write(
     *,
     recordings: Sequence[str | Path],
     settings: Settings,
+    models: Sequence[Mask] = (),
 ) -> Report:
     """Write the calibration report of a huddle test.
 
@@ -49,6 +51,8 @@ def write(
         stop that first: HDF5 shares what it remembers of a file among its readers.
     settings : Settings
         What the estimate was made with.
+    models : sequence of Mask
+        Noise models to show beside the noise.
 
     Returns
     -------
@@ -61,17 +65,25 @@ def write(
         If the file cannot be written, or has another suffix.
     RecordingError
         If a recording cannot be read.
+    WrongSettingError
+        If a noise model cannot be turned into the unit of the estimate.
     """
     path = Path(path)
     check_suffix(path)
-    report = report_of(snapshot, settings, sources(recordings))
+    report = report_of(snapshot, settings, sources(recordings), models)
     if path.suffix.lower() in PAPER:
         paper = io.BytesIO()
         write_paper(report, paper)
         content = paper.getvalue()
     else:
         content = page(report).encode("utf-8")
-    _replace(path, content)
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise ReportError(
+            f"{path}: the report cannot be written ({error.strerror}); choose another place with "
+            "--out, or make room"
+        ) from error
     return report
 
 
@@ -85,20 +97,3 @@ def check_suffix(path: Path) -> None:
     """
     if path.suffix.lower() not in PAPER + PAGES:
         raise ReportError(f"{path}: expected a name that ends in .html or .pdf")
-
-
-def _replace(path: Path, content: bytes) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise ReportError(
-            f"{path}: the report cannot be written ({error.strerror}); choose another place with "
-            "--out, or make room"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)

@@ -1,32 +1,29 @@
-"""Noise against frequency, and where the model test fails."""
+"""Noise against frequency, with limits and noise models."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
-from itertools import groupby, pairwise
+from itertools import cycle, groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
-from scipy import special
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from daq.results.band_summary import correlation_of
 from daq.results.limits import concerns, mask_psd
-from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
 from estimator.self_noise.band_means import band_means, log_edges
-from estimator.spectra.windows import get_window
 from tui.report.figures import drawing
 from tui.report.parts import Plot
 from tui.report.wording import power_of_ten
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping, Sequence
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from daq.bench.masks import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -36,20 +33,30 @@ if TYPE_CHECKING:
 
 POINTS = 240
 """Most points of a curve: more than print resolves. Each is a mean over its share of the axis."""
-TEST_POINTS = 90
-NOISE_HEIGHT, TEST_HEIGHT = 1.45, 1.25
-_SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
+NOISE_HEIGHT = 1.45
+WIDTH = 7.1
+"""Of a plot in inches: that of A4 between its margins."""
+KEY_COLUMN = 1.2
+"""Width of an entry of the key, in inches."""
+BEYOND = 60.0
+"""By how many dB a noise model may widen the vertical scale."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Curves:
-    """One channel on a logarithmic axis: PSD in unit²/Hz over edges of points in Hz."""
+    """One channel on a logarithmic axis: PSD in unit²/Hz over edges of points in Hz.
+
+    `noise` is that of the first method, `others` have the means of the others by name; `limits`
+    and `models` have points and PSD of each mask, the latter by name.
+    """
 
     edges: FloatArray
     frequency: FloatArray
     data: FloatArray
     noise: BandMeans
+    others: Mapping[str, FloatArray]
     limits: tuple[tuple[FloatArray, FloatArray], ...]
+    models: Mapping[str, tuple[FloatArray, FloatArray]]
     quantisation: FloatArray
 
 
@@ -59,6 +66,7 @@ class _NoisePanel:
 
     curve: _Curves
     name: str
+    noise_label: str
     scale: tuple[float, float]
     band: tuple[float, float] | None
     unit: str
@@ -68,8 +76,7 @@ class _NoisePanel:
         curve, scale = self.curve, self.scale
         frequency = curve.frequency
         axes.set_title(self.name)
-        _logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
-        _nothing(axes, curve)
+        logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
         axes.plot(frequency, _decibels(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
         floor = 10 ** (scale[0] / 10)
         high = np.where(curve.noise.high > 0, curve.noise.high, np.nan)
@@ -83,8 +90,18 @@ class _NoisePanel:
             label="95 % interval",
         )
         axes.plot(
-            frequency, _decibels(curve.noise.mean), color=drawing.NOISE, lw=0.9, label="self-noise"
+            frequency,
+            _decibels(curve.noise.mean),
+            color=drawing.NOISE,
+            lw=0.9,
+            label=self.noise_label,
         )
+        for (label, psd), colour, dashes in zip(
+            curve.others.items(), drawing.LINES[1:], drawing.DASHES, strict=False
+        ):
+            axes.plot(
+                frequency, _decibels(psd), color=colour, lw=0.8, dashes=dashes, label=_shown(label)
+            )
         if (curve.quantisation > floor).any():
             axes.plot(
                 frequency,
@@ -98,8 +115,15 @@ class _NoisePanel:
             axes.plot(
                 at, _decibels(mask), color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit"
             )
+        for (label, (at, psd)), dashes in zip(
+            curve.models.items(), cycle(drawing.DASHES), strict=False
+        ):
+            axes.plot(
+                at, _decibels(psd), color=drawing.MODEL, lw=0.7, dashes=dashes, label=_shown(label)
+            )
         for edge in self.band or ():
             axes.axvline(edge, color=drawing.INK, lw=0.5, dashes=(1, 2))
+        _nothing(axes, curve)
         axes.set_ylim(scale)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
         axes.yaxis.set_major_formatter(
@@ -110,12 +134,39 @@ class _NoisePanel:
             _amplitude_scale(axes, scale, self.unit)
 
 
-def noise_plots(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> tuple[Plot, ...]:
-    """Return a plot for each sensor, or for three channels where a sensor has but one."""
+def noise_plots(
+    snapshot: Snapshot,
+    settings: Settings,
+    bench: Bench | None,
+    models: Sequence[Mask] = (),
+    *,
+    width: float = WIDTH,
+) -> tuple[Plot, ...]:
+    """Return a plot for each sensor, or for three channels where a sensor has but one.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        With the results of one method or more; the interval shown is that of the first.
+    settings : Settings
+    bench : Bench or None
+        Its limits are shown.
+    models : sequence of Mask
+        Noise models to show.
+    width : float
+        Of each plot, in inches.
+
+    Raises
+    ------
+    WrongSettingError
+        If a model cannot be turned into the unit of the snapshot.
+    """
     if not snapshot.results:
         return ()
-    curves = _curves(snapshot, settings, bench)
+    curves = _curves(snapshot, settings, bench, models)
     scale = _scale(curves)
+    first = next(iter(snapshot.results))
+    noise_label = "self-noise" if len(snapshot.results) == 1 else f"self-noise, {first}"
     band = settings.band
     groups = list(_groups(snapshot))
     widest = max(len(columns) for _, columns in groups)
@@ -126,7 +177,9 @@ def noise_plots(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> 
             label = snapshot.channels[column]
             name = label.channel if title else f"{label.sensor}.{label.channel}"
             last = place == len(columns) - 1
-            panels.append(_NoisePanel(curves[column], name, scale, band, snapshot.unit, last))
+            panels.append(
+                _NoisePanel(curves[column], name, noise_label, scale, band, snapshot.unit, last)
+            )
         plots.append(
             Plot(
                 title,
@@ -135,47 +188,11 @@ def noise_plots(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> 
                 height=NOISE_HEIGHT,
                 right=0.55,
                 titled=True,
-                key_rows=1 if number == 0 else 0,
+                key_rows=_key_rows(curves, width) if number == 0 else 0,
                 alt=f"Power spectral density of data and noise against frequency: {title}",
             )
         )
     return tuple(plots)
-
-
-def model_test_plot(snapshot: Snapshot, settings: Settings) -> Plot | None:
-    """Return the statistic of the model test over its expectation; None where there is none."""
-    found = snapshot.diagnostics.diagnosis
-    if found is None or not np.isfinite(found.per_frequency.statistic[1:-1]).any():
-        return None
-    statistic, degrees = found.per_frequency.statistic, found.per_frequency.degrees
-    window = get_window(settings.window, _SHAPE_LENGTH)
-    hop = max(1, round(_SHAPE_LENGTH * (1 - settings.overlap)))
-    r = neighbour_correlation(window, hop, max(1, snapshot.n_segments))
-    edges = log_edges(snapshot.frequency, TEST_POINTS)
-    known = np.isfinite(statistic)
-    count = np.add.reduceat(known.astype(float), edges[:-1])[: edges.size - 1]
-    ratio, limit = np.full((2, edges.size - 1), np.nan)
-    for number, (first, stop) in enumerate(pairwise(edges)):
-        inside = slice(int(first), int(stop))
-        n = int(known[inside].sum())
-        if n == 0:
-            continue
-        total = float(degrees[inside][known[inside]].sum())
-        pairs = np.maximum(n - np.arange(1, len(r) + 1), 0)
-        spread = 1 + 2 * float(pairs @ r**2) / n  # as estimator.likelihood.goodness_of_fit.pool
-        ratio[number] = float(statistic[inside][known[inside]].sum()) / total
-        limit[number] = special.chdtri(total / spread, REJECT) * spread / total
-    if not count.any():
-        return None
-    centre = _centres(snapshot.frequency, edges)
-    return Plot(
-        "",
-        (partial(_draw_test, centre, ratio, limit, _span(snapshot.frequency)),),
-        n_columns=1,
-        height=TEST_HEIGHT,
-        key_rows=1,
-        alt="Statistic of the model test over its expectation against frequency",
-    )
 
 
 def _groups(snapshot: Snapshot) -> Iterator[tuple[str, list[int]]]:
@@ -191,14 +208,28 @@ def _groups(snapshot: Snapshot) -> Iterator[tuple[str, list[int]]]:
             yield f"Sensor {sensor}", numbers[first : first + 3]
 
 
-def _curves(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> list[_Curves]:
-    noise = next(iter(snapshot.results.values()))
+def _shown(label: str) -> str:
+    """Return a label that the key shows: matplotlib hides those that begin with an underscore."""
+    return f" {label}" if label.startswith("_") else label
+
+
+def _key_rows(curves: list[_Curves], width: float) -> int:
+    """Return the rows of a key of all that may be in a plot."""
+    curve = curves[0]
+    n_labels = 4 + len(curve.others) + len(curve.models)
+    n_labels += bool(curve.limits) + bool(np.isfinite(curve.quantisation).any())
+    return math.ceil(n_labels / max(1, int(width / KEY_COLUMN)))
+
+
+def _curves(
+    snapshot: Snapshot, settings: Settings, bench: Bench | None, models: Sequence[Mask]
+) -> list[_Curves]:
+    (_, noise), *others = snapshot.results.items()
     frequency, data = snapshot.frequency, snapshot.data_psd
     edges = log_edges(frequency, POINTS)
-    centre = _centres(frequency, edges)
+    centre = centres(frequency, edges)
     width = np.gradient(frequency)
     correlation = correlation_of(settings)
-    share = np.add.reduceat(width[edges[0] : edges[-1]], edges[:-1] - edges[0])
     added = snapshot.added_by_clocks
     curves = []
     for column, label in enumerate(snapshot.channels):
@@ -213,24 +244,41 @@ def _curves(snapshot: Snapshot, settings: Settings, bench: Bench | None) -> list
         single = np.diff(edges) == 1  # has an interval of its own, better at few averages
         means.low[single] = noise.low[edges[:-1][single], column]
         means.high[single] = noise.high[edges[:-1][single], column]
-        power = (data[:, column] * width)[edges[0] : edges[-1]]
         limits = [] if bench is None else [lim for lim in bench.limits if concerns(lim, label)]
         masks = []
         for limit in limits:
-            at = np.unique(np.concatenate([limit.frequency, centre]))
-            at = at[(at >= limit.frequency[0]) & (at <= limit.frequency[-1])]
+            at = _inside(limit.mask.points(centre), frequency)
             masks.append((at, mask_psd(bench, limit, label, at) if bench else at))
         curves.append(
             _Curves(
                 np.append(frequency[edges[:-1]], frequency[edges[-1] - 1]),
                 centre,
-                np.add.reduceat(power, edges[:-1] - edges[0]) / share,
+                _mean(data[:, column], edges, width),
                 means,
+                {name: _mean(other.noise_psd[:, column], edges, width) for name, other in others},
                 tuple(masks),
+                {
+                    each.name: (points, each.at(points, label.unit))
+                    for each in models
+                    for points in [_inside(each.points(centre), frequency)]
+                },
                 _quantisation(snapshot, column, centre),
             )
         )
     return curves
+
+
+def _mean(psd: FloatArray, edges: NDArray[np.int64], width: FloatArray) -> FloatArray:
+    """Return the mean of each point of a curve; NaN where a frequency of it is not known."""
+    inside, starts = slice(int(edges[0]), int(edges[-1])), edges[:-1] - edges[0]
+    power = np.add.reduceat((psd * width)[inside], starts)
+    return np.asarray(power / np.add.reduceat(width[inside], starts))
+
+
+def _inside(at: FloatArray, frequency: FloatArray) -> FloatArray:
+    """Return the points that an axis shows, and one to either side of it."""
+    first, last = np.searchsorted(at, (frequency[1], frequency[-1]))
+    return at[max(0, first - 1) : last + 1]
 
 
 def _quantisation(snapshot: Snapshot, column: int, frequency: FloatArray) -> FloatArray:
@@ -242,24 +290,28 @@ def _quantisation(snapshot: Snapshot, column: int, frequency: FloatArray) -> Flo
     )
 
 
-def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
+def centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
+    """Return the middle of each point on a logarithmic axis."""
     return np.asarray(np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1]))
-
-
-def _span(frequency: FloatArray) -> tuple[float, float]:
-    return float(frequency[1]), float(frequency[-1])
 
 
 def _scale(curves: list[_Curves]) -> tuple[float, float]:
     """Return the range in dB that holds all curves, in steps of ten."""
     values = []
     for curve in curves:
-        values += [curve.data, curve.noise.mean, *(mask for _, mask in curve.limits)]
+        values += [curve.data, curve.noise.mean, *curve.others.values()]
+        values += [mask for _, mask in curve.limits]
     level = _decibels(np.concatenate(values))
     level = level[np.isfinite(level)]
     if not level.size:
         return -10.0, 10.0
     low, high = np.percentile(level, (0.5, 100))
+    if curves[0].models:
+        span = curves[0].frequency[[0, -1]]
+        psd = [psd[(at >= span[0]) & (at <= span[1])] for at, psd in curves[0].models.values()]
+        shown = _decibels(np.concatenate(psd))
+        low = min(low, max(shown.min(initial=math.inf), low - BEYOND))
+        high = max(high, min(shown.max(initial=-math.inf), high + BEYOND))
     return 10 * math.floor(low / 10 - 0.3), 10 * math.ceil(high / 10 + 0.1)
 
 
@@ -292,6 +344,7 @@ def _nothing(axes: Axes, curve: _Curves) -> None:
             edgecolor=drawing.NOTHING,
             hatch="////",
             lw=0,
+            zorder=0.5,
             label="nothing can be said",
         )
 
@@ -303,42 +356,8 @@ def _runs(true: BoolArray) -> Iterator[tuple[int, int]]:
         yield int(first), int(stop)
 
 
-def _draw_test(
-    centre: FloatArray, ratio: FloatArray, limit: FloatArray, span: tuple[float, float], axes: Axes
-) -> None:
-    _logarithmic(axes, span)
-    axes.set_yscale("log")
-    failing = ratio > limit
-    axes.plot(centre, limit, color=drawing.LIMIT, lw=0.9, dashes=(5, 2), label="1 % limit")
-    axes.plot(
-        centre[~failing],
-        ratio[~failing],
-        "o",
-        ms=2.4,
-        color=drawing.NOISE,
-        label="explained",
-        clip_on=False,
-    )
-    if failing.any():
-        axes.plot(
-            centre[failing],
-            ratio[failing],
-            "D",
-            ms=2.6,
-            color=drawing.LIMIT,
-            label="not explained",
-            clip_on=False,
-        )
-    finite = np.concatenate([ratio[ratio > 0], limit[np.isfinite(limit)], [1.0]])
-    finite = finite[np.isfinite(finite)]
-    axes.set_ylim(min(0.7, 0.9 * finite.min()), max(1.6, 1.25 * finite.max()))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_ylabel("statistic / expected")
-
-
-def _logarithmic(axes: Axes, span: tuple[float, float]) -> None:
+def logarithmic(axes: Axes, span: tuple[float, float]) -> None:
+    """Make the horizontal axis one of frequency."""
     axes.set_xscale("log")
     axes.set_xlim(span)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -13,7 +13,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from matplotlib.artist import Artist
 
@@ -21,12 +21,17 @@ if TYPE_CHECKING:
 
 INK, GRID = "#20262d", "#d8dde2"
 DATA, NOISE, LIMIT, NOTHING = "#8b949e", "#0b62a8", "#c2321f", "#c7b98a"
-QUANTISATION = "#7d6a58"
+QUANTISATION, MODEL = "#7d6a58", "#4f5861"
 LINES = ("#0b62a9", "#d1661f", "#2f8f4e", "#8c4fb0", "#b3272c", "#7d6a57", "#c4579b", "#4d8f9b")
 """Of several things in one plot; each colour of its own, so that a page can replace it."""
 
+DASHES = ((4, 1.2), (1.2, 1.2), (6, 1.2, 1.2, 1.2), (6, 1.2, 1.2, 1.2, 1.2, 1.2))
+"""Of lines that are told apart without colour."""
+
 LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.19
 """Room left of a row of axes, between them, above, for titles, below, and for a row of the key."""
+STACKED_TITLE = 0.25
+"""Room above a plot for the name of its sensor."""
 
 _LOOK: dict[Any, Any] = {  # matplotlib's own type of keys is a list of them all
     "axes.edgecolor": INK,
@@ -125,6 +130,28 @@ def alone(plot: Plot, width: float) -> Figure:
     figure = Figure(figsize=(width, height))
     draw(plot, figure, left=0, top=height, width=width)
     return figure
+
+
+def stack_height(plots: Sequence[Plot]) -> float:
+    """Return how high plots are below each other, each with its title above, in inches."""
+    return sum(height_of(plot) + _room_for_title(plot) for plot in plots)
+
+
+def stack(plots: Sequence[Plot], figure: Figure, *, margin: float = 0.0) -> None:
+    """Draw plots below each other into a figure as high as `stack_height`."""
+    width, top = figure.get_size_inches()
+    height = top
+    for plot in plots:
+        room = _room_for_title(plot)
+        if plot.title:
+            place = ((margin + LEFT) / width, (top - room / 2) / height)
+            figure.text(*place, plot.title, va="center", size=8.0)
+        draw(plot, figure, left=margin, top=top - room, width=width - 2 * margin)
+        top -= room + height_of(plot)
+
+
+def _room_for_title(plot: Plot) -> float:
+    return STACKED_TITLE if plot.title else 0.0
 
 
 def _above(plot: Plot) -> float:

@@ -1,0 +1,195 @@
+"""Figures of the noise: curves, limits, noise models, and the files that ``huddle plot`` writes."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
+
+from daq.bench.loading import parse
+from daq.bench.mask_file import masks_named
+from daq.bench.masks import NOISE_MODELS, Mask
+from daq.errors import WrongSettingError
+from tests.tui.example_snapshot import SETTINGS, made_snapshot
+from tests.tui.night_recording import record
+from tui.cli.main import app
+from tui.report.figures import drawing
+from tui.report.figures.curves import BEYOND, noise_plots
+from tui.report.figures.sheet import write_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+    from daq.bench.model import Bench
+    from tui.report.parts import Plot
+
+SNAPSHOT = made_snapshot()
+LIMIT = """
+name = "b"
+sampling_rate = 200.0
+[[sensors]]
+name = "A"
+driver = "text"
+port = "p"
+channels = [{name = "X", sensitivity = 1.0}]
+[[limits]]
+name = "data sheet"
+frequency = [0.1, 1000.0]
+psd = [0.4, 0.4]
+unit = "µg/√Hz"
+channels = ["X"]
+"""
+
+
+def drawn(plots: Iterable[Plot]) -> list[Axes]:
+    """Return the axes of all panels."""
+    with drawing.look():
+        return [
+            axes
+            for plot in plots
+            for axes in drawing.alone(plot, 7.1).axes
+            if axes.get_title(loc="left")  # not the scale at the right
+        ]
+
+
+def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequency and dB of a line of a panel."""
+    (found,) = [each for each in axes.get_lines() if each.get_label() == label]
+    x, y = np.asarray(found.get_xdata()), np.asarray(found.get_ydata())
+    return x, y
+
+
+def panels(
+    methods: Sequence[str] = ("three-sensor",),
+    models: Sequence[Mask] = (),
+    bench: Bench | None = None,
+) -> list[Axes]:
+    """Draw the example's noise by some methods."""
+    results = {method: SNAPSHOT.results[method] for method in methods}
+    snapshot = made_snapshot()
+    snapshot.results.clear()
+    snapshot.results.update(results)
+    return drawn(noise_plots(snapshot, SETTINGS, bench, models))
+
+
+def test_curves_are_the_estimate() -> None:
+    for number, axes in enumerate(panels()):
+        x, y = line(axes, "self-noise")
+        noise = SNAPSHOT.results["three-sensor"].noise_psd[:, number]
+        single = np.isin(x, SNAPSHOT.frequency)  # points of one frequency
+        expected = noise[np.searchsorted(SNAPSHOT.frequency, x[single])]
+        assert single.sum() > 20
+        np.testing.assert_allclose(y[single], 10 * np.log10(expected))
+        assert axes.get_xlabel() == "frequency (Hz)"
+    assert panels()[0].get_ylabel() == "dB re 1 (m/s²)²/Hz"
+
+
+def test_all_methods_are_overlaid() -> None:
+    axes = panels(("three-sensor", "three-channel"))[0]
+    x, y = line(axes, "three-channel")
+    single = np.isin(x, SNAPSHOT.frequency)
+    noise = SNAPSHOT.results["three-channel"].noise_psd[:, 0]
+    expected = noise[np.searchsorted(SNAPSHOT.frequency, x[single])]
+    positive = expected > 0
+    np.testing.assert_allclose(y[single][positive], 10 * np.log10(expected[positive]))
+    line(axes, "self-noise, three-sensor")
+    assert {each.get_label() for each in axes.collections} >= {"95 % interval"}
+
+
+def test_limits_and_models_are_lines_in_the_unit_of_the_result() -> None:
+    first, second, _ = panels(models=masks_named("ahnm,nhnm"), bench=parse(LIMIT))[:3]
+    x, y = line(first, "limit")
+    assert x[0] < SNAPSHOT.frequency[1]
+    assert x[-1] > 99
+    np.testing.assert_allclose(y, 20 * np.log10(0.4 * 9.80665e-6))
+    assert "limit" not in {each.get_label() for each in second.get_lines()}
+    for name in ("AHNM", "NHNM"):
+        x, y = line(second, name)
+        expected = 10 * np.log10(NOISE_MODELS[name.lower()].at(x, "m/s²"))
+        np.testing.assert_allclose(y, expected)
+    assert x[-1] == pytest.approx(10.0)  # the NHNM ends there
+
+
+def test_a_model_far_off_widens_the_scale_so_far_and_no_farther() -> None:
+    usual = panels()[0].get_ylim()
+    near = panels(models=[Mask("near", "m/s²", (1.0, 10.0), (1e-14, 1e-14))])[0].get_ylim()
+    far = panels(models=[Mask("far", "m/s²", (1.0, 10.0), (1e-40, 1e-40))])[0].get_ylim()
+    assert near[0] < -140 < usual[0]
+    assert usual[0] - BEYOND - 20 <= far[0] <= usual[0] - BEYOND + 20
+    assert near[1] == far[1] == usual[1]
+
+
+def test_a_model_of_another_quantity_is_refused() -> None:
+    with pytest.raises(WrongSettingError, match="'V' cannot be turned into 'm/s²'"):
+        panels(models=[Mask("volts", "V", (1.0, 10.0), (1.0, 1.0))])
+
+
+def test_the_key_fits_into_a_narrow_figure() -> None:
+    for width in (3.3, 7.1):
+        plots = noise_plots(SNAPSHOT, SETTINGS, None, masks_named("nlnm,nhnm,alnm"), width=width)
+        with drawing.look():
+            figure = Figure(figsize=(width, drawing.stack_height(plots)))
+            drawing.stack(plots, figure)
+            figure.draw_without_rendering()
+            (key,) = figure.legends
+            box, whole = key.get_window_extent(), figure.bbox
+            assert whole.x0 <= box.x0
+            assert box.x1 <= whole.x1
+            highest = max(axes.get_window_extent().y1 for axes in figure.axes)
+            assert box.y0 > highest
+
+
+def test_the_same_estimate_gives_the_same_file(tmp_path: Path) -> None:
+    contents = {}
+    for name in ("a.svg", "b.svg", "a.pdf", "b.pdf", "a.png"):
+        write_figure(SNAPSHOT, SETTINGS, None, tmp_path / name, width=7.1)
+        contents[name] = (tmp_path / name).read_bytes()
+    for kind in ("svg", "pdf"):
+        assert contents[f"a.{kind}"] == contents[f"b.{kind}"]
+    assert contents["a.pdf"].startswith(b"%PDF-")
+    assert contents["a.png"].startswith(b"\x89PNG")
+    root = ET.fromstring(contents["a.svg"])  # noqa: S314 - our own
+    assert root.attrib["width"] == "511.2pt"
+    assert not root.findall(".//{*}text")  # letters are shapes: no font is needed
+
+
+def test_the_command_writes_what_the_suffix_says(tmp_path: Path) -> None:
+    recording = record(tmp_path / "night.h5")
+    runner = CliRunner()
+    arguments = ["plot", str(recording), "--segment", "1s", "--models", "nlnm"]
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "night.svg").read_text(encoding="utf-8").startswith("<?xml")
+    out = tmp_path / "n.png"
+    out.write_bytes(b"old")
+    result = runner.invoke(app, [*arguments, "-o", str(out), "--width", "90"])
+    assert result.exit_code == 0, result.output
+    width = int.from_bytes(out.read_bytes()[16:20], "big")
+    assert width == pytest.approx(90 / 25.4 * 300, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["-o", "n.jpg"], r"ends in \.svg, \.png or \.pdf"),
+        (["-o", "none/n.svg"], "no folder"),
+        (["--models", "nlm"], "did you mean 'nlnm'"),
+        (["--models", "none.csv"], "none.csv: No such file"),
+        (["--width", "10"], "equal to 80"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_the_estimate(
+    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["plot", "absent.h5", *options], terminal_width=300)
+    assert result.exit_code == 2
+    assert re.search(said, result.stderr)

@@ -1,0 +1,101 @@
+"""The statistic of the model test against frequency."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from scipy import special
+
+from estimator.likelihood.goodness_of_fit import REJECT, neighbour_correlation
+from estimator.self_noise.band_means import log_edges
+from estimator.spectra.windows import get_window
+from tui.report.figures import drawing
+from tui.report.figures.curves import centres, logarithmic
+from tui.report.parts import Plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import FloatArray
+
+TEST_POINTS = 90
+TEST_HEIGHT = 1.25
+_SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
+
+
+def model_test_plot(snapshot: Snapshot, settings: Settings) -> Plot | None:
+    """Return the statistic of the model test over its expectation; None where there is none."""
+    found = snapshot.diagnostics.diagnosis
+    if found is None or not np.isfinite(found.per_frequency.statistic[1:-1]).any():
+        return None
+    statistic, degrees = found.per_frequency.statistic, found.per_frequency.degrees
+    window = get_window(settings.window, _SHAPE_LENGTH)
+    hop = max(1, round(_SHAPE_LENGTH * (1 - settings.overlap)))
+    r = neighbour_correlation(window, hop, max(1, snapshot.n_segments))
+    edges = log_edges(snapshot.frequency, TEST_POINTS)
+    known = np.isfinite(statistic)
+    count = np.add.reduceat(known.astype(float), edges[:-1])[: edges.size - 1]
+    ratio, limit = np.full((2, edges.size - 1), np.nan)
+    for number, (first, stop) in enumerate(pairwise(edges)):
+        inside = slice(int(first), int(stop))
+        n = int(known[inside].sum())
+        if n == 0:
+            continue
+        total = float(degrees[inside][known[inside]].sum())
+        pairs = np.maximum(n - np.arange(1, len(r) + 1), 0)
+        spread = 1 + 2 * float(pairs @ r**2) / n  # as estimator.likelihood.goodness_of_fit.pool
+        ratio[number] = float(statistic[inside][known[inside]].sum()) / total
+        limit[number] = special.chdtri(total / spread, REJECT) * spread / total
+    if not count.any():
+        return None
+    centre = centres(snapshot.frequency, edges)
+    span = float(snapshot.frequency[1]), float(snapshot.frequency[-1])
+    return Plot(
+        "",
+        (partial(_draw_test, centre, ratio, limit, span),),
+        n_columns=1,
+        height=TEST_HEIGHT,
+        key_rows=1,
+        alt="Statistic of the model test over its expectation against frequency",
+    )
+
+
+def _draw_test(
+    centre: FloatArray, ratio: FloatArray, limit: FloatArray, span: tuple[float, float], axes: Axes
+) -> None:
+    logarithmic(axes, span)
+    axes.set_yscale("log")
+    failing = ratio > limit
+    axes.plot(centre, limit, color=drawing.LIMIT, lw=0.9, dashes=(5, 2), label="1 % limit")
+    axes.plot(
+        centre[~failing],
+        ratio[~failing],
+        "o",
+        ms=2.4,
+        color=drawing.NOISE,
+        label="explained",
+        clip_on=False,
+    )
+    if failing.any():
+        axes.plot(
+            centre[failing],
+            ratio[failing],
+            "D",
+            ms=2.6,
+            color=drawing.LIMIT,
+            label="not explained",
+            clip_on=False,
+        )
+    finite = np.concatenate([ratio[ratio > 0], limit[np.isfinite(limit)], [1.0]])
+    finite = finite[np.isfinite(finite)]
+    axes.set_ylim(min(0.7, 0.9 * finite.min()), max(1.6, 1.25 * finite.max()))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set_ylabel("statistic / expected")
