@@ -141,6 +141,8 @@ def _place(
                 key, sensor = "", name
             else:
                 key += f'["{name}"]' if name else f"[{step + 1}]"
+        elif isinstance(table, (list, tuple)):
+            continue  # a list in the file that is a field of a table here
         else:
             key += f".{step}" if key else str(step)
             table = table.get(step) if isinstance(table, dict) else None

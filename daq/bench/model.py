@@ -5,18 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
-from cronsim import CronSim, CronSimError
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     InstanceOf,
     PlainSerializer,
@@ -25,48 +20,15 @@ from pydantic import (
     model_validator,
 )
 
-from daq.bench.durations import parse_duration
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks import NOISE_MODELS, Mask, check_points
+from daq.bench.table import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.toml_text import to_toml
+from daq.bench.unattended import History, Hooks, Metrics, Schedule, Storage
 from daq.bench.units import DensityUnit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-
-def check_name(value: str) -> str:
-    """Return a name that a sensor, a channel, a limit or a bench may have.
-
-    Raises
-    ------
-    ValueError
-        Saying what was expected.
-    """
-    if value in {".", ".."} or "/" in value or not value.isprintable() or value != value.strip():
-        raise ValueError("expected a printable name without '/' and outer spaces")
-    if not 0 < len(value.encode()) <= 64:
-        raise ValueError("expected a name of 1 to 64 bytes")
-    return value
-
-
-def _cron_line(value: str) -> str:
-    try:
-        CronSim(value, datetime(2026, 1, 1, tzinfo=UTC))
-    except CronSimError as error:
-        raise ValueError(
-            'expected a cron line "minute hour day month weekday", such as "0 22 * * 1-5"'
-            f" ({error})"
-        ) from None
-    return value
-
-
-def _time_zone(value: str) -> str:
-    try:
-        ZoneInfo(value)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise ValueError('expected a time zone such as "UTC" or "Europe/Berlin"') from None
-    return value
 
 
 def _pair_to_complex(value: object) -> object:
@@ -79,17 +41,7 @@ def _pair_to_complex(value: object) -> object:
     raise ValueError("expected a number or [real, imaginary], in rad/s")
 
 
-Number = Annotated[float, Field(strict=True)]
-PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
-Name = Annotated[str, AfterValidator(check_name)]
-Duration = Annotated[float, BeforeValidator(parse_duration)]
 ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
-
-
-class Table(BaseModel):
-    """A table of the bench file: unknown keys are faults."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class PolesZeros(Table):
@@ -243,16 +195,9 @@ class RecordingSettings(Table):
     """Relative to the bench file."""
     duration: Duration | None = None
     retention: Duration | None = None
-    """Recordings older than this are removed by ``huddle serve``; never, if not given."""
+    """The same as ``keep_for`` of ``[storage]``."""
     report: Literal["html", "pdf"] | None = None
     """Whether a calibration report is written beside each recording, and as what."""
-
-
-class Schedule(Table):
-    """When ``huddle serve`` starts a run."""
-
-    cron: tuple[Annotated[str, AfterValidator(_cron_line)], ...] = ()
-    time_zone: Annotated[str, AfterValidator(_time_zone)] = "UTC"
 
 
 class Limit(Table):
@@ -322,6 +267,10 @@ class Bench(Table):
     ] = EstimateSettings()
     recording: RecordingSettings = RecordingSettings()
     schedule: Schedule = Schedule()
+    storage: Storage = Storage()
+    hooks: Hooks = Hooks()
+    metrics: Metrics | None = None
+    history: History = History()
     limits: tuple[Limit, ...] = ()
     simulation: dict[str, Any] = Field(default_factory=dict)
     """Handed to the simulated devices unread, but for ``speed`` and ``clock``."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from tui.cli import acquisition, recordings, setup, studies
+from tui.cli import acquisition, recordings, service, setup, studies
 from tui.cli.examples import EXAMPLES
 from tui.output.exit_codes import ExitCode
 
@@ -128,7 +128,13 @@ _PANELS = {
         acquisition.run,
         acquisition.record,
         acquisition.watch,
+    ),
+    "Unattended": (
         acquisition.serve,
+        service.status,
+        service.runs,
+        service.pin,
+        service.verify,
     ),
     "Recordings": (
         recordings.estimate,

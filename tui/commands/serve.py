@@ -1,4 +1,4 @@
-"""``huddle serve``: starts a ``huddle run`` at each scheduled time."""
+"""``huddle serve``: the service, from its bench file."""
 
 from __future__ import annotations
 
@@ -6,54 +6,45 @@ import asyncio
 import contextlib
 import logging
 import signal
-import sys
 import time
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from daq.acquisition.recorder import recording_path
-from daq.acquisition.retention import ClockTrust, remove_old
-from daq.acquisition.schedule import RunNotice, RunState, due_times, serve, utc_now
-from daq.bench.estimate_settings import to_arguments
+from daq.acquisition.clock_trust import ClockTrust
+from daq.acquisition.schedule import all_due, utc_now
+from daq.bench.durations import format_duration
+from daq.bench.estimate_settings import shortest_duration
 from daq.drivers.bench_file import load
-from daq.errors import BenchFileError, FileFault, HuddleError, RecordingError
+from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.estimation.settings import Settings
-from daq.host_clock import SystemClock
-from daq.python_process import python_command
-from tui.output.console import for_people, write_json
-from tui.output.exit_codes import ExitCode
-from tui.output.logs import lines as logs
-from tui.runs.child_log import ChildLog
+from tui.output.console import for_people, write_json, write_whole
+from tui.output.extras import require
 from tui.runs.estimate_settings import check_fit, chosen
+from tui.service.clock import SystemTime
+from tui.service.finish import options_table
+from tui.service.hooks import Teller
+from tui.service.locks import Lock
+from tui.service.notify import Notifier
+from tui.service.places import file_name, service_lock
+from tui.service.service import Service
+from tui.service.steps import ProcessSteps
+from tui.service.storage import tidy
+from tui.service.store import RunStore, StoreError
+from tui.service.supervision import signs_of_life
 
 if TYPE_CHECKING:
-    from asyncio.subprocess import Process
-    from collections.abc import Iterator, Mapping, Sequence
-    from datetime import datetime
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from daq.bench.model import Bench
+    from tui.service.clock import Clock
 
 _LOGGER = logging.getLogger(__name__)
-_LEVELS = {
-    RunState.FAILED: logging.ERROR,
-    RunState.MISSED: logging.WARNING,
-    RunState.REFUSED: logging.WARNING,
-    RunState.LIMIT_NOT_MET: logging.WARNING,
-    RunState.NOT_DECIDED: logging.WARNING,
-}
 SHOWN = 5
-ENDED_WELL: Mapping[int | None, RunState] = {
-    ExitCode.DONE: RunState.FINISHED,
-    ExitCode.INTERRUPTED: RunState.FINISHED,
-    ExitCode.LIMIT_NOT_MET: RunState.LIMIT_NOT_MET,
-    ExitCode.NOT_DECIDED: RunState.NOT_DECIDED,
-}
-"""How a run ended that did not fail, by its exit code."""
 
 
-class RunFailedError(HuddleError):
-    """A scheduled run failed; the message is that of the run."""
+class AlreadyServedError(HuddleError):
+    """Another service runs the schedule of this bench."""
 
 
 def serve_bench(
@@ -64,154 +55,164 @@ def serve_bench(
     Raises
     ------
     BenchFileError
-        The bench file has no cron lines, or no duration.
+        The bench file has no schedule, or entries without a duration.
+    AlreadyServedError
+        Another service has this bench and folder.
     typer.BadParameter
         If an option of the estimate does not fit the others or the sensors.
     """
-    bench = load(path)
     wanted = wanted or {}
-    settings = chosen(Settings.of(bench), **wanted)
-    check_fit(settings, bench.sensors)
-    if not bench.schedule.cron:
-        expected = 'is missing; expected cron lines such as ["0 22 * * *"]'
-        raise BenchFileError(FileFault("schedule.cron", expected), source=path)
-    if bench.recording.duration is None:
-        expected = 'is missing; expected the duration of each run, such as "3h"'
-        raise BenchFileError(FileFault("recording.duration", expected), source=path)
+    bench = accepted(path, wanted)
     if show:
-        times = list(islice(due_times(bench.schedule, utc_now()), SHOWN))
-        for due in times:
-            for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}")
-        write_json(json, {"next": [due.isoformat() for due in times]})
+        now = utc_now()
+        times = list(islice(all_due(bench.schedule, now), SHOWN))
+        for due, entry in times:
+            for_people(json).print(f"{due:%Y-%m-%d %H:%M %Z}  {entry.name}")
+        document = {
+            "next": [due.isoformat() for due, _ in times],
+            "entries": [entry.name for _, entry in times],
+        }
+        write_json(json, document)
         return
-    asyncio.run(_serve(path, bench, to_arguments(wanted)))
+    asyncio.run(serve(path, bench, wanted))
 
 
-async def _serve(path: Path, bench: Bench, arguments: Sequence[str]) -> None:
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with contextlib.suppress(NotImplementedError):  # Windows: KeyboardInterrupt instead
-            loop.add_signal_handler(number, stop.set)
-
-    trust = ClockTrust(utc_now, time.monotonic)
-
-    async def run(due: datetime) -> RunNotice:
-        _remove_old(bench, trust)  # before the run, which a full disk would end
-        state, out = await run_once(path, bench, stop, arguments)
-        _remove_old(bench, trust)
-        return RunNotice(state, due, str(out))
-
-    await serve(bench.schedule, run, stop=stop, notice=_tell)
-
-
-def _remove_old(bench: Bench, trust: ClockTrust) -> None:
-    """Remove recordings older than the retention; a failure does not stop the run."""
-    if bench.recording.retention is None:
-        return
-    doubt = trust.doubt()
-    if doubt:
-        _LOGGER.warning("no recording is removed: %s", doubt)
-        return
-    directory, retention = bench.recording_directory, bench.recording.retention
-    try:
-        for old in remove_old(directory, retention, bench=bench.name, now=utc_now()):
-            _LOGGER.info(
-                "%s removed: older than the retention of the bench file",
-                old,
-                extra={"recording": str(old)},
-            )
-    except RecordingError as error:
-        _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
-
-
-async def run_once(
-    path: Path, bench: Bench, stop: asyncio.Event, arguments: Sequence[str] = ()
-) -> tuple[RunState, Path]:
-    """Run ``huddle run`` once; on `stop`, interrupt it and wait for its result.
-
-    Returns
-    -------
-    state : RunState
-        How it ended by the limits of the bench file.
-    recording : Path
+def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
+    """Read a bench file for the service.
 
     Raises
     ------
-    RunFailedError
-        The run failed.
-    RecordingError
-        The folder of the recordings cannot be made or written.
+    BenchFileError
+        With every fault of the file, also of its schedule.
     """
-    with reserved_path(bench) as out:
-        return await _run_to(out, path, stop, arguments), out
+    bench = load(path)
+    settings = chosen(Settings.of(bench), **wanted)
+    check_fit(settings, bench.sensors)
+    if not bench.schedule.entries:
+        expected = 'is missing; expected [[schedule]] tables with cron = "0 22 * * *" and time_zone'
+        raise BenchFileError(FileFault("schedule.cron", expected), source=path)
+    faults = []
+    shortest = shortest_duration(settings, bench.sensors)[1]
+    for entry in bench.schedule.entries:
+        found = entry.duration or entry.longest or bench.recording.duration
+        key = f'schedule["{entry.name}"].duration'
+        if found is None:
+            faults.append(
+                FileFault(
+                    key,
+                    'is missing; expected one such as "3h", here or in'
+                    " [recording], or target_cov with longest",
+                )
+            )
+        elif found < shortest:
+            at_least = format_duration(shortest)
+            faults.append(
+                FileFault(key, f"too short for an estimate; expected at least {at_least}")
+            )
+    if bench.metrics is not None:
+        require("prometheus_client")
+    if faults:
+        raise BenchFileError(*faults, source=path)
+    return bench
 
 
-@contextlib.contextmanager
-def reserved_path(bench: Bench) -> Iterator[Path]:
-    """Yield the path of a new recording, which no other service uses while the context lasts."""
-    out = first = recording_path(bench, SystemClock().now())
-    number = 1
+async def serve(
+    path: Path, bench: Bench, wanted: Mapping[str, object], *, clock: Clock | None = None
+) -> None:
+    """Serve a bench until SIGINT or SIGTERM; SIGHUP reads its file again.
+
+    Raises
+    ------
+    AlreadyServedError, StoreError
+        If there is another service, or the folder of the recordings cannot be used.
+    """
+    clock = SystemTime() if clock is None else clock
+    folder = bench.recording_directory
+    lock = _locked(bench, folder)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            mark = out.with_name(f".{out.name}.run")
+        store, notifier = RunStore(folder), Notifier()
+        trust = ClockTrust(clock.now, time.monotonic)
+
+        def tidied(bench: Bench) -> None:
             try:
-                mark.touch(exist_ok=False)
-            except FileExistsError:
-                pass
-            else:
-                if not out.exists():
-                    break
-                mark.unlink()
-            number += 1
-            out = first.with_stem(f"{first.stem}-{number}")
-    except OSError as error:
-        raise RecordingError(f"{out.parent}: cannot be written: {error.strerror}") from error
-    try:
-        yield out
+                tidy(bench, store, clock.now(), doubt=trust.doubt())
+            except (HuddleError, OSError) as error:
+                _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
+
+        teller = Teller(lambda: service.bench.hooks, store, folder, clock)
+        service = Service(
+            bench,
+            steps=lambda bench: ProcessSteps(bench, _snapshot(bench, path)),
+            store=store,
+            clock=clock,
+            options=options_table(wanted),
+            reload=lambda: _again(path, wanted, bench),
+            tell=teller.tell,
+            tidy=tidied,
+        )
+        _on_signals(service.request_stop, service.request_reload)
+        helpers = [
+            asyncio.create_task(teller.work()),
+            asyncio.create_task(signs_of_life(service, notifier)),
+        ]
+        _LOGGER.info("serving %s; recordings go to %s", bench.name, folder)
+        try:
+            await service.run()
+        finally:
+            notifier.send("STOPPING=1")
+            for task in helpers:
+                task.cancel()
+            await asyncio.gather(*helpers, return_exceptions=True)
     finally:
-        mark.unlink(missing_ok=True)
+        lock.release()
 
 
-async def _run_to(out: Path, path: Path, stop: asyncio.Event, arguments: Sequence[str]) -> RunState:
-    process = await asyncio.create_subprocess_exec(
-        *python_command("tui", "run", str(path)),
-        *("--out", str(out), "--json", str(out.with_suffix(".json")), *arguments),
-        *logs.arguments_for_child(),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.DEVNULL,  # the result is in the recording and the JSON file
-        stderr=asyncio.subprocess.PIPE,
-        start_new_session=sys.platform != "win32",
-    )
-    log = ChildLog("the run")
-    stopping = asyncio.create_task(stop.wait())
-    done = asyncio.create_task(_follow(process, log))
-    await asyncio.wait({stopping, done}, return_when=asyncio.FIRST_COMPLETED)
-    stopping.cancel()
-    await asyncio.wait({stopping})
-    if not done.done():
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(signal.SIGINT)
-    await done
-    state = ENDED_WELL.get(process.returncode)
-    if state is None:
-        said = "; ".join(log.errors) or f"huddle run ended with exit code {process.returncode}"
-        raise RunFailedError(said)
-    return state
+def _locked(bench: Bench, folder: Path) -> Lock:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = Lock.take(service_lock(bench))
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written: {error.strerror}") from error
+    if lock is None:
+        raise AlreadyServedError(
+            f"{folder}: another huddle serve runs the schedule of bench {bench.name!r}; stop it, or"
+            " give this bench another name or directory"
+        )
+    return lock
 
 
-async def _follow(process: Process, log: ChildLog) -> None:
-    """Read the standard error of a run until it ends."""
-    while process.stderr is not None and (content := await process.stderr.read(1 << 16)):
-        log.feed(content)
-    await process.wait()
+def _snapshot(bench: Bench, path: Path) -> Path:
+    """Return a copy of the accepted bench file, which recorders read whatever becomes of it."""
+    copy = bench.recording_directory / f".{file_name(bench.name)}.toml"
+    try:
+        write_whole(copy, bench.text.encode())
+        copy.chmod(0o600)
+    except OSError as error:
+        _LOGGER.warning("%s: cannot be written (%s); recorders read %s", copy, error, path)
+        return path
+    return copy
 
 
-def _tell(notice: RunNotice) -> None:
-    _LOGGER.log(
-        _LEVELS.get(notice.state, logging.INFO),
-        "run due %s %s%s",
-        *(f"{notice.due:%Y-%m-%d %H:%M %Z}", notice.state, notice.text and f": {notice.text}"),
-        extra={"due": notice.due.isoformat(), "run": notice.state},
-    )
+def _again(path: Path, wanted: Mapping[str, object], first: Bench) -> Bench:
+    bench = accepted(path, wanted)
+    for key, old, new in (
+        ("name", first.name, bench.name),
+        ("recording.directory", first.recording_directory, bench.recording_directory),
+        ("metrics", first.metrics, bench.metrics),
+    ):
+        if old != new:
+            expected = (
+                "differs from that of the running service; expected a restart for this change"
+            )
+            raise BenchFileError(FileFault(key, expected), source=path)
+    return bench
+
+
+def _on_signals(stop: Callable[[], None], reload: Callable[[], None]) -> None:
+    loop = asyncio.get_running_loop()
+    numbers = {signal.SIGINT: stop, signal.SIGTERM: stop}
+    if hasattr(signal, "SIGHUP"):
+        numbers[signal.SIGHUP] = reload
+    for number, action in numbers.items():
+        with contextlib.suppress(NotImplementedError):  # Windows: KeyboardInterrupt instead
+            loop.add_signal_handler(number, action)

@@ -81,7 +81,7 @@ def local_time(moment: datetime, bench: Bench | None) -> str:
     """Return an instant in the bench's time zone where its file names one, or this machine's."""
     if not is_known(moment):
         return "not known"
-    named = bench is not None and bench.schedule.time_zone != "UTC"
-    name = bench.schedule.time_zone if bench is not None and named else ""
+    named = bench is not None and bench.schedule.named_zone != "UTC"
+    name = bench.schedule.named_zone if bench is not None and named else ""
     local = moment.astimezone(ZoneInfo(name) if name else None)
     return f"{local:%Y-%m-%d %H:%M:%S} UTC{local:%z}" + (f" ({name})" if name else "")

@@ -49,6 +49,8 @@ class RecorderProcess:
         Recording it writes; must not exist.
     duration : float, optional
         In seconds; without it, until a stop is requested.
+    lock : int, optional
+        Descriptor of a lock that the process holds as long as it lives (not on Windows).
 
     Raises
     ------
@@ -56,7 +58,14 @@ class RecorderProcess:
         If there is a recording already: it would be taken for the new one.
     """
 
-    def __init__(self, bench_path: Path, out: Path, *, duration: float | None = None) -> None:
+    def __init__(
+        self,
+        bench_path: Path,
+        out: Path,
+        *,
+        duration: float | None = None,
+        lock: int | None = None,
+    ) -> None:
         if out.exists():
             raise RecordingError(f"{out}: exists already; expected a new file")
         self.out = out
@@ -72,6 +81,7 @@ class RecorderProcess:
                 stdout=subprocess.DEVNULL,
                 stderr=descriptor,
                 **_own_session(),
+                pass_fds=() if lock is None else (lock,),
             )
             self._log = _LogFollower(Path(name))
         finally:
@@ -134,6 +144,11 @@ class RecorderProcess:
             f"huddle repair {self.out} closes the recording; start a new run to continue"
         )
 
+    def kill(self) -> None:
+        """End it without closing its file, which has all that was acknowledged."""
+        self._process.kill()
+        self._process.wait()
+
     def interrupt(self) -> None:
         """Request a stop by a signal, if the control channel does not answer."""
         if sys.platform == "win32":
@@ -165,8 +180,7 @@ class RecorderProcess:
     def wait(self, timeout: float = STOP_TIMEOUT) -> None:
         """Wait until it has ended; kill it if it does not."""
         if not self.ends_within(timeout):
-            self._process.kill()
-            self._process.wait()
+            self.kill()
 
 
 class _LogFollower:

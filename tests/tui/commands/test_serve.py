@@ -1,62 +1,140 @@
-"""A scheduled run in a folder where nothing has run before."""
+"""The service with its real processes, in a folder where nothing has run before."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import sys
+import time
+from datetime import timedelta
 from importlib import resources
 from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.acquisition.schedule import RunState
+from daq.acquisition.schedule import utc_now
 from daq.bench.loading import dump
+from daq.bench.unattended import Schedule, ScheduledRun
 from daq.drivers.bench_file import load, parse
-from daq.errors import RecordingError
+from daq.errors import BenchFileError, RecordingError
 from daq.recording.reader import Recording
-from tui.commands.serve import reserved_path, run_once
+from tests.waiting import limit
+from tui.commands.serve import AlreadyServedError, accepted, serve
+from tui.service.clock import SystemTime
+from tui.service.locks import Lock
+from tui.service.places import service_lock
+from tui.service.run_state import RunState
+from tui.service.steps import ProcessSteps
+from tui.service.store import RunStore
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
+    from datetime import datetime
     from pathlib import Path
 
+    from daq.bench.model import Bench
+
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
+DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+DUE = utc_now().replace(microsecond=0) - timedelta(hours=1)
 
 
-async def test_the_first_run_makes_its_folder_and_leaves_recording_and_result(
+class ClockAtDue(SystemTime):
+    """Begins just before the run is due."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic()
+
+    def now(self) -> datetime:
+        """Return the time."""
+        return DUE + timedelta(seconds=time.monotonic() - self._start - 0.2)
+
+
+def scheduled(bench: Bench, path: Path, *, seconds: float) -> Bench:
+    schedule = Schedule(runs=(ScheduledRun(name="night", at=DUE, duration=seconds),))
+    path.write_text(dump(bench.model_copy(update={"schedule": schedule})), encoding="utf-8")
+    return load(path)
+
+
+async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_row(
     tmp_path: Path,
 ) -> None:
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     path = tmp_path / "bench.toml"
-    with simulated(parse(text), speed=8.0) as reachable:
-        settings = reachable.recording.model_copy(update={"duration": 60.0})
-        path.write_text(dump(reachable.model_copy(update={"recording": settings})), "utf-8")
-        bench = load(path)
-        state, out = await run_once(path, bench, asyncio.Event())
-    assert state is not RunState.FAILED
-    assert out.parent == tmp_path / "recordings"
-    names = sorted(entry.name for entry in out.parent.iterdir())
-    assert names == sorted([out.name, out.with_suffix(".json").name])
+    with simulated(parse(DEMO), speed=8.0) as reachable:
+        bench = scheduled(reachable, path, seconds=60.0)
+        store = RunStore(bench.recording_directory)
+        task = asyncio.create_task(serve(path, bench, {"overlap": 0.25}, clock=ClockAtDue()))
+        async with asyncio.timeout(limit()):
+            while True:
+                if store.path.exists() and all(run.is_over for run in store.runs()):
+                    break
+                await asyncio.sleep(0.05)
+        with pytest.raises(AlreadyServedError, match="another huddle serve"):
+            await serve(path, bench, {})
+        os.kill(os.getpid(), signal.SIGTERM)
+        await task
+    (run,) = store.runs()
+    assert run.state is RunState.DONE, run.reason
+    assert run.due == DUE
+    assert {(each.sensor, each.channel) for each in run.noise} == {
+        (sensor, channel) for sensor in "ABC" for channel in "XYZ"
+    }
+    assert all(0 < each.low < each.psd < each.high for each in run.noise)
+    assert all(each.serial_number for each in run.noise)
+    out = bench.recording_directory / run.parts[0]
+    names = {entry.name for entry in out.parent.iterdir()}
+    assert names == {
+        *(out.name, out.with_suffix(".json").name, "runs.sqlite"),
+        *(".demo.toml", ".demo.service"),
+    }
+    assert all(
+        (out.parent / name).stat().st_mode & 0o077 == 0 for name in names if "json" not in name
+    )
     with Recording.open(out) as recording:
         assert recording.results()
 
 
 def test_two_services_never_have_the_same_recording(tmp_path: Path) -> None:
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    bench = parse(text, tmp_path / "bench.toml")
-    with reserved_path(bench) as one, reserved_path(bench) as other:
-        assert one != other
-    with reserved_path(bench) as again:
-        assert not list(again.parent.glob("*.h5"))
-    assert not list(one.parent.iterdir())
+    bench = parse(DEMO, tmp_path / "bench.toml")
+    steps = ProcessSteps(bench, tmp_path / "bench.toml")
+    one, other = steps.new_part(DUE), steps.new_part(DUE)
+    assert one != other
+    steps.release(one)
+    steps.release(other)
+    assert not list(bench.recording_directory.iterdir())
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    bench = parse(text, tmp_path / "bench.toml")
+    bench = parse(DEMO, tmp_path / "bench.toml")
     (tmp_path / "recordings").write_text("a file", encoding="utf-8")
-    with (
-        pytest.raises(RecordingError, match="recordings: cannot be written"),
-        reserved_path(bench),
-    ):
-        pass
+    with pytest.raises(RecordingError, match="recordings: cannot be written"):
+        ProcessSteps(bench, tmp_path / "bench.toml").new_part(DUE)
+
+
+def test_a_schedule_without_a_usable_duration_is_a_fault_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        DEMO.replace('duration = "5min"', "")
+        + '[[schedule]]\nname = "a"\ncron = "0 1 * * *"\ntime_zone = "UTC"\n'
+        + '[[schedule]]\ncron = "0 1 * * *"\ntime_zone = "UTC"\nduration = "3s"\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(BenchFileError) as caught:
+        accepted(path, {})
+    said = str(caught.value)
+    assert 'schedule["a"].duration: is missing' in said
+    assert 'schedule["2"].duration: too short' in said
+
+
+def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
+    bench = parse(DEMO, tmp_path / "bench.toml")
+    bench.recording_directory.mkdir()
+    lock = Lock.take(service_lock(bench))
+    assert lock is not None
+    assert Lock.take(service_lock(bench)) is None
+    lock.release()
+    again = Lock.take(service_lock(bench))
+    assert again is not None
+    again.release(remove=True)
+    assert not service_lock(bench).exists()

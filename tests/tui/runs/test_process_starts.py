@@ -7,19 +7,24 @@ import json
 import re
 import subprocess
 import sys
+from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.acquisition.schedule import RunState
 from daq.bench.loading import dump
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from daq.recording.reader import Recording
-from tui.commands.serve import run_once
 from tui.runs.recorder_process import RecorderProcess
+from tui.service.finish import Outcome, Request
+from tui.service.steps import ProcessSteps
 from tui.simulation.devices import simulated
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 
@@ -28,6 +33,7 @@ MODULES = ("random", "cronsim", "json", "numpy", "typer", "huddle")
 PACKAGES = ("tui", "daq", "estimator", "sim_devices")
 FOREIGN = """
 from pathlib import Path
+from typing import TYPE_CHECKING
 with Path({record!r}).open("a") as record:
     print(__file__, file=record)
 raise SystemExit(f"{{__file__}} was executed")
@@ -77,26 +83,32 @@ def test_simulators_and_the_recorder_run_none(record: Path) -> None:
     assert not record.exists()
 
 
-def test_runs_of_a_service_execute_none(record: Path) -> None:
+def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None:
     with simulated(parse(demo_bench()), speed=8.0) as reachable:
-        bench = reachable.model_copy(
-            update={
-                "recording": reachable.recording.model_copy(update={"duration": 12.0}),
-                "limits": (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),),
-            }
-        )
+        limits = (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),)
+        bench = reachable.model_copy(update={"limits": limits})
         Path("bench.toml").write_text(dump(bench), encoding="utf-8")
-        placed = parse(dump(bench), "bench.toml")
-        placed.recording_directory.mkdir(parents=True, exist_ok=True)
-        options = ["--method", "three-channel"]
-        state, out = asyncio.run(run_once(Path("bench.toml"), placed, asyncio.Event(), options))
-    assert state is RunState.NOT_DECIDED  # 12 s are too short for the limit
-    path = out.with_suffix(".json")
+        placed = parse(dump(bench), Path("bench.toml").absolute())
+        outcome, part = asyncio.run(one_run(ProcessSteps(placed, Path("bench.toml")), placed))
+    assert outcome.error == ""
+    assert outcome.verdict == "not-decided"  # 12 s are too short for the limit
+    path = (placed.recording_directory / part).with_suffix(".json")
     result = json.loads(path.read_text(encoding="utf-8"))
     assert result["segments"] >= 5
     assert result["method"] == "three-channel"
-    assert result["verdict"] == "not-decided"
     assert not record.exists()
+
+
+async def one_run(steps: ProcessSteps, bench: Bench) -> tuple[Outcome, str]:
+    part = steps.new_part(datetime.now(UTC))
+    recorder = steps.start(part, 12.0, 0.01)
+    while not await recorder.ends_within(60):
+        pass
+    assert recorder.failure() == ""
+    options = {"method": "three-channel"}
+    outcome = await steps.finish(Request([str(bench.recording_directory / part)], options))
+    steps.release(part)
+    return outcome, part
 
 
 def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> None:
@@ -131,6 +143,8 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     assert starts == {
         str(Path("sim_devices", "server", "launch.py")),
         str(Path("tui", "runs", "recorder_process.py")),
-        str(Path("tui", "commands", "serve.py")),
+        str(Path("tui", "service", "hooks.py")),
+        str(Path("tui", "service", "steps.py")),
     }
-    assert all("python_command(" in sources[name] for name in starts)
+    hooks = str(Path("tui", "service", "hooks.py"))  # runs what the bench file says
+    assert all("python_command(" in sources[name] for name in starts - {hooks})

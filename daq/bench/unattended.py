@@ -1,0 +1,192 @@
+"""Tables of the bench file for unattended use: schedule, storage, hooks, metrics."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from cronsim import CronSim, CronSimError
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from daq.bench.table import Duration, Name, PositiveNumber, Table
+
+_BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
+_SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]*)", re.ASCII)
+
+
+def _cron_line(value: str) -> str:
+    try:
+        CronSim(value, datetime(2026, 1, 1, tzinfo=UTC))
+    except CronSimError as error:
+        raise ValueError(
+            'expected a cron line "minute hour day month weekday", such as "0 22 * * 1-5"'
+            f" ({error})"
+        ) from None
+    return value
+
+
+def _time_zone(value: str) -> str:
+    try:
+        ZoneInfo(value)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError('expected a time zone such as "UTC" or "Europe/Berlin"') from None
+    return value
+
+
+def parse_size(value: str | float) -> int:
+    """Return a size in bytes: ``500 MB``, ``2.5GB``; a bare number is bytes.
+
+    Raises
+    ------
+    ValueError
+        If it is none; the message says what was expected.
+    """
+    numeric = isinstance(value, (int, float)) and not isinstance(value, bool)
+    found = _SIZE.fullmatch(str(value).strip().lower()) if not numeric else None
+    if numeric and 0 <= float(value) < 1e18:
+        return int(value)
+    if found is None or found[2] not in _BYTES or float(found[1]) * _BYTES[found[2]] > 1e18:
+        raise ValueError('expected a size such as "500 MB" or "2 GB"')
+    return round(float(found[1]) * _BYTES[found[2]])
+
+
+def _address(value: str) -> str:
+    try:
+        ipaddress.ip_address(value)
+    except ValueError:
+        raise ValueError('expected an IP address such as "127.0.0.1"') from None
+    return value
+
+
+CronLine = Annotated[str, AfterValidator(_cron_line)]
+TimeZone = Annotated[str, AfterValidator(_time_zone)]
+Size = Annotated[int, BeforeValidator(parse_size)]
+Command = Annotated[tuple[str, ...], Field(min_length=1, description="a program and its arguments")]
+
+
+class ScheduledRun(Table):
+    """One ``[[schedule]]`` table: when runs are due, and how long they record."""
+
+    name: Name = "runs"
+    cron: CronLine | None = None
+    at: datetime | None = None
+    """One run at this time."""
+    time_zone: TimeZone | None = None
+    duration: Duration | None = None
+    """In seconds; that of ``[recording]`` where neither this nor `target_cov` is given."""
+    target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
+    """Coefficient of variation at which the run ends."""
+    longest: Duration | None = None
+    """Seconds after which a run with `target_cov` ends at the latest."""
+    when_busy: Literal["skip", "queue"] = "skip"
+    """What becomes of a run that is due while another one records."""
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> ScheduledRun:
+        if (self.cron is None) == (self.at is None):
+            raise ValueError('expected either cron = "0 22 * * *" or at = 2026-12-01T22:00:00')
+        is_local = self.at is None or self.at.tzinfo is None
+        if is_local and self.time_zone is None:
+            raise ValueError('time_zone is missing; expected one such as "UTC" or "Europe/Berlin"')
+        if self.duration is not None and self.target_cov is not None:
+            raise ValueError("expected duration, or target_cov with longest; not both")
+        if (self.target_cov is None) != (self.longest is None):
+            raise ValueError("expected target_cov and longest together")
+        return self
+
+    @property
+    def zone(self) -> ZoneInfo:
+        """The time zone of the entry; UTC where `at` has an offset of its own."""
+        return ZoneInfo(self.time_zone or "UTC")
+
+
+class Schedule(Table):
+    """When ``huddle serve`` starts a run: ``[[schedule]]`` tables, or cron lines in one table."""
+
+    cron: tuple[CronLine, ...] = ()
+    time_zone: TimeZone = "UTC"
+    runs: tuple[ScheduledRun, ...] = ()
+    """The ``[[schedule]]`` tables."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_all(cls, table: object) -> object:
+        """Take a list as `runs`, and name those that have no name by their position."""
+        table = {"runs": table} if isinstance(table, (list, tuple)) else table
+        if not isinstance(table, dict) or not isinstance(table.get("runs"), (list, tuple)):
+            return table
+        named = [
+            {"name": str(number), **run} if isinstance(run, dict) else run
+            for number, run in enumerate(table["runs"], 1)
+        ]
+        return table | {"runs": named}
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Schedule:
+        names = [run.name for run in self.runs]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two entries have the name {twice!r}; expected names that differ")
+        return self
+
+    @property
+    def entries(self) -> tuple[ScheduledRun, ...]:
+        """All entries, the cron lines of the one table included."""
+        lines = (
+            ScheduledRun(name=f"cron {number}", cron=line, time_zone=self.time_zone)
+            for number, line in enumerate(self.cron, 1)
+        )
+        return (*lines, *self.runs)
+
+    @property
+    def named_zone(self) -> str:
+        """The time zone of the bench: the first that is not UTC, or UTC."""
+        zones = [self.time_zone, *(run.time_zone for run in self.runs if run.time_zone)]
+        return next((zone for zone in zones if zone != "UTC"), "UTC")
+
+
+class Storage(Table):
+    """What ``huddle serve`` keeps; without limits, every run for ever."""
+
+    keep_for: Duration | None = None
+    """Seconds after which a run is removed."""
+    keep_runs: Annotated[int, Field(strict=True, ge=1)] | None = None
+    """Number of the newest runs that are kept."""
+    keep_free: Size | None = None
+    """Bytes of free space for which the oldest runs are removed."""
+    min_free: Size = 500 * 10**6
+    """Bytes of free space below which no run starts and a running one is closed."""
+
+
+class Hooks(Table):
+    """Commands of ``huddle serve``, given a JSON document on standard input."""
+
+    on_finished: Command | None = None
+    """A run has its result, whatever the verdict."""
+    on_limit: Command | None = None
+    """A limit is not met."""
+    on_failed: Command | None = None
+    """A run has no result."""
+    on_missed: Command | None = None
+    """A run was due and not started."""
+    timeout: Duration = 30.0
+    retries: Annotated[int, Field(strict=True, ge=0, le=20)] = 3
+    retry_after: Duration = 60.0
+    """Seconds between attempts, doubled after each."""
+
+
+class Metrics(Table):
+    """Prometheus metrics of ``huddle serve``."""
+
+    port: Annotated[int, Field(strict=True, ge=0, le=65535)]
+    address: Annotated[str, AfterValidator(_address)] = "127.0.0.1"
+
+
+class History(Table):
+    """What ``huddle serve`` keeps of each run for ``huddle history``."""
+
+    bands: tuple[tuple[PositiveNumber, PositiveNumber], ...] = ()
+    """Bands in Hz whose noise is kept, beside the band of the estimate."""

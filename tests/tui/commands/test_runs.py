@@ -1,0 +1,125 @@
+"""What the commands show of a service's database, and of its folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import h5py
+import pytest
+from typer.testing import CliRunner
+
+from tests.torture.damaged_files import make_recording
+from tests.tui.service.bench_files import START
+from tui.cli.main import app
+from tui.output.csv_text import csv_text
+from tui.service.locks import Lock
+from tui.service.places import Place, service_lock
+from tui.service.run_state import Run, RunState
+from tui.service.store import RunStore, StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def huddle(*arguments: str, code: int = 0) -> str:
+    result = CliRunner().invoke(app, arguments, terminal_width=200)
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """Return a bench file whose service has done a run, failed one, and plans another."""
+    bench = tmp_path / "lab.toml"
+    huddle("init", "--out", str(bench))
+    with bench.open("a", encoding="utf-8") as file:
+        file.write('\n[[schedule]]\ncron = "0 22 * * *"\ntime_zone = "UTC"\n')
+    store = RunStore(tmp_path / "recordings")
+    done = Run("bench", "1", START, 60.0).to(RunState.RECORDING, started=START, parts=("a.h5",))
+    done = done.to(RunState.ESTIMATING).to(RunState.DONE, verdict="pass", ended=START)
+    failed = replace(done, due=START + timedelta(hours=1), parts=(), verdict="", reason="=1+1")
+    store.save(done)
+    store.save(replace(failed, state=RunState.FAILED))
+    store.save(Run("bench", "1", START + timedelta(days=4000), 60.0))
+    make_recording(tmp_path / "recordings" / "a.h5")
+    return bench
+
+
+def test_runs_as_table_json_and_csv(place: Path) -> None:
+    table = huddle("runs", str(place))
+    assert [line.split()[3] for line in table.splitlines()[1:]] == ["done", "failed", "due"]
+    runs = json.loads(huddle("runs", str(place), "--json", "-"))["runs"]
+    assert [run["verdict"] for run in runs] == ["pass", None, None]
+    rows = list(
+        csv.DictReader(
+            io.StringIO(
+                huddle("runs", str(place.parent / "recordings"), "--last", "2", "--csv", "-")
+            )
+        )
+    )
+    assert [row["reason"] for row in rows] == ["'=1+1", ""]  # no formula for a spreadsheet
+    nowhere = CliRunner().invoke(app, ["runs", str(place.parent)])
+    assert nowhere.exit_code == 2
+    assert "runs.sqlite: does not exist" in nowhere.stderr
+
+
+def test_pinned_by_recording_or_time(place: Path) -> None:
+    huddle("pin", str(place), "a.h5", "2026-11-21 13:00")
+    store = RunStore(place.parent / "recordings")
+    assert [run.pinned for run in store.runs()] == [True, True, False]
+    store.save(replace(store.runs()[0], pinned=False))  # by a service that knows nothing of it
+    assert store.runs()[0].pinned
+    huddle("pin", str(place), "recordings/a.h5", "--remove")
+    assert [run.pinned for run in store.runs()] == [False, True, False]
+    assert "no such run" in CliRunner().invoke(app, ["pin", str(place), "b.h5"]).stderr
+
+
+def test_verify_walks_what_is_kept(place: Path) -> None:
+    found = json.loads(huddle("verify", str(place), "--json", "-"))["recordings"]
+    assert [entry["intact"] for entry in found] == [True]
+    path = place.parent / "recordings" / "a.h5"
+    with h5py.File(path) as file:
+        chunk = file["sensors/a/samples"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(content)
+    result = CliRunner().invoke(app, ["verify", str(place)])
+    assert result.exit_code == 3
+    assert "1 of 1 recordings are damaged or lost" in result.stderr
+    path.unlink()
+    huddle("verify", str(place), code=3)
+
+
+def test_status_with_and_without_a_service(place: Path) -> None:
+    found = json.loads(huddle("status", str(place), "--json", "-", code=3))
+    assert found["running"] is False
+    assert found["last"]["state"] == "failed"
+    assert found["next"]["due"].startswith("2037-11-03")
+    assert found["disk"]["min_free_bytes"] == 500_000_000
+    bench = Place.of(place).bench
+    assert bench is not None
+    lock = Lock.take(service_lock(bench))
+    assert lock is not None
+    text = huddle("status", str(place))
+    lock.release()
+    assert "service    running" in text
+    assert "last run   1 of 2026-11-21T13:00:30Z: failed (=1+1)" in text
+
+
+def test_a_database_that_is_none_is_refused(tmp_path: Path) -> None:
+    store = RunStore(tmp_path)
+    store.path.write_bytes(b"no database" * 100)
+    with pytest.raises(StoreError, match="move it away: recordings are not affected"):
+        store.runs()
+
+
+def test_no_cell_is_a_formula() -> None:
+    text = csv_text(["name"], [["=cmd|' /C calc'!A0"], ["@x"], [-1.5], [None], ['"a"\n']])
+    assert list(csv.reader(io.StringIO(text)))[1:] == [
+        *(["'=cmd|' /C calc'!A0"], ["'@x"], ["-1.5"], [""], ['"a"\n'])
+    ]

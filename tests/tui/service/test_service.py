@@ -1,0 +1,309 @@
+"""The life of runs: by schedule, after crashes, beside each other, with a disk that is full."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.errors import BenchFileError, FileFault
+from tests.tui.service.bench_files import HOURLY, START, Place, bench_of
+from tui.service.finish import Outcome
+from tui.service.planning import MAX_MISSED
+from tui.service.run_state import NEXT, Run, RunState, WrongStateError
+from tui.service.steps import FinishFailedError
+from tui.service.store import RunStore, StoreError
+from tui.service.window import STALL, STOPPED
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+
+pytestmark = pytest.mark.virtual_time
+HOUR = 3600.0
+
+
+async def test_runs_when_due_and_estimates_after(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(2.2 * HOUR)
+    assert place.states() == [("13:00", "done"), ("14:00", "done"), ("15:00", "due")]
+    run = place.store.runs()[0]
+    assert run.started == run.due
+    assert place.steps.started[0][1] == 600
+    assert run.ended is not None
+    assert run.ended - run.due >= timedelta(seconds=630)
+    assert [run.state for run in place.told] == ["recording", "estimating", "done"] * 2
+
+
+async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_rest(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 170)  # 13:03:20
+    (run,) = place.store.unfinished("lab")
+    assert run.state is RunState.RECORDING
+    assert run.reason == STOPPED
+    place.clock.set_by += timedelta(seconds=100)
+    await place.serve(0.5 * HOUR)
+    run = place.store.runs()[0]
+    assert run.state is RunState.DONE
+    assert len(run.parts) == 2
+    assert [seconds for _, seconds in place.steps.started] == [600, 300]
+    request = place.steps.finished[0]
+    assert [path.rpartition("/")[2] for path in request.parts] == list(run.parts)
+
+
+async def test_a_killed_service_finds_its_recorder_again(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 170, killed=True)
+    (part, _), *_ = place.steps.started
+    place.steps.left_running[part] = 400.0
+    await place.serve(0.5 * HOUR)
+    run = place.store.runs()[0]
+    assert run.state is RunState.DONE
+    assert run.parts == (part,)
+    assert len(place.steps.started) == 1
+    assert run.reason == ""
+
+
+async def test_a_power_cut_beyond_the_window_leaves_the_estimate_to_be_made(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 170, killed=True)
+    place.clock.set_by += timedelta(hours=2.5)
+    await place.serve(60)
+    assert place.states() == [
+        *(("13:00", "done"), ("14:00", "missed"), ("15:00", "missed")),
+        ("16:00", "due"),
+    ]
+    assert place.store.runs()[0].reason.startswith("interrupted")
+    assert "computer was off" in place.store.runs()[1].reason
+    assert len(place.steps.started) == 1
+
+
+async def test_an_estimate_that_was_killed_is_made_again(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 580, killed=True)  # 13:10:10
+    (run,) = place.store.unfinished("lab")
+    assert run.state is RunState.ESTIMATING
+    await place.serve(60)
+    assert place.states()[0] == ("13:00", "done")
+    assert len(place.steps.finished) == 2
+
+
+async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.outcomes = [FinishFailedError("the estimate was killed (signal 9)")] * 9
+    await place.serve(1.5 * HOUR)
+    run = place.store.runs()[0]
+    assert run.state is RunState.FAILED
+    assert "3 estimates ended without an outcome" in run.reason
+    assert "killed (signal 9)" in run.reason
+
+
+async def test_a_killed_recorder_is_followed_by_another(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.endings = [(200.0, "the recorder was killed"), (None, "")]
+    await place.serve(1.5 * HOUR)
+    run = place.store.runs()[0]
+    assert run.state is RunState.DONE
+    assert run.reason == "the recorder was killed"
+    assert [seconds for _, seconds in place.steps.started] == [600, 395]
+
+
+async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.refuses = True
+    place.steps.endings = [(3.0, "a: no answer")]
+    await place.serve(HOUR)
+    run = place.store.runs()[0]
+    assert (run.state, run.reason, run.parts) == (RunState.FAILED, "a: no answer", ())
+
+
+async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.is_stuck = True
+    await place.serve(1.5 * HOUR)
+    run = place.store.runs()[0]
+    assert f"no progress for {STALL.total_seconds():.0f} s" in run.reason
+    assert len(run.parts) > 1
+    assert run.state is RunState.DONE
+
+
+async def test_a_run_with_an_error_has_its_reason(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.outcomes = [Outcome(error="no segment"), Outcome(verdict="fail", notes=("n",))]
+    await place.serve(2.5 * HOUR)
+    first, second, _ = place.store.runs()
+    assert (first.state, first.reason) == (RunState.FAILED, "no segment")
+    assert (second.state, second.verdict, second.reason) == (RunState.DONE, "fail", "n")
+
+
+TWO = """
+[[schedule]]
+name = "long"
+cron = "0 13 * * *"
+time_zone = "UTC"
+duration = "40min"
+
+[[schedule]]
+name = "short"
+cron = "20,30 13 * * *"
+time_zone = "UTC"
+when_busy = "{busy}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("busy", "expected"),
+    [
+        ("skip", ["done", "missed", "missed"]),
+        ("queue", ["done", "done", "done"]),
+    ],
+)
+async def test_a_run_in_the_way_is_skipped_or_waited_for(
+    tmp_path: Path, busy: str, expected: list[str]
+) -> None:
+    place = Place(tmp_path, TWO.format(busy=busy))
+    await place.serve(2.5 * HOUR)
+    runs = [run for run in place.store.runs() if run.state is not RunState.DUE]
+    assert [run.state for run in runs] == expected
+    if busy == "queue":
+        assert runs[1].started is not None
+        assert f"{runs[1].started:%H:%M}" == "13:40"
+        assert [seconds for _, seconds in place.steps.started] == [2400, 600, 600]
+    else:
+        assert runs[1].reason == "the run before was still recording"
+
+
+async def test_runs_that_touch_are_all_recorded(tmp_path: Path) -> None:
+    """An hour each, every hour: the end of one, and its estimate, do not miss the next."""
+    place = Place(tmp_path, HOURLY + 'duration = "1h"\n')
+    place.steps.endings = [(HOUR + 8.0, "")] * 3
+    await place.serve(4.2 * HOUR)
+    assert [state for _, state in place.states()] == [*["done"] * 3, "recording", "due"]
+
+
+async def test_a_one_shot_comes_once(tmp_path: Path) -> None:
+    text = '[[schedule]]\nat = 2026-11-21T14:30:00\ntime_zone = "Europe/Berlin"\n'
+    place = Place(tmp_path, text)
+    await place.serve(5 * HOUR)
+    assert place.states() == [("13:30", "done")]
+
+
+async def test_a_reload_plans_anew_and_a_faulty_file_changes_nothing(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    faults = iter([BenchFileError(FileFault("schedule", "wrong"), source="lab.toml")])
+
+    def reload() -> Bench:
+        for fault in faults:
+            raise fault
+        return bench_of(tmp_path, HOURLY.replace("0 *", "30 *"))
+
+    place.reload = reload
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(60)
+    service.request_reload()
+    await asyncio.sleep(60)
+    assert place.states() == [("13:00", "due")]
+    service.request_reload()
+    await asyncio.sleep(60)
+    assert place.states() == [("12:30", "due")]
+    service.request_stop()
+    await task
+
+
+async def test_a_clock_set_back_repeats_no_run(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(1.5 * HOUR)
+    place.clock.set_by -= timedelta(hours=1)
+    await asyncio.sleep(1.4 * HOUR)
+    service.request_stop()
+    await task
+    assert place.states() == [("13:00", "done"), ("14:00", "due")]
+
+
+async def test_a_clock_set_forward_by_years_reports_a_few_misses(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(60)
+    place.clock.set_by += timedelta(days=4000)
+    await asyncio.sleep(1.3 * HOUR)
+    service.request_stop()
+    await task
+    states = [state for _, state in place.states()]
+    assert states == ["missed"] * (MAX_MISSED + 1) + ["done", "due"]
+    assert "all others until" in place.store.runs()[MAX_MISSED].reason
+
+
+async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Place(tmp_path)
+    free = 10**9
+    monkeypatch.setattr("tui.service.window.Window.free", lambda _: free)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(HOUR + 70)  # 13:01:40
+    free = 10**8
+    await asyncio.sleep(300)  # 13:06:40
+    free = 10**9
+    await asyncio.sleep(0.5 * HOUR)
+    run = place.store.runs()[0]
+    assert run.state is RunState.DONE
+    assert "recording closed at 100 MB of free space" in run.reason
+    assert len(run.parts) == 2
+    assert 150 < place.steps.started[1][1] < 210  # what was left when there was space again
+    free = 10**8
+    await asyncio.sleep(HOUR)
+    free = 10**9
+    await asyncio.sleep(HOUR)
+    service.request_stop()
+    await task
+    runs = place.store.runs()
+    assert [run.state for run in runs] == ["done", "missed", "done", "due"]
+    assert runs[1].reason == "100 MB of free space; expected at least 500 MB"
+
+
+async def test_a_database_that_cannot_be_written_is_written_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Place(tmp_path)
+    save = RunStore.save
+    is_broken = False
+
+    def failing(store: RunStore, run: Run) -> None:
+        if is_broken:
+            raise StoreError("disk I/O error")
+        save(store, run)
+
+    monkeypatch.setattr(RunStore, "save", failing)
+    service = place.service()
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(60)
+    is_broken = True
+    await asyncio.sleep(1.5 * HOUR)
+    assert place.states() == [("13:00", "due")]
+    is_broken = False
+    await asyncio.sleep(60)
+    assert place.states() == [("13:00", "done"), ("14:00", "due")]
+    service.request_stop()
+    await task
+
+
+def test_states_follow_the_machine() -> None:
+    run = Run("lab", "hourly", START, 60.0)
+    assert run.to(RunState.RECORDING).to(RunState.ESTIMATING).to(RunState.DONE).is_over
+    for state in NEXT:
+        for wrong in set(RunState) - NEXT[state]:
+            with pytest.raises(WrongStateError, match=f"{wrong} cannot follow {state}"):
+                replace(run, state=state).to(wrong)

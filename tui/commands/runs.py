@@ -1,0 +1,155 @@
+"""``huddle runs``, ``huddle pin``, ``huddle verify``: what a service has kept."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from daq.errors import HuddleError, RecordingError
+from daq.recording.repair import verify
+from tui.output.console import check_places, for_people, write_json, write_text
+from tui.output.csv_text import csv_text
+from tui.service.places import NoServiceError, Place
+from tui.service.run_state import Run, RunState, utc_text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+_STYLES = {RunState.FAILED: "red", RunState.MISSED: "yellow", RunState.DONE: "green"}
+_COLUMNS = (
+    *("bench", "entry", "due", "state", "verdict", "started", "ended", "duration"),
+    *("recordings", "pinned", "removed", "reason"),
+)
+
+
+class RunNotFoundError(HuddleError):
+    """No run has this recording or due time."""
+
+    is_usage_error = True
+
+
+def list_runs(source: Path, *, last: int | None, json: str | None, csv: str | None) -> None:
+    """List the runs of a service, the last ones only where `last` is given.
+
+    Raises
+    ------
+    NoServiceError, StoreError
+        If there is no database of runs, or it cannot be read.
+    """
+    check_places(json, csv)
+    runs = Place.of(source).runs()
+    runs = runs if last is None else runs[-last:]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("due (UTC)", "entry", "state", "verdict", "recording", "reason"):
+        table.add_column(name, overflow="fold")
+    for run in runs:
+        kept = ", ".join(run.parts) or "-"
+        notes = [*(["pinned"] if run.pinned else []), *(["removed"] if run.removed else [])]
+        table.add_row(
+            *(f"{run.due:%Y-%m-%d %H:%M}", run.entry, run.state, run.verdict or "-"),
+            kept + (f" ({', '.join(notes)})" if notes else ""),
+            run.reason,
+            style=_STYLES.get(run.state),
+        )
+    for_people(json, csv).print(table)
+    write_json(json, {"runs": [run.document() for run in runs]})
+    if csv is not None:
+        write_text(csv, csv_text(_COLUMNS, map(_cells, runs)))
+
+
+def _cells(run: Run) -> list[object]:
+    document = run.document() | {"recordings": " ".join(run.parts)}
+    return [document[name] for name in _COLUMNS]
+
+
+def pin_runs(source: Path, names: Sequence[str], *, pinned: bool) -> None:
+    """Keep runs whatever the limits of storage, or no longer.
+
+    Parameters
+    ----------
+    source : Path
+        Bench file or folder.
+    names : sequence of str
+        File names of recordings, or due times.
+    pinned : bool
+
+    Raises
+    ------
+    RunNotFoundError
+        If there is no such run; then none is changed.
+    """
+    place = Place.of(source)
+    runs = place.runs()
+    found = [run for name in names for run in _named(runs, name)]
+    place.store.pin([run.key for run in found], pinned=pinned)
+    for run in found:
+        for_people(None).print(f"run {run.name} {'is kept' if pinned else 'is no longer pinned'}")
+
+
+def _named(runs: Sequence[Run], name: str) -> list[Run]:
+    short = name.rpartition("/")[2]
+    found = [
+        run
+        for run in runs
+        if short in run.parts or name in {utc_text(run.due), f"{run.due:%Y-%m-%d %H:%M}"}
+    ]
+    if not found:
+        raise RunNotFoundError(
+            f"{name}: no such run; expected a recording or a due time as huddle runs shows them"
+        )
+    return found
+
+
+def verify_recordings(sources: Sequence[Path], *, json: str | None) -> None:
+    """Walk the checksums of recordings, or of all that services have kept.
+
+    Parameters
+    ----------
+    sources : sequence of path
+        Recordings, bench files or folders.
+    json : str or None
+
+    Raises
+    ------
+    RecordingError
+        If one is damaged or lost.
+    """
+    found = []
+    for path in _recordings(sources):
+        try:
+            report = verify(path)
+        except (HuddleError, OSError) as error:
+            state = str(error)
+        else:
+            damaged = [s.name for s in report.sensors if s.bad_blocks]
+            damaged += report.damaged_tables
+            state = f"damaged: {', '.join(damaged)}" if damaged else "intact"
+        found.append((path, state))
+        for_people(json).print(f"{path}: {state.removeprefix(f'{path}: ')}", soft_wrap=True)
+    bad = [path.name for path, state in found if state != "intact"]
+    write_json(
+        json,
+        {"recordings": [{"path": str(p), "intact": s == "intact", "state": s} for p, s in found]},
+    )
+    if bad:
+        raise RecordingError(f"{len(bad)} of {len(found)} recordings are damaged or lost")
+
+
+def _recordings(sources: Sequence[Path]) -> list[Path]:
+    found: list[Path] = []
+    for source in sources:
+        if source.suffix.lower() in {".h5", ".hdf5"}:
+            found.append(source)
+            continue
+        try:
+            place = Place.of(source)
+        except NoServiceError:
+            if not source.is_dir():
+                raise
+            found += sorted(source.glob("*.h5"))
+            continue
+        runs = [run for run in place.runs() if run.removed is None]
+        found += [place.folder / part for run in runs for part in run.parts]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,227 @@
+"""Finishes the recordings of a run: repairs them, estimates, stores and reports the result.
+
+A process of its own, so that neither memory nor a crash of a library concerns the service. It can
+be killed at any moment and started again: it changes nothing that it has changed before.
+
+``python -m tui.service.finish REQUEST`` takes a `Request` as JSON and prints an `Outcome` as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daq.bench.estimate_settings import OPTIONS, table_keys
+from daq.bench.model import EstimateTable
+from daq.errors import HuddleError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.recording.reader import Recording
+from daq.recording.repair import repair
+from daq.results.band_summary import band_of, channel_means, judged_method
+from daq.results.limits import judge
+from daq.results.sources import sources
+from daq.results.store import store_results
+from estimator.errors import BandError, EstimatorError
+from tui.output.console import finite, write_json
+from tui.output.json_document import document
+from tui.output.logs.lines import configure
+from tui.output.logs.options import LogFormat
+from tui.runs.estimate_settings import chosen
+from tui.service.run_state import BandNoise
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.estimation.snapshot import Snapshot
+
+
+_NOISE = tuple(field.name for field in fields(BandNoise))
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is to be finished.
+
+    Attributes
+    ----------
+    parts : list of str
+        Paths of the recordings of the run, in order.
+    options : dict
+        Settings that replace those of the bench file, as its table ``[estimate]`` has them.
+    report : str or None
+        ``html`` or ``pdf``.
+    bands : list of (float, float)
+        Further bands in Hz whose noise is wanted.
+    """
+
+    parts: list[str]
+    options: dict[str, Any]
+    report: str | None = None
+    bands: tuple[tuple[float, float], ...] = ()
+
+    def text(self) -> str:
+        """Return the request as an argument."""
+        return json.dumps(asdict(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of it: an error, or a verdict (empty without limits), and what is to be known."""
+
+    verdict: str = ""
+    notes: tuple[str, ...] = ()
+    noise: tuple[BandNoise, ...] = ()
+    error: str = ""
+
+    @classmethod
+    def of(cls, text: str) -> Outcome:
+        """Return the outcome that a process printed.
+
+        Raises
+        ------
+        ValueError
+            If it printed something else.
+        """
+        try:
+            found = json.loads(text)
+            noise = tuple(
+                BandNoise.of(*(each[name] for name in _NOISE)) for each in found.pop("noise")
+            )
+            return cls(noise=noise, notes=tuple(found.pop("notes")), **found)
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"no outcome: {error}") from None
+
+
+def options_table(wanted: Mapping[str, object]) -> dict[str, Any]:
+    """Return settings by field, None where not given, as the table ``[estimate]`` has them."""
+    keys = {field: key for key, field in table_keys().items()}
+    return {
+        keys[name]: OPTIONS[name].show(value) for name, value in wanted.items() if value is not None
+    }
+
+
+def finish(request: Request) -> Outcome:
+    """Repair, estimate, store, report.
+
+    Raises
+    ------
+    HuddleError, EstimatorError
+        If there is no result.
+    """
+    paths, notes = _repaired([Path(part) for part in request.parts])
+    table = EstimateTable.model_validate(request.options)
+    names = table_keys()
+    wanted = {names[key]: getattr(table, key) for key in table.model_fields_set}
+    with Recording.open(paths[-1]) as recording:
+        bench = recording.bench
+        about = {s.name: (s.model, s.serial_number) for s in recording.sensors}
+    settings = chosen(Settings.of(bench), **wanted)
+    paths = _long_enough(paths, settings.segment, notes)
+    snapshot = estimate(paths, settings)
+    last = paths[-1]
+    try:  # first into the recording, whatever becomes of other files
+        store_results(last, snapshot)
+    except HuddleError as error:
+        notes.append(f"the result is not in the recording: {error}")
+    found = judge(bench, snapshot, settings)
+    result = document(snapshot, settings, sources=sources(paths), verdict=found)
+    try:
+        write_json(str(last.with_suffix(".json")), result)
+    except OSError as error:
+        notes.append(f"the result is not in the JSON file: {error}")
+    if request.report is not None:
+        notes += _reported(snapshot, last, paths, settings, request.report)
+    noise = _noise(snapshot, settings, request.bands, about, notes)
+    return Outcome("" if found is None else str(found.verdict), tuple(notes), noise)
+
+
+def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Close what was left open; return the recordings that can be read, and what was found."""
+    good, notes, errors = [], [], []
+    for part in parts:
+        try:
+            if not repair(part).intact:
+                notes.append(f"{part.name}: damaged blocks are left out")
+        except HuddleError as error:
+            errors.append(str(error))
+        else:
+            good.append(part)
+    if not good:
+        raise NothingRecordedError("; ".join(errors) or "no recording")
+    return good, notes + errors
+
+
+class NothingRecordedError(HuddleError):
+    """No recording of the run can be read."""
+
+
+def _long_enough(paths: list[Path], segment: float, notes: list[str]) -> list[Path]:
+    """Return the recordings that hold a segment of every sensor, or all if none does."""
+    if len(paths) == 1:
+        return paths
+    found = []
+    for path in paths:
+        with Recording.open(path) as recording:
+            shortest = min(s.n_samples / s.sampling_rate for s in recording.sensors)
+        if shortest >= segment:
+            found.append(path)
+        else:
+            notes.append(f"{path.name}: shorter than one segment, and left out")
+    return found or paths
+
+
+def _reported(
+    snapshot: Snapshot, last: Path, paths: list[Path], settings: Settings, kind: str
+) -> list[str]:
+    from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
+
+    try:
+        write(snapshot, last.with_suffix(f".{kind}"), recordings=paths, settings=settings)
+    except (HuddleError, OSError) as error:
+        return [f"no report: {error}"]
+    return []
+
+
+def _noise(
+    snapshot: Snapshot,
+    settings: Settings,
+    bands: Sequence[tuple[float, float]],
+    about: Mapping[str, tuple[str, str]],
+    notes: list[str],
+) -> tuple[BandNoise, ...]:
+    method = judged_method(snapshot, settings)
+    if method not in snapshot.results:
+        return ()
+    found = []
+    for band in dict.fromkeys([band_of(settings, snapshot), *bands]):
+        try:
+            means = channel_means(snapshot.results[method], snapshot, settings, band)
+        except BandError as error:
+            notes.append(f"no noise for the history: {error}")
+            continue
+        for label, each in zip(snapshot.channels, means, strict=True):
+            values = (float(each.mean[0]), float(each.low[0]), float(each.high[0]))
+            model, serial_number = about.get(label.sensor, ("", ""))
+            own = (label.sensor, model, serial_number, label.channel, label.unit)
+            found.append(BandNoise(*own, method, float(band[0]), float(band[1]), *values))
+    return tuple(found)
+
+
+def main() -> None:
+    """Finish what the argument says; print the outcome."""
+    configure(style=LogFormat.JSON)
+    found = json.loads(sys.argv[1])
+    request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
+    try:
+        outcome = finish(request)
+    except (HuddleError, EstimatorError, OSError) as error:
+        outcome = Outcome(error=str(error) or type(error).__name__)
+    sys.stdout.write(json.dumps(finite(asdict(outcome))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Where a service keeps its things: found from its bench file, or from its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.drivers.bench_file import load
+from daq.errors import HuddleError
+from tui.service.store import NAME, RunStore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+    from tui.service.run_state import Run
+
+
+class NoServiceError(HuddleError):
+    """No service has kept a database of runs there."""
+
+    is_usage_error = True
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A folder with the runs of one bench, or of all that record there.
+
+    Attributes
+    ----------
+    folder : Path
+    bench : Bench or None
+        None where a folder was given.
+    """
+
+    folder: Path
+    bench: Bench | None
+
+    @classmethod
+    def of(cls, source: Path) -> Place:
+        """Return the place of a bench file or a folder of recordings.
+
+        Raises
+        ------
+        BenchFileError
+            If the bench file is faulty.
+        NoServiceError
+            If no service has been there.
+        """
+        bench = None if source.is_dir() else load(source)
+        folder = source if bench is None else bench.recording_directory
+        if not (folder / NAME).exists():
+            raise NoServiceError(
+                f"{folder / NAME}: does not exist; expected a bench file or a folder that huddle"
+                " serve has used"
+            )
+        return cls(folder, bench)
+
+    @property
+    def store(self) -> RunStore:
+        """The database."""
+        return RunStore(self.folder)
+
+    def runs(self) -> list[Run]:
+        """Return all runs of the place, by their time."""
+        return self.store.runs(None if self.bench is None else self.bench.name)
+
+
+def service_lock(bench: Bench) -> Path:
+    """Return the lock that the service of a bench holds."""
+    return bench.recording_directory / f".{file_name(bench.name)}.service"
+
+
+def file_name(name: str) -> str:
+    """Return the name of a bench as a part of a file name."""
+    return "".join(c if c.isalnum() or c in "-_." else "-" for c in name)

@@ -1,0 +1,201 @@
+"""The life of a scheduled run, as one state machine.
+
+::
+
+    due ──▶ recording ──▶ estimating ──▶ done
+     │          │              │
+     ▼          └──────────────┴───────▶ failed
+    missed
+
+A run is written to the database before anything is done in its new state. So whatever ends the
+service, the database says what is left to do: a run in `RECORDING` has its recorder awaited, or the
+rest of its window recorded; one in `ESTIMATING` is estimated again, which changes nothing where it
+was estimated before.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from typing import Any
+
+from daq.errors import HuddleError
+
+
+class RunState(StrEnum):
+    """Where a run is in its life."""
+
+    DUE = "due"
+    """Planned, or waiting for another run to end."""
+    RECORDING = "recording"
+    ESTIMATING = "estimating"
+    """Recorded, and being repaired, estimated and reported."""
+    DONE = "done"
+    """Has its result."""
+    FAILED = "failed"
+    """Has no result; the reason says why."""
+    MISSED = "missed"
+    """Was not started; the reason says why."""
+
+
+NEXT: dict[RunState, frozenset[RunState]] = {
+    RunState.DUE: frozenset({RunState.RECORDING, RunState.MISSED}),
+    RunState.RECORDING: frozenset({RunState.ESTIMATING, RunState.FAILED}),
+    RunState.ESTIMATING: frozenset({RunState.DONE, RunState.FAILED}),
+    RunState.DONE: frozenset(),
+    RunState.FAILED: frozenset(),
+    RunState.MISSED: frozenset(),
+}
+UNFINISHED = (RunState.RECORDING, RunState.ESTIMATING)
+
+
+class WrongStateError(HuddleError):
+    """A run cannot go from its state to another; an error of the program."""
+
+
+@dataclass(frozen=True, slots=True)
+class BandNoise:
+    """Mean noise of one channel in one band, as one run found it; PSD in unit²/Hz.
+
+    ``low`` and ``high`` bound the 95 % interval.
+    """
+
+    sensor: str
+    model: str
+    serial_number: str
+    channel: str
+    unit: str
+    method: str
+    low_hz: float
+    high_hz: float
+    psd: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, *values: Any) -> BandNoise:  # noqa: ANN401 - of the fields, in order
+        """Return it from the fields in order; numbers that are None are not known."""
+        numbers = (math.nan if value is None else float(value) for value in values[-3:])
+        return cls(*values[:-3], *numbers)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One scheduled run.
+
+    Attributes
+    ----------
+    bench, entry : str
+        Names of the bench, and of the entry of its schedule.
+    due : datetime
+        UTC.
+    state : RunState
+    reason : str
+        Why it failed, was missed, or ended early; what was done about it.
+    duration : float
+        Length of its window in s; with `target_cov` the longest.
+    target_cov : float or None
+    queue : bool
+        Whether it waits for a run that still records.
+    started, ended : datetime or None
+        UTC; when recording began, and when the last state was reached.
+    parts : tuple of str
+        File names of its recordings: more than one where it was interrupted.
+    verdict : str
+        On the limits of the bench file; empty where it has none.
+    attempts : int
+        Number of estimates begun.
+    pinned : bool
+        Whether it must be kept.
+    removed : datetime or None
+        When its files were removed.
+    untold : tuple of str
+        Hooks that have not been carried out.
+    """
+
+    bench: str
+    entry: str
+    due: datetime
+    duration: float
+    target_cov: float | None = None
+    queue: bool = False
+    state: RunState = RunState.DUE
+    reason: str = ""
+    started: datetime | None = None
+    ended: datetime | None = None
+    parts: tuple[str, ...] = ()
+    verdict: str = ""
+    attempts: int = 0
+    pinned: bool = False
+    removed: datetime | None = None
+    untold: tuple[str, ...] = ()
+    noise: tuple[BandNoise, ...] = field(default=(), compare=False)
+
+    @property
+    def key(self) -> str:
+        """What no other run has: bench, entry and time."""
+        return f"{self.bench}/{self.entry}/{utc_text(self.due)}"
+
+    @property
+    def name(self) -> str:
+        """The run in messages."""
+        return f"{self.entry} of {self.due:%Y-%m-%d %H:%M %Z}"
+
+    @property
+    def window_end(self) -> datetime | None:
+        """When its recording is to end; None before it has begun."""
+        return None if self.started is None else self.started + timedelta(seconds=self.duration)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has reached its last state."""
+        return not NEXT[self.state]
+
+    def to(self, state: RunState, **changes: Any) -> Run:  # noqa: ANN401 - fields
+        """Return the run in its next state.
+
+        Raises
+        ------
+        WrongStateError
+            If that state does not follow.
+        """
+        if state not in NEXT[self.state]:
+            raise WrongStateError(f"run {self.name}: {state} cannot follow {self.state}")
+        return replace(self, state=state, **changes)
+
+    def because(self, reason: str) -> Run:
+        """Return the run with a further reason; each is said once."""
+        known = self.reason.split("; ") if self.reason else []
+        return self if reason in known else replace(self, reason="; ".join([*known, reason]))
+
+    def document(self) -> dict[str, Any]:
+        """Return the run as JSON (docs/service.md)."""
+        return {
+            "bench": self.bench,
+            "entry": self.entry,
+            "due": utc_text(self.due),
+            "state": self.state,
+            "reason": self.reason,
+            "verdict": self.verdict or None,
+            "started": utc_text(self.started),
+            "ended": utc_text(self.ended),
+            "duration": self.duration,
+            "target_cov": self.target_cov,
+            "recordings": list(self.parts),
+            "pinned": self.pinned,
+            "removed": utc_text(self.removed),
+        }
+
+
+def utc_text(moment: datetime | None) -> str | None:
+    """Return an instant as ISO 8601 in UTC."""
+    if moment is None:
+        return None
+    return moment.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def from_text(text: str | None) -> datetime | None:
+    """Return the instant of `utc_text`."""
+    return None if text is None else datetime.fromisoformat(text)

@@ -1,0 +1,351 @@
+"""The service: starts what is due, takes up what is unfinished, and keeps the database.
+
+Theory of operation
+-------------------
+One task waits for due times, one records windows one after another, one estimates what has been
+recorded. So a run is recorded while the one before is estimated. Every change of a run is written
+to the database before it is acted upon; a change that the disk does not take is kept and written
+later. Nothing but an error of the program ends the service.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import replace
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+from daq.errors import HuddleError
+from tui.service.finish import Request
+from tui.service.hooks import events_of
+from tui.service.planning import GRACE, missed_runs, next_runs
+from tui.service.run_state import Run, RunState
+from tui.service.store import StoreError
+from tui.service.window import Window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from datetime import datetime
+    from typing import Any
+
+    from daq.bench.model import Bench
+    from tui.service.clock import Clock
+    from tui.service.steps import Steps
+    from tui.service.store import RunStore
+
+_LOGGER = logging.getLogger(__name__)
+LONGEST_SLEEP = 30.0
+"""Seconds between two readings of the clock, which may be set."""
+MAX_ATTEMPTS = 3
+"""Estimates of a run that may end without an outcome: one that kills its process is given up."""
+_LEVELS = {RunState.FAILED: logging.ERROR, RunState.MISSED: logging.WARNING}
+BUSY = "the run before was still recording"
+OFF = "the computer was off, asleep or without the service"
+
+
+class Service:
+    """Runs the schedule of one bench.
+
+    Parameters
+    ----------
+    bench : Bench
+    steps : callable
+        Makes the `Steps` of a bench.
+    store : RunStore
+    clock : Clock
+    options : mapping
+        Settings of the estimate that replace those of the bench file, as its table has them.
+    reload : callable
+        Reads the bench file again when asked to; raises a HuddleError where it is faulty.
+    tell : callable
+        Receives every run that has changed its state.
+    tidy : callable
+        Removes what need not be kept; called before and after runs.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        *,
+        steps: Callable[[Bench], Steps],
+        store: RunStore,
+        clock: Clock,
+        options: Mapping[str, Any],
+        reload: Callable[[], Bench],
+        tell: Callable[[Run], None] = lambda _: None,
+        tidy: Callable[[Bench], None] = lambda _: None,
+    ) -> None:
+        self.bench = bench
+        self._make_steps, self._steps = steps, steps(bench)
+        self._store, self._clock, self._options = store, clock, options
+        self._reload, self._tell, self._tidy = reload, tell, tidy
+        self.stop = asyncio.Event()
+        self._wake = asyncio.Event()
+        self._wants_reload = False
+        self._planned: dict[str, Run] = {}
+        self._known: set[str] = set()
+        self._unsaved: dict[str, Run] = {}
+        self._windows: asyncio.Queue[Run] = asyncio.Queue()
+        self._estimates: asyncio.Queue[Run] = asyncio.Queue()
+        self.recording: Run | None = None
+        self.window: Window | None = None
+
+    def request_stop(self) -> None:
+        """End: recordings are closed, and their runs taken up by the next service."""
+        self.stop.set()
+        self._wake.set()
+
+    def request_reload(self) -> None:
+        """Read the bench file again."""
+        self._wants_reload = True
+        self._wake.set()
+
+    @property
+    def next_run(self) -> Run | None:
+        """The run that is due next."""
+        return min(self._planned.values(), key=lambda run: run.due, default=None)
+
+    @property
+    def waiting(self) -> tuple[int, int]:
+        """Numbers of runs that wait to be recorded, and to be estimated."""
+        return self._windows.qsize(), self._estimates.qsize()
+
+    async def run(self) -> None:
+        """Serve until a stop is requested.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be used at the start.
+        """
+        self._take_up()
+        recorder = asyncio.create_task(self._record_windows())
+        estimator = asyncio.create_task(self._estimate_runs())
+        workers = [asyncio.create_task(self._wait_for_runs()), recorder, estimator]
+        try:
+            # One that ends has been asked to, or has failed.
+            done, _ = await asyncio.wait(workers, return_when=asyncio.FIRST_COMPLETED)
+            self.request_stop()
+            if self.recording is not None:
+                await asyncio.wait({recorder})
+            for task in done:
+                task.result()
+        finally:
+            for task in workers:
+                task.cancel()
+            await asyncio.gather(*workers, return_exceptions=True)
+            self._write_unsaved()
+
+    def _take_up(self) -> None:
+        """Continue what an earlier service has left, and report what it has missed."""
+        now = self._clock.now()
+        runs = self._store.runs(self.bench.name)
+        self._known = {run.key for run in runs if run.state is not RunState.DUE}
+        for run in runs:
+            if run.state is RunState.RECORDING:
+                _LOGGER.info("run %s is taken up: it was being recorded", run.name)
+                self._windows.put_nowait(run)
+            elif run.state is RunState.ESTIMATING:
+                _LOGGER.info("run %s is taken up: it was being estimated", run.name)
+                self._estimates.put_nowait(run)
+            elif run.untold:
+                self._tell(run)
+        planned = [run for run in runs if run.state is RunState.DUE]
+        for run in planned:
+            if run.due < now - GRACE:
+                self._miss(run, OFF)
+            else:
+                self._planned[run.key] = run
+        if planned and min(run.due for run in planned) < now - GRACE:
+            self._miss_all(min(run.due for run in planned), now)
+        self._plan()
+
+    def _plan(self) -> None:
+        """Have the next run of every entry in the database, and no other."""
+        now = self._clock.now()
+        runs = {
+            run.key: run
+            for run in next_runs(self.bench, now - timedelta(microseconds=1), self._known)
+        }
+        for key in [key for key in self._planned if key not in runs]:
+            run = self._planned.pop(key)
+            if run.due > now:
+                try:
+                    self._store.forget_planned(run)
+                except StoreError as error:
+                    _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
+            else:  # it became due while the bench file was read
+                runs[key] = run
+        for key, run in runs.items():
+            if key not in self._planned:
+                self._planned[key] = run
+                self._save(run)
+
+    async def _wait_for_runs(self) -> None:
+        while not self.stop.is_set():
+            self._wake.clear()
+            if self._wants_reload:
+                self._load_again()
+            self._write_unsaved()
+            run, now = self.next_run, self._clock.now()
+            left = LONGEST_SLEEP if run is None else (run.due - now).total_seconds()
+            if run is None or left > 0:
+                await self._clock.sleep(min(left, LONGEST_SLEEP), self._wake)
+                continue
+            del self._planned[run.key]
+            if now - run.due > GRACE:
+                self._miss(run, OFF)
+                self._miss_all(run.due, now)
+            else:
+                self._begin(run)
+            self._plan()
+
+    def _begin(self, run: Run) -> None:
+        """Have a run recorded, unless another one is in its way for too long."""
+        self._known.add(run.key)
+        if not run.queue and self._is_busy_beyond(run.due + GRACE):
+            self._miss(run, BUSY)
+        else:
+            self._windows.put_nowait(run)
+
+    def _is_busy_beyond(self, moment: datetime) -> bool:
+        """Whether another window is recorded, or waits, for longer than this."""
+        if self._windows.qsize():
+            return True
+        end = None if self.recording is None else self.recording.window_end
+        return end is not None and end > moment
+
+    async def _record_windows(self) -> None:
+        while True:
+            run = await self._windows.get()
+            if self.stop.is_set():
+                return
+            now = self._clock.now()
+            if run.state is RunState.DUE:
+                self._tidy(self.bench)
+                window = self._window()
+                reason = self._obstacle(run, now, window)
+                if reason:
+                    self._miss(run, reason)
+                    continue
+                run = run.to(RunState.RECORDING, started=now)
+                self._note(run)
+            else:
+                window = self._window()
+            self.recording, self.window = run, window
+            try:
+                run = await window.record(run)
+            finally:
+                self.recording = self.window = None
+            if run.state is RunState.RECORDING:
+                return
+            self._note(run)
+            if run.state is RunState.ESTIMATING:
+                self._estimates.put_nowait(run)
+
+    def _obstacle(self, run: Run, now: datetime, window: Window) -> str:
+        """Return why a run cannot start, or nothing."""
+        if not run.queue and now - run.due > GRACE:
+            return BUSY
+        free, least = window.free(), self.bench.storage.min_free
+        if free is not None and free < least:
+            return f"{free / 1e6:.0f} MB of free space; expected at least {least / 1e6:.0f} MB"
+        return ""
+
+    def _window(self) -> Window:
+        return Window(
+            steps=self._steps,
+            clock=self._clock,
+            stop=self.stop,
+            save=self._save,
+            folder=self.bench.recording_directory,
+            min_free=self.bench.storage.min_free,
+            shortest=2 * self.bench.estimate.segment,
+        )
+
+    async def _estimate_runs(self) -> None:
+        while True:
+            run = await self._estimates.get()
+            while run.state is RunState.ESTIMATING:
+                run = await self._estimated(run)
+            self._note(run)
+            for part in run.parts:
+                self._steps.release(part)
+            self._tidy(self.bench)
+
+    async def _estimated(self, run: Run) -> Run:
+        if run.attempts >= MAX_ATTEMPTS:
+            return self._failed(run, f"{run.attempts} estimates ended without an outcome")
+        run = replace(run, attempts=run.attempts + 1)
+        self._save(run)
+        folder = self.bench.recording_directory
+        request = Request(
+            [str(folder / part) for part in run.parts],
+            dict(self._options),
+            self.bench.recording.report,
+            self.bench.history.bands,
+        )
+        try:
+            outcome = await self._steps.finish(request)
+        except (HuddleError, OSError) as error:
+            _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
+            return run.because(str(error))
+        for note in outcome.notes:
+            run = run.because(note)
+        if outcome.error:
+            return self._failed(run, outcome.error)
+        return run.to(
+            RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=self._clock.now()
+        )
+
+    def _failed(self, run: Run, reason: str) -> Run:
+        return run.because(reason).to(RunState.FAILED, ended=self._clock.now())
+
+    def _miss(self, run: Run, reason: str) -> None:
+        self._known.add(run.key)
+        self._note(run.to(RunState.MISSED, ended=self._clock.now()).because(reason))
+
+    def _miss_all(self, after: datetime, now: datetime) -> None:
+        """Report everything that was due between an instant and now as missed."""
+        runs, more = missed_runs(self.bench, after, now - GRACE, self._known.__contains__)
+        for number, run in enumerate(runs, 1):
+            others = f"; the same for all others until {now:%Y-%m-%d %H:%M}"
+            self._miss(run, OFF + (others if more and number == len(runs) else ""))
+
+    def _note(self, run: Run) -> None:
+        """Write a run that has changed its state, log it, and have it told."""
+        run = replace(run, untold=events_of(run, self.bench.hooks))
+        self._save(run)
+        verdict = f", verdict {run.verdict}" if run.verdict else ""
+        recordings = f": {', '.join(run.parts)}" if run.parts else ""
+        _LOGGER.log(
+            _LEVELS.get(run.state, logging.INFO),
+            "run %s %s%s%s%s",
+            *(run.name, run.state, verdict, recordings, run.reason and f" ({run.reason})"),
+            extra=run.document() | {"run": run.state},
+        )
+        self._tell(run)
+
+    def _save(self, run: Run) -> None:
+        self._unsaved.pop(run.key, None)
+        try:
+            self._store.save(run)
+        except StoreError as error:
+            _LOGGER.error("%s; it is tried again", error)  # noqa: TRY400 - its message says all
+            self._unsaved[run.key] = run
+
+    def _write_unsaved(self) -> None:
+        for run in list(self._unsaved.values()):
+            self._save(run)
+
+    def _load_again(self) -> None:
+        self._wants_reload = False
+        try:
+            bench = self._reload()
+        except HuddleError as error:
+            _LOGGER.error("the bench file is not taken; the old one stays: %s", error)  # noqa: TRY400
+            return
+        self.bench, self._steps = bench, self._make_steps(bench)
+        self._plan()
+        _LOGGER.info("the bench file was read again")

@@ -1,0 +1,83 @@
+"""What a service does at this moment, as seen from another process."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import sys
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+from daq.recording.control import ask
+from tui.service.locks import is_held
+from tui.service.places import service_lock
+from tui.service.run_state import UNFINISHED, RunState, utc_text
+
+if TYPE_CHECKING:
+    from datetime import datetime
+    from pathlib import Path
+
+    from daq.bench.model import Bench
+    from tui.service.run_state import Run
+
+_TIME_ERROR = 5
+"""Answer of ``adjtimex`` where nothing keeps the clock right."""
+
+
+def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, Any]:
+    """Return the status of the service of a bench as JSON (docs/service.md).
+
+    Parameters
+    ----------
+    bench : Bench
+    runs : list of Run
+        Of the bench, by their time.
+    now : datetime
+        UTC.
+    """
+    folder = bench.recording_directory
+    by_state = {state: [run for run in runs if run.state is state] for state in RunState}
+    recording = by_state[RunState.RECORDING][:1]
+    planned = by_state[RunState.DUE]
+    over = [run for run in runs if run.is_over]
+    return {
+        "bench": bench.name,
+        "running": is_held(service_lock(bench)),
+        "recording": _recording(recording[0], folder) if recording else None,
+        "estimating": [run.document() for run in by_state[RunState.ESTIMATING]],
+        "waiting": [run.document() for run in planned if run.due <= now],
+        "next": next((run.document() for run in planned if run.due > now), None),
+        "last": max(over, key=lambda run: run.due).document() if over else None,
+        "unfinished": sum(run.state in UNFINISHED for run in runs),
+        "untold": sum(len(run.untold) for run in over),
+        "disk": _disk(folder, bench.storage.min_free),
+        "clock": {"utc": utc_text(now), "synchronised": clock_is_synchronised()},
+    }
+
+
+def _recording(run: Run, folder: Path) -> dict[str, Any]:
+    found = run.document() | {"ends": utc_text(run.window_end), "elapsed": None, "sensors": {}}
+    if run.parts:
+        try:
+            answer = ask(folder / run.parts[-1], "status")
+        except (HuddleError, OSError, ValueError):
+            return found  # it starts or ends just now
+        found |= {"elapsed": answer.get("elapsed"), "sensors": answer.get("sensors", {})}
+    return found
+
+
+def _disk(folder: Path, least: int) -> dict[str, Any]:
+    usage = shutil.disk_usage(folder)
+    return {"free_bytes": usage.free, "total_bytes": usage.total, "min_free_bytes": least}
+
+
+def clock_is_synchronised() -> bool | None:
+    """Return whether the kernel knows of something that keeps the clock right; None if unknown."""
+    if sys.platform != "linux":
+        return None
+    try:
+        timex = ctypes.create_string_buffer(512)  # modes = 0: only asks
+        state = ctypes.CDLL(None).adjtimex(timex)
+    except (OSError, AttributeError):
+        return None
+    return None if state < 0 else state != _TIME_ERROR

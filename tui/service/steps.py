@@ -1,0 +1,337 @@
+"""What the service starts: recorders, those that watch the precision, and estimates.
+
+Each is a process of its own. A recorder survives the service, whose successor finds it by the lock
+beside its recording.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from daq.acquisition.recorder import recording_path
+from daq.errors import HuddleError, RecordingError
+from daq.protocols.block import HostTime
+from daq.python_process import python_command
+from daq.recording.control import ask
+from daq.recording.reader import Recording
+from daq.recording.storage.locking import is_being_written
+from tui.runs.child_log import ChildLog
+from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
+from tui.service.finish import Outcome, Request
+from tui.service.locks import Lock, is_held, kill_holder
+
+if TYPE_CHECKING:
+    from asyncio.subprocess import Process
+    from collections.abc import Iterator
+    from datetime import datetime
+
+    from daq.bench.model import Bench
+
+POLL = 0.2
+"""Seconds between looks at a process."""
+_LONG = 60.0
+
+
+class Recorder(Protocol):
+    """A recorder that runs, whoever started it."""
+
+    async def ends_within(self, seconds: float) -> bool:
+        """Wait this long, or until it has ended; return whether it has."""
+        ...
+
+    async def progress(self) -> float | None:
+        """Return the seconds that are safe on disk, or None where it does not answer."""
+        ...
+
+    async def stop(self) -> None:
+        """Let it close its recording, and wait for its end."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once."""
+        ...
+
+    def failure(self) -> str:
+        """Return why it failed; empty where it did not."""
+        ...
+
+
+class Steps(Protocol):
+    """What the service needs done, by processes or in a test."""
+
+    def new_part(self, at: datetime) -> str:
+        """Take a file name for a new recording."""
+        ...
+
+    def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
+        """Start a recorder."""
+        ...
+
+    def running(self, part: str, target_cov: float | None) -> Recorder | None:
+        """Return the recorder of a recording, if one runs."""
+        ...
+
+    async def finish(self, request: Request) -> Outcome:
+        """Estimate the recordings of a run."""
+        ...
+
+    def release(self, part: str) -> None:
+        """Give back what `new_part` took, when a run is over."""
+        ...
+
+
+class ProcessSteps:
+    """Starts processes of ``huddle``.
+
+    Parameters
+    ----------
+    bench : Bench
+        Where recordings go and by what names.
+    bench_path : Path
+        Bench file for recorders.
+    """
+
+    def __init__(self, bench: Bench, bench_path: Path) -> None:
+        self._bench, self._bench_path = bench, bench_path
+        self._folder = bench.recording_directory
+
+    def new_part(self, at: datetime) -> str:
+        """Take a file name that no other service has.
+
+        Raises
+        ------
+        RecordingError
+            If the folder cannot be written.
+        """
+        first = recording_path(self._bench, HostTime(0, round(at.timestamp() * 1e9)))
+        try:
+            first.parent.mkdir(parents=True, exist_ok=True)
+            for out in _numbered(first):
+                with contextlib.suppress(FileExistsError):
+                    _mark(out).touch(mode=0o600, exist_ok=False)
+                    if not out.exists():
+                        return out.name
+                    _mark(out).unlink()
+        except OSError as error:
+            raise RecordingError(f"{first.parent}: cannot be written: {error.strerror}") from error
+        raise AssertionError
+
+    def start(self, part: str, seconds: float, target_cov: float | None) -> Recorder:
+        """Start a recorder, and what stops it at a precision.
+
+        Raises
+        ------
+        RecordingError, OSError
+            If it cannot be started.
+        """
+        out = self._folder / part
+        lock = Lock.take(_mark(out))
+        if lock is None:
+            raise RecordingError(f"{out}: another recorder of the service is writing it")
+        try:
+            process = RecorderProcess(self._bench_path, out, duration=seconds, lock=lock.descriptor)
+            lock.name(process.pid)
+        finally:
+            lock.release()
+        return _OwnRecorder(process, None if target_cov is None else _stopper(out, target_cov))
+
+    def running(self, part: str, target_cov: float | None) -> Recorder | None:
+        """Return the recorder of a recording, if one runs."""
+        found = _FoundRecorder(self._folder / part, target_cov)
+        return found if found.is_running else None
+
+    async def finish(self, request: Request) -> Outcome:
+        """Estimate in a process; killed if this task is cancelled.
+
+        Raises
+        ------
+        FinishFailedError
+            If the process ended without an outcome.
+        """
+        mark = _mark(Path(request.parts[-1]))
+        lock = await _taken(mark)  # one of an earlier service may still run
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *python_command("tui.service.finish", request.text()),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                pass_fds=() if sys.platform == "win32" else (lock.descriptor,),
+            )
+        finally:
+            lock.release()
+        return await _outcome(process)
+
+    def release(self, part: str) -> None:
+        """Remove the mark of a recording."""
+        with contextlib.suppress(OSError):
+            _mark(self._folder / part).unlink(missing_ok=True)
+
+
+class FinishFailedError(HuddleError):
+    """The process that estimates ended without an outcome."""
+
+
+async def _outcome(process: Process) -> Outcome:
+    log = ChildLog("the estimate")
+    try:
+        out, errors = await process.communicate()
+    except BaseException:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+        raise
+    if errors:
+        log.feed(errors.rstrip() + b"\n")
+    with contextlib.suppress(ValueError):
+        return Outcome.of(out.decode(errors="replace"))
+    code = process.returncode or 0
+    how = f"was killed (signal {-code})" if code < 0 else f"ended with exit code {code}"
+    said = f": {log.errors[-1]}" if log.errors else ""
+    raise FinishFailedError(f"the estimate {how}{said}")
+
+
+class _OwnRecorder:
+    """A recorder that this service has started."""
+
+    def __init__(self, process: RecorderProcess, stopper: RecorderStopper | None) -> None:
+        self._process, self._stopper = process, stopper
+        self._code_error = ""
+
+    async def ends_within(self, seconds: float) -> bool:
+        ended = await asyncio.to_thread(self._process.ends_within, seconds)
+        if ended:
+            self._close()
+        return ended
+
+    async def progress(self) -> float | None:
+        return await _progress(self._process.out)
+
+    async def stop(self) -> None:
+        await asyncio.to_thread(self._process.stop)
+        self._close()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._close()
+
+    def failure(self) -> str:
+        return self._code_error
+
+    def _close(self) -> None:
+        if self._stopper is not None:
+            self._stopper.end()
+            self._stopper = None
+        try:
+            self._process.check()
+        except RecorderFailedError as error:
+            self._code_error = str(error).replace("\n", "; ")
+        self._process.close()
+
+
+class _FoundRecorder:
+    """A recorder that a service before this one has started."""
+
+    def __init__(self, out: Path, target_cov: float | None) -> None:
+        self._out, self._target_cov = out, target_cov
+        self._stopper: RecorderStopper | None = None
+
+    @property
+    def is_running(self) -> bool:
+        return is_held(_mark(self._out)) or (self._out.exists() and is_being_written(self._out))
+
+    async def ends_within(self, seconds: float) -> bool:
+        if self._stopper is None and self._target_cov is not None and self._out.exists():
+            self._stopper = _stopper(self._out, self._target_cov)
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + seconds
+        while self.is_running:
+            if loop.time() >= deadline:
+                return False
+            await asyncio.sleep(min(POLL, seconds))
+        self._end()
+        return True
+
+    async def progress(self) -> float | None:
+        return await _progress(self._out)
+
+    async def stop(self) -> None:
+        with contextlib.suppress(HuddleError):
+            await asyncio.to_thread(ask, self._out, "stop")
+        while not await self.ends_within(_LONG):
+            pass
+
+    def kill(self) -> None:
+        kill_holder(_mark(self._out))
+        self._end()
+
+    def failure(self) -> str:
+        try:
+            with Recording.open(self._out) as recording:
+                closed = recording.closed
+        except (HuddleError, OSError) as error:
+            return str(error)
+        return "" if closed else "the recorder ended without closing its recording"
+
+    def _end(self) -> None:
+        if self._stopper is not None:
+            self._stopper.end()
+            self._stopper = None
+
+
+class RecorderStopper:
+    """The process that stops a recorder when the noise has its precision."""
+
+    def __init__(self, out: Path, target_cov: float) -> None:
+        import subprocess  # noqa: PLC0415 - seldom needed
+
+        self._process = subprocess.Popen(
+            python_command("tui.service.until_cov", json.dumps([str(out), target_cov])),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def end(self) -> None:
+        """End the process, which has nothing to lose."""
+        self._process.kill()
+        self._process.wait()
+
+
+def _stopper(out: Path, target_cov: float) -> RecorderStopper:
+    return RecorderStopper(out, target_cov)
+
+
+async def _taken(mark: Path) -> Lock:
+    """Take a lock as soon as it is free."""
+    while True:
+        lock = Lock.take(mark)
+        if lock is not None:
+            return lock
+        await asyncio.sleep(POLL)
+
+
+async def _progress(out: Path) -> float | None:
+    try:
+        answer = await asyncio.to_thread(ask, out, "status")
+        return float(answer["elapsed"])
+    except (HuddleError, OSError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _mark(out: Path) -> Path:
+    """Return the lock beside a recording."""
+    return out.with_name(f".{out.name}.run")
+
+
+def _numbered(first: Path) -> Iterator[Path]:
+    yield first
+    number = 2
+    while True:
+        yield first.with_stem(f"{first.stem}-{number}")
+        number += 1

@@ -1,0 +1,242 @@
+"""The database of runs: one row a run, and the noise that it found.
+
+SQLite in the folder of the recordings, readable by its owner alone. Each change is one transaction
+that survives a power cut. A connection lasts for one operation, so that a disk that comes back is
+used again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sqlite3
+from dataclasses import astuple, fields
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+from daq.recording.storage.names import PRIVATE
+from tui.service.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+NAME = "runs.sqlite"
+VERSION = 1
+_BUSY = 10.0
+"""Seconds that a change waits for another program's."""
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS runs (
+    key TEXT PRIMARY KEY, bench TEXT NOT NULL, entry TEXT NOT NULL, due TEXT NOT NULL,
+    state TEXT NOT NULL, reason TEXT NOT NULL, verdict TEXT NOT NULL, started TEXT, ended TEXT,
+    duration REAL NOT NULL, target_cov REAL, queue INTEGER NOT NULL, parts TEXT NOT NULL,
+    attempts INTEGER NOT NULL, pinned INTEGER NOT NULL, removed TEXT, untold TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS runs_by_due ON runs (bench, due);
+CREATE TABLE IF NOT EXISTS noise (
+    run TEXT NOT NULL REFERENCES runs (key), sensor TEXT, model TEXT, serial_number TEXT,
+    channel TEXT, unit TEXT, method TEXT, low_hz REAL, high_hz REAL, psd REAL, low REAL, high REAL);
+CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
+"""
+_COLUMNS = (
+    *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
+    *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
+)
+_NOISE = tuple(field.name for field in fields(BandNoise))
+
+
+class StoreError(HuddleError):
+    """The database of runs cannot be read or written."""
+
+
+class RunStore:
+    """The runs of all benches that record into one folder.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / NAME
+
+    def save(self, run: Run) -> None:
+        """Write a run in its present state, with the noise that it has found.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be written; it stays as it was.
+        """
+        row = _row(run)
+        places = ", ".join(f":{name}" for name in _COLUMNS)
+        # What a person has pinned meanwhile stays pinned.
+        updates = ", ".join(f"{n} = :{n}" for n in _COLUMNS if n not in {"key", "pinned"})
+        with self._changed() as database:
+            database.execute(
+                f"INSERT INTO runs ({', '.join(_COLUMNS)}) VALUES ({places})"  # noqa: S608
+                f" ON CONFLICT (key) DO UPDATE SET {updates}",
+                row,
+            )
+            if run.noise:
+                database.execute("DELETE FROM noise WHERE run = ?", (run.key,))
+                database.executemany(
+                    f"INSERT INTO noise (run, {', '.join(_NOISE)})"  # noqa: S608
+                    f" VALUES (?{', ?' * len(_NOISE)})",
+                    [(run.key, *astuple(each)) for each in run.noise],
+                )
+
+    def pin(self, keys: Sequence[str], *, pinned: bool) -> None:
+        """Keep these runs whatever the limits of storage, or no longer."""
+        with self._changed() as database:
+            database.executemany(
+                "UPDATE runs SET pinned = ? WHERE key = ?", [(int(pinned), key) for key in keys]
+            )
+
+    def set_untold(self, run: Run, untold: Sequence[str]) -> None:
+        """Write which hooks of a run have still to be carried out."""
+        with self._changed() as database:
+            database.execute(
+                "UPDATE runs SET untold = ? WHERE key = ?", (json.dumps(list(untold)), run.key)
+            )
+
+    def set_removed(self, run: Run, when: datetime) -> None:
+        """Write that the files of a run were removed."""
+        with self._changed() as database:
+            database.execute("UPDATE runs SET removed = ? WHERE key = ?", (utc_text(when), run.key))
+
+    def forget_planned(self, run: Run) -> None:
+        """Remove a run that is no longer in the schedule, unless it has begun."""
+        with self._changed() as database:
+            database.execute(
+                "DELETE FROM runs WHERE key = ? AND state = ?", (run.key, RunState.DUE)
+            )
+
+    def runs(self, bench: str | None = None, *states: RunState) -> list[Run]:
+        """Return runs by the time at which they were due, with their noise: of one bench, or all.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be read.
+        """
+        where, values = [], []
+        if bench is not None:
+            where.append("bench = ?")
+            values.append(bench)
+        if states:
+            where.append(f"state IN ({', '.join('?' * len(states))})")
+            values += list(states)
+        condition = f" WHERE {' AND '.join(where)}" if where else ""
+        if not self.path.exists():
+            return []
+        with self._opened() as database:
+            rows = database.execute(
+                f"SELECT {', '.join(_COLUMNS)} FROM runs{condition} ORDER BY due, entry",  # noqa: S608
+                values,
+            ).fetchall()
+            noise: dict[str, list[BandNoise]] = {}
+            for key, *values_of_row in database.execute(
+                f"SELECT run, {', '.join(_NOISE)} FROM noise"  # noqa: S608
+                f" WHERE run IN (SELECT key FROM runs{condition}) ORDER BY rowid",
+                values,
+            ):
+                noise.setdefault(key, []).append(BandNoise.of(*values_of_row))
+        return [
+            _run(dict(zip(_COLUMNS, row, strict=True)), tuple(noise.get(row[0], ())))
+            for row in rows
+        ]
+
+    def unfinished(self, bench: str) -> list[Run]:
+        """Return the runs that something has kept from their end."""
+        return self.runs(bench, *UNFINISHED)
+
+    @contextlib.contextmanager
+    def _changed(self) -> Iterator[sqlite3.Connection]:
+        with self._opened() as database:
+            database.execute("BEGIN IMMEDIATE")
+            yield database
+            database.execute("COMMIT")
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        try:
+            if not self.path.exists():
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                with contextlib.suppress(FileExistsError):
+                    os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
+            # Closing undoes what was not committed.
+            with contextlib.closing(
+                sqlite3.connect(self.path, timeout=_BUSY, isolation_level=None)
+            ) as database:
+                database.execute("PRAGMA synchronous = EXTRA")
+                self._prepare(database)
+                yield database
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(
+                f"{self.path}: the database of runs cannot be used ({error}); if it is damaged,"
+                " move it away: recordings are not affected"
+            ) from error
+
+    def _prepare(self, database: sqlite3.Connection) -> None:
+        version = int(database.execute("PRAGMA user_version").fetchone()[0])
+        if version > VERSION:
+            raise StoreError(
+                f"{self.path}: written by a newer version of huddle (format {version}); this"
+                f" version reads formats up to {VERSION}: update huddle"
+            )
+        if version < VERSION:
+            database.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION};")
+            database.execute("COMMIT")
+
+
+def _row(run: Run) -> dict[str, Any]:
+    return {
+        "key": run.key,
+        "bench": run.bench,
+        "entry": run.entry,
+        "due": utc_text(run.due),
+        "state": str(run.state),
+        "reason": run.reason,
+        "verdict": run.verdict,
+        "started": utc_text(run.started),
+        "ended": utc_text(run.ended),
+        "duration": run.duration,
+        "target_cov": run.target_cov,
+        "queue": int(run.queue),
+        "parts": json.dumps(run.parts),
+        "attempts": run.attempts,
+        "pinned": int(run.pinned),
+        "removed": utc_text(run.removed),
+        "untold": json.dumps(run.untold),
+    }
+
+
+def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
+    return Run(
+        bench=row["bench"],
+        entry=row["entry"],
+        due=datetime.fromisoformat(row["due"]),
+        duration=row["duration"],
+        target_cov=row["target_cov"],
+        queue=bool(row["queue"]),
+        state=RunState(row["state"]),
+        reason=row["reason"],
+        started=from_text(row["started"]),
+        ended=from_text(row["ended"]),
+        parts=tuple(_safe_name(name) for name in json.loads(row["parts"])),
+        verdict=row["verdict"],
+        attempts=row["attempts"],
+        pinned=bool(row["pinned"]),
+        removed=from_text(row["removed"]),
+        untold=tuple(json.loads(row["untold"])),
+        noise=noise,
+    )
+
+
+def _safe_name(name: str) -> str:
+    """Return a file name that stays in the folder of the database, whoever wrote it there."""
+    if Path(name).name != name or name in {"", ".", ".."}:
+        raise StoreError(f"recording {name!r}: expected a file name without a folder")
+    return name

@@ -1,0 +1,205 @@
+"""Records the window of one run, in as many parts as it takes.
+
+Where a recorder ends before its time (killed, out of disk space, stalled, or with the service), the
+rest of the window is recorded as a further part. All parts are estimated as one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import shutil
+from dataclasses import replace
+from datetime import timedelta
+from enum import Enum, auto
+from typing import TYPE_CHECKING
+
+from daq.errors import HuddleError
+from daq.recording.reader import Recording
+from tui.service.run_state import Run, RunState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tui.service.clock import Clock
+    from tui.service.steps import Recorder, Steps
+
+_LOGGER = logging.getLogger(__name__)
+LOOK = 2.0
+"""Seconds between looks at a recorder and the disk."""
+STALL = timedelta(minutes=2)
+"""Time without progress after which a recorder is killed: devices that are lost do not matter."""
+RETRY, LONGEST_RETRY = 5.0, 300.0
+"""Seconds until the rest of a window is tried to be recorded: at first, and at most."""
+STOPPED = "interrupted: the service was stopped"
+INTERRUPTED = "interrupted: the service, its recorder or the computer ended"
+
+
+class _End(Enum):
+    """How the recorder of a part ended."""
+
+    COMPLETE = auto()
+    EARLY = auto()
+    WITH_SERVICE = auto()
+
+
+class Window:
+    """Records one run.
+
+    Parameters
+    ----------
+    steps : Steps
+    clock : Clock
+    stop : asyncio.Event
+        Set when the service is to end.
+    save : callable
+        Writes a run to the database.
+    folder : Path
+        Of the recordings.
+    min_free : int
+        Bytes of free space at which a recorder is stopped.
+    shortest : float
+        Seconds of a rest that is worth recording.
+    """
+
+    def __init__(
+        self,
+        *,
+        steps: Steps,
+        clock: Clock,
+        stop: asyncio.Event,
+        save: Callable[[Run], None],
+        folder: Path,
+        min_free: int,
+        shortest: float,
+    ) -> None:
+        self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
+        self._folder, self._min_free, self._shortest = folder, min_free, shortest
+        self.progressed_at: float | None = None
+        """Time of the event loop at which the recorder last made progress; None before."""
+
+    async def record(self, run: Run) -> Run:
+        """Record what is left of the window of a run in the state `RECORDING`.
+
+        Returns
+        -------
+        Run
+            In the state `ESTIMATING` or `FAILED`; in `RECORDING` where the service is to end.
+        """
+        recorder = self._left_over(run)
+        if recorder is None and run.parts:
+            if self._is_complete(run):
+                return self._recorded(run)
+            run = run.because(STOPPED if STOPPED in run.reason else INTERRUPTED)
+        wait = RETRY
+        while True:
+            if recorder is None:
+                if self._stop.is_set():
+                    return run
+                if self._rest(run) < (self._shortest if run.parts else 0.0):
+                    break
+                run, recorder = self._started(run)
+            if recorder is not None:
+                end, text = await self._followed(recorder)
+                recorder = None
+                if end is _End.WITH_SERVICE:
+                    run = run.because(STOPPED)
+                    self._save(run)
+                    return run
+                if end is _End.COMPLETE:
+                    break
+                run = run.because(text)
+                self._save(run)
+                if not self._existing(run):
+                    break  # the devices, the bench file or the disk let no recording begin
+            run = await self._pause(run, wait)
+            wait = min(2 * wait, LONGEST_RETRY)
+        return self._recorded(run)
+
+    def _left_over(self, run: Run) -> Recorder | None:
+        return self._steps.running(run.parts[-1], run.target_cov) if run.parts else None
+
+    def _rest(self, run: Run) -> float:
+        end = run.window_end
+        return 0.0 if end is None else (end - self._clock.now()).total_seconds()
+
+    def _started(self, run: Run) -> tuple[Run, Recorder | None]:
+        """Start a recorder; its part is in the database before."""
+        try:
+            part = self._steps.new_part(self._clock.now())
+            run = replace(run, parts=(*run.parts, part))
+            self._save(run)
+            return run, self._steps.start(part, max(1.0, self._rest(run)), run.target_cov)
+        except (HuddleError, OSError) as error:
+            return run.because(f"no recorder: {error}"), None
+
+    async def _followed(self, recorder: Recorder) -> tuple[_End, str]:
+        """Wait for the end of a recorder; end it where it must."""
+        stalled = ""
+        known, since = None, self._clock.now()
+        while not await recorder.ends_within(LOOK):
+            if self._stop.is_set():
+                await recorder.stop()
+                return _End.WITH_SERVICE, ""
+            if (free := self.free()) is not None and free < self._min_free:
+                await recorder.stop()
+                return _End.EARLY, f"recording closed at {_size(free)} of free space"
+            progress = await recorder.progress()
+            if progress is not None and progress != known:
+                known, since = progress, self._clock.now()
+                self.progressed_at = asyncio.get_running_loop().time()
+            elif self._clock.now() - since > STALL:
+                stalled = f"the recorder made no progress for {STALL.total_seconds():.0f} s"
+                _LOGGER.error("%s; it is killed", stalled)
+                recorder.kill()
+                return _End.EARLY, stalled
+        failure = recorder.failure()
+        return (_End.EARLY, failure) if failure else (_End.COMPLETE, "")
+
+    async def _pause(self, run: Run, seconds: float) -> Run:
+        """Wait before the rest is recorded, as long as the disk is full."""
+        said = False
+        while True:
+            await self._clock.sleep(min(seconds, max(0.0, self._rest(run))), self._stop)
+            free = self.free()
+            is_full = free is not None and free < self._min_free
+            if not is_full or self._stop.is_set() or self._rest(run) <= self._shortest:
+                return run
+            if not said:
+                _LOGGER.warning("%s of free space; the recording waits for more", _size(free or 0))
+                said = True
+
+    def free(self) -> int | None:
+        """Return the bytes of free space for recordings; None if that cannot be told."""
+        try:
+            return shutil.disk_usage(self._folder).free
+        except OSError:
+            return None
+
+    def _existing(self, run: Run) -> tuple[str, ...]:
+        return tuple(part for part in run.parts if (self._folder / part).exists())
+
+    def _recorded(self, run: Run) -> Run:
+        parts = self._existing(run)
+        for part in set(run.parts) - set(parts):
+            self._steps.release(part)
+        run = replace(run, parts=parts)
+        if parts:
+            return run.to(RunState.ESTIMATING)
+        run = run if run.reason else run.because("nothing was recorded")
+        return run.to(RunState.FAILED, ended=self._clock.now())
+
+    def _is_complete(self, run: Run) -> bool:
+        """Whether a recording that ends at a precision has reached it, without the service."""
+        if run.target_cov is None or STOPPED in run.reason:
+            return False
+        try:
+            with Recording.open(self._folder / run.parts[-1]) as recording:
+                return recording.closed
+        except (HuddleError, OSError):
+            return False
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.0f} MB"
