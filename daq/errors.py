@@ -119,6 +119,16 @@ class NotARecordingError(RecordingError):
     """The file is not a huddle recording, or of a format newer than this program."""
 
 
+class ArchiveError(HuddleError, OSError):
+    """A store of spectra cannot be read or written."""
+
+
+class WrongArchiveError(ArchiveError):
+    """A store is not one, of a newer format, or of other settings or sensors than asked for."""
+
+    is_usage_error = True
+
+
 class CannotAlignError(HuddleError, ValueError):
     """The sensors of a recording cannot be brought onto one grid."""
 

@@ -13,9 +13,12 @@ import numpy as np
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
-    from daq.recording.interface import ReadableSensor
+    from daq.bench.model import Channel
+    from daq.recording.interface import ReadableRecording, ReadableSensor
 
 _STRETCHES = 16
 _ROWS = 2048  # of each
@@ -45,6 +48,24 @@ def clipped_shares(record: ReadableSensor) -> dict[str, float]:
         if not channel.auxiliary
     }
     return {name: share for name, share in shares.items() if share}
+
+
+def clipped_columns(
+    recordings: Iterable[ReadableRecording], channels: Sequence[tuple[str, Channel]]
+) -> dict[int, float]:
+    """Return the share of samples at the end of the range, by column, of channels with any.
+
+    Of several recordings the largest share.
+    """
+    columns = {(sensor, channel.name): column for column, (sensor, channel) in enumerate(channels)}
+    shares: dict[int, float] = {}
+    for recording in recordings:
+        for record in recording.sensors:
+            for channel, share in clipped_shares(record).items():
+                column = columns.get((record.name, channel))
+                if column is not None:
+                    shares[column] = max(share, shares.get(column, 0.0))
+    return shares
 
 
 def _rows(record: ReadableSensor) -> NDArray[np.int64]:

@@ -88,15 +88,28 @@ def synchronisation(
     if len(moved):
         first = list(is_reference).index(True)
         residual = np.hypot(residual, (moved - moved[:, [first]]).std(axis=0))
-    noise_bias = None
-    if results and len(residual) == len(dims):
-        noise = next(iter(results.values())).noise_psd
-        coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
-        turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            noise_bias = turn**2 * coherent / np.abs(noise)
     by_sensor = zip((state.sensor for state in clocks), residual.tolist(), strict=True)
-    return Synchronisation(residual=dict(by_sensor), noise_bias=noise_bias)
+    found = Synchronisation(residual=dict(by_sensor))
+    return bias_of_clocks(found, dims=dims, frequency=frequency, csm=csm, results=results)
+
+
+def bias_of_clocks(
+    found: Synchronisation,
+    *,
+    dims: tuple[int, ...],
+    frequency: FloatArray,
+    csm: ComplexArray,
+    results: Mapping[str, SelfNoise],
+) -> Synchronisation:
+    """Return what is left between the clocks with its effect on the noise, if that is known."""
+    residual = np.array(list(found.residual.values()))
+    if not results or len(residual) != len(dims):
+        return found
+    noise = next(iter(results.values())).noise_psd
+    coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
+    turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return replace(found, noise_bias=turn**2 * coherent / np.abs(noise))
 
 
 def vertical_channel(channels: Sequence[Channel]) -> int | None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
-from daq.estimation.clipping import clipped_shares
+from daq.estimation.clipping import clipped_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
 from daq.estimation.noise_estimates import (
     Dimensions,
@@ -38,7 +38,7 @@ from daq.estimation.noise_estimates import (
 )
 from daq.estimation.recording_set import check_same, check_span, open_another
 from daq.estimation.segment_course import segment_course
-from daq.estimation.segment_pass import Pass
+from daq.estimation.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
     ChannelLabel,
@@ -51,7 +51,7 @@ from daq.estimation.snapshot import (
     added_by_clocks,
 )
 from daq.estimation.throttle import Throttle
-from estimator.spectra.segment_rejection import Reason, RejectionSettings
+from estimator.spectra.segment_rejection import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,13 +63,11 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 _LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are taken again
-_FINAL_TOLERANCE = 1e-7
 _REVIEW = 1.25  # growth after which that is looked at
 _FIRST_REVIEW = 8  # segments
 _RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
 DIAGNOSIS_SHARE = 0.02
 """Share of the time that diagnoses of a growing recording may take."""
-_MOST_PASSES = 4
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
 _MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
 
@@ -222,15 +220,12 @@ class Estimation:
             if progress is not None:
                 progress(done, total)
 
+        def repeat(n: int) -> None:
+            nonlocal total
+            total += n
+
         for each in self._passes:
-            each.advance(count)
-            for _ in range(_MOST_PASSES - 1):
-                each.set_clocks()
-                if not each.is_outdated(_FINAL_TOLERANCE):
-                    break
-                total += each.n_seen
-                each.restart()
-                each.advance(count)
+            each.finish(count, repeat)
         snapshot = self._snapshot(final=True)
         if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
             raise NoResultError(self._why_nothing(snapshot), snapshot)
@@ -311,14 +306,16 @@ class Estimation:
 
     def _diagnose(self, bands: tuple[Band, ...], estimates: Estimates) -> Findings:
         """Say what the averages show of the test itself: costly, and so not at every snapshot."""
-        clipped, stood_still = self._clipped(), self._dead_for_a_while()
+        channels = self._passes[0].aligned.channels
+        clipped = clipped_columns(self._recordings, channels)
+        stood_still = still_for_a_while(self._passes, self.settings)
         found, untested = diagnosis(
             bands,
             self._passes[0].aligned.dims,
-            self._passes[0].aligned.channels,
+            channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
-            course=segment_course(self._passes, self._passes[0].aligned.channels, self._unit),
+            course=segment_course(self._passes, channels, self._unit),
         )
         return Findings(clipped, stood_still, found, untested)
 
@@ -351,32 +348,6 @@ class Estimation:
         """Whether the dimensions chosen before are for the same frequencies."""
         before = () if self._dimensions is None else self._dimensions.n_factors
         return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
-
-    def _clipped(self) -> dict[int, float]:
-        """Return the share of samples at the end of the range, by column, of channels with any."""
-        columns = {
-            (sensor, channel.name): column
-            for column, (sensor, channel) in enumerate(self._passes[0].aligned.channels)
-        }
-        shares: dict[int, float] = {}
-        for recording in self._recordings:
-            for record in recording.sensors:
-                for channel, share in clipped_shares(record).items():
-                    column = columns.get((record.name, channel))
-                    if column is not None:
-                        shares[column] = max(share, shares.get(column, 0.0))
-        return shares
-
-    def _dead_for_a_while(self) -> dict[int, float]:
-        """Return for how long channels stood still in segments that count, by column.
-
-        Rejection leaves such segments out, but takes what lasts for a change for good.
-        """
-        welch = self._passes[0].welch
-        lasting = RejectionSettings().start_up * welch.hop / welch.sampling_rate
-        least = lasting if self.settings.reject else 0.0
-        seconds = np.atleast_1d(sum(each.stillness.for_a_while() for each in self._passes))
-        return {column: float(still) for column, still in enumerate(seconds) if still > least}
 
     def _left_out(self) -> dict[Reason, int]:
         counts: Counter[Reason] = Counter()

@@ -36,6 +36,8 @@ _VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
 _READERS = 2  # pieces being read while one is worked on
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
+_MOST_PASSES = 4
+_FINAL_TOLERANCE = 1e-7  # seconds rms that clocks may move before segments are taken again
 _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgives more
 
 
@@ -102,6 +104,17 @@ class Pass:
             self._selected = self._undisturbed.spectra()
         return self._selected
 
+    def drain(self, *, last: bool) -> CrossSpectra:
+        """Return the spectra since the last call; none with octaves.
+
+        Segments held back for judgement are among the next ones, unless these are the last.
+        """
+        if self._undisturbed is None:
+            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, threads=1)
+            return spectra
+        self._selected = None
+        return self._undisturbed.spectra() if last else self._undisturbed.drain()
+
     @property
     def n_segments(self) -> int:
         """Segments that count; with octaves those of the highest."""
@@ -159,18 +172,46 @@ class Pass:
                 new = self._fed - first * hop
                 self.octaves.add(samples[new:], complete[new:])
                 self._fed = first * hop + len(samples)
-            elif self._undisturbed is None:
-                self._all.add(samples, starts)
-                self._kept_at.append(first * hop + starts)
             else:
-                self._undisturbed.add(samples, starts)
-                self._selected = None
+                self._take(samples, starts, first * hop)
             self._n_taken += len(starts)
             self.taken_at.append(self._positions(np.arange(first, first + count)))
             self._measure(samples, starts, first * hop)
             self.n_seen += count
             if progress is not None:
                 progress(count)
+
+    def finish(
+        self,
+        progress: Callable[[int], None] | None = None,
+        repeating: Callable[[int], None] | None = None,
+    ) -> None:
+        """Take every segment by the final clocks.
+
+        `progress` receives the segments of each piece; `repeating`, before they are taken again,
+        how many these are.
+        """
+        self.advance(progress)
+        for _ in range(_MOST_PASSES - 1):
+            self.set_clocks()
+            if not self.is_outdated(_FINAL_TOLERANCE):
+                break
+            if repeating is not None:
+                repeating(self.n_seen)
+            self.restart()
+            self.advance(progress)
+
+    def _take(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
+        """Add the segments that begin at rows `starts` of `samples`.
+
+        `first` is the grid sample of row 0.
+        """
+        if self._undisturbed is None:
+            self._all.add(samples, starts)
+            self._kept_at.append(first + starts)
+        else:
+            self._undisturbed.add(samples, starts)
+            self._selected = None
 
     def _silence(self, samples: FloatArray) -> None:
         """Make channels that stand still exactly zero: the rounding of their mean is no signal."""
@@ -273,6 +314,18 @@ class Pass:
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
         middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
         return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+
+
+def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:
+    """Return for how long channels stood still in segments that count, in seconds, by column.
+
+    Rejection leaves such segments out, but takes what lasts for a change for good.
+    """
+    welch = passes[0].welch
+    lasting = RejectionSettings().start_up * welch.hop / welch.sampling_rate
+    least = lasting if settings.reject else 0.0
+    seconds = np.atleast_1d(sum(each.stillness.for_a_while() for each in passes))
+    return {column: float(still) for column, still in enumerate(seconds) if still > least}
 
 
 def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) -> NDArray[np.bool_]:

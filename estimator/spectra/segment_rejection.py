@@ -204,6 +204,15 @@ class SelectedSpectra:
             total.add(held.samples, np.zeros(1, dtype=np.int64))
         return total
 
+    def drain(self) -> CrossSpectra:
+        """Return the spectra of segments accepted since the last call; the judgement goes on.
+
+        Those held back are among the next ones.
+        """
+        accepted = self._accepted
+        self._accepted = CrossSpectra(self.settings, accepted.n_channels)
+        return accepted
+
     def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
         """Logarithm of the power in each band, of the largest squared step, and of the time still.
 

@@ -1,0 +1,413 @@
+"""What an archive says of the self-noise over months.
+
+One pass over the stretches in order of time: days and the whole are averages of spectra, so a day
+with gaps weighs by its segments; the density counts stretch by stretch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.archive.averages import Average, Estimator, converted
+from daq.archive.changes import Changes, Drift, changes, drift
+from daq.archive.spectra_file import SpectraFile
+from daq.errors import ArchiveError
+from daq.results.band_summary import band_of, channel_means, judged_method
+from estimator.errors import BandError
+from estimator.self_noise.band_means import CERTAIN, NORMAL_95
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from datetime import tzinfo
+
+    from numpy.typing import NDArray
+
+    from daq.archive.plan import Plan
+    from daq.archive.store import Entry
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+
+DAY_NS = 86400 * 10**9
+FALSE_ALARM = 0.01
+POINTS_PER_OCTAVE = 8
+"""Of the density; each is a mean over an octave (McNamara and Buland 2004)."""
+LOWEST_DB, HIGHEST_DB = -320, 80
+_FEWEST_BINS = 4
+"""Frequencies in an octave."""
+WORKING_HOURS = range(8, 18)
+NIGHT_HOURS = frozenset({22, 23, 0, 1, 2, 3, 4, 5})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels:
+    """Mean noise PSD in bands, in unit²/Hz, each array of shape (…, n_bands, n_channels)."""
+
+    mean: FloatArray
+    spread: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Density:
+    """How often a stretch has a self-noise, as PQLX draws it.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_points,)
+        Centres of octaves, in Hz.
+    counts : int64, shape (n_points, n_levels, n_channels)
+        Stretches with a level from ``LOWEST_DB + k`` to one dB above.
+    not_positive : int64, shape (n_points, n_channels)
+        Stretches whose estimate is zero or below, and so has no level.
+    n_stretches, n_short : int
+        Stretches counted, and those left out as less than half of one.
+    """
+
+    frequency: FloatArray
+    counts: IntArray
+    not_positive: IntArray
+    n_stretches: int
+    n_short: int
+
+    def percentile(self, share: float) -> FloatArray:
+        """Return the level in dB below which this share of stretches lies, (n_points, n_channels).
+
+        NaN where it has no level. Within a bin of 1 dB, stretches are taken to be spread evenly.
+        """
+        total = self.counts.sum(axis=1) + self.not_positive
+        wanted = share * total
+        below = np.concatenate(
+            [self.not_positive[:, None], self.not_positive[:, None] + np.cumsum(self.counts, 1)], 1
+        )
+        level = np.argmax(below[:, 1:] >= wanted[:, None], axis=1)
+        before = np.take_along_axis(below, level[:, None], axis=1)[:, 0]
+        inside = np.take_along_axis(self.counts, level[:, None], axis=1)[:, 0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = LOWEST_DB + level + np.clip((wanted - before) / inside, 0, 1)
+        return np.where((total > 0) & (self.not_positive < np.maximum(wanted, 1e-9)), found, np.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contrast:
+    """Noise in working hours against that at night.
+
+    Attributes
+    ----------
+    weekday, night : Levels
+        Of shape (n_bands, n_channels).
+    n_weekday, n_night : int
+        Segments.
+    difference, low, high : float64, shape (n_bands, n_channels)
+        Weekday over night in dB, with its 95 % interval; NaN where it has none.
+    """
+
+    weekday: Levels
+    night: Levels
+    n_weekday: int
+    n_night: int
+    difference: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What an archive says.
+
+    Attributes
+    ----------
+    pooled : Snapshot
+        The estimate from all recordings together.
+    settings : Settings
+    method : str
+        That of all but `pooled`.
+    bands : tuple of (float, float)
+        In Hz: the band of the estimate, then octaves, unless a band was asked for.
+    days_utc_ns : int64, shape (n_days,)
+        Beginnings of days of UTC.
+    n_segments : int64, shape (n_days,)
+    levels : Levels
+        Of shape (n_days, n_bands, n_channels).
+    drift, changes : Drift, Changes
+        Series are bands times channels.
+    density : Density
+    contrast : Contrast or None
+        None where stretches are longer than an hour, or one of the two has too few segments.
+    problems : tuple of str
+        What could not be read.
+    """
+
+    pooled: Snapshot
+    settings: Settings
+    method: str
+    bands: tuple[tuple[float, float], ...]
+    days_utc_ns: IntArray
+    n_segments: IntArray
+    levels: Levels
+    drift: Drift
+    changes: Changes
+    density: Density
+    contrast: Contrast | None
+    problems: tuple[str, ...]
+
+
+def answer(
+    plan: Plan,
+    entries: Sequence[Entry],
+    settings: Settings,
+    *,
+    zone: tzinfo = UTC,
+    false_alarm: float = FALSE_ALARM,
+    progress: Callable[[int, int], None] | None = None,
+) -> Answer:
+    """Answer from the spectra of an archive.
+
+    Parameters
+    ----------
+    plan : Plan
+    entries : sequence of Entry
+        In order of time.
+    settings : Settings
+        Those of `plan`, but for what does not shape spectra.
+    zone : tzinfo
+        Of working hours and nights.
+    false_alarm : float
+        See `daq.archive.changes.changes`.
+    progress : callable, optional
+        Receives how many recordings are done, and of how many.
+
+    Raises
+    ------
+    ArchiveError
+        If there is no spectrum that could be read.
+    WrongSettingError
+        If a unit or gain does not fit the sensors.
+    """
+    known = [entry for entry in entries if entry.start_utc_ns]
+    if not known:
+        raise ArchiveError(
+            "the archive has no spectra yet: no recording holds one whole segment of"
+            f" {plan.settings.segment:g} s"
+        )
+    channels = known[0].described.channels
+    every = Estimator(plan, settings, channels)
+    # Days and stretches go by the method that judges.
+    first = settings.methods[:1] if settings.methods[:1] != ("all",) else ("three-sensor",)
+    one = Estimator(plan, replace(settings, methods=first), channels)
+    tally = _Tally(plan, one, zone)
+    pooled = Average()
+    problems: list[str] = []
+    for number, entry in enumerate(known):
+        if progress is not None:
+            progress(number, len(known))
+        pooled.add_totals(entry.described)
+        problems += tally.take(entry, pooled)
+    snapshot = every.snapshot(pooled, diagnose=True)
+    tally.end()
+    bands = tally.bands(snapshot)
+    n_series = (-1, len(bands) * len(snapshot.channels))
+    levels = tally.levels(bands)
+    days = np.array(sorted(tally.days), dtype=np.int64)
+    at = (days - days[0]) / DAY_NS
+    mean, spread = levels.mean.reshape(n_series), levels.spread.reshape(n_series)
+    return Answer(
+        pooled=snapshot,
+        settings=settings,
+        method=judged_method(snapshot, one.settings),
+        bands=bands,
+        days_utc_ns=days,
+        n_segments=np.array([tally.days[int(day)].n_segments for day in days]),
+        levels=levels,
+        drift=drift(at, mean, spread),
+        changes=changes(mean, spread, false_alarm=false_alarm),
+        density=tally.density(),
+        contrast=tally.contrast(bands),
+        problems=tuple(problems),
+    )
+
+
+class _Tally:
+    """What is gathered from the stretches on the way through the archive."""
+
+    def __init__(self, plan: Plan, one: Estimator, zone: tzinfo) -> None:
+        self._plan, self._one, self._zone = plan, one, zone
+        self.days: dict[int, Snapshot] = {}
+        self._open: dict[int, Average] = {}
+        self._weekday, self._night = Average(), Average()
+        self._edges = _octaves(one.welch.frequencies, POINTS_PER_OCTAVE)
+        n_points, n_channels = len(self._edges), len(one.channels)
+        self._counts = np.zeros((n_points, HIGHEST_DB - LOWEST_DB, n_channels), dtype=np.int64)
+        self._not_positive = np.zeros((n_points, n_channels), dtype=np.int64)
+        self._n_stretches = self._n_short = 0
+
+    def take(self, entry: Entry, pooled: Average) -> list[str]:
+        """Take every stretch of a recording; returns a message for each that is damaged."""
+        problems = []
+        described = entry.described
+        response = self._one.responses(described.channels)
+        self._end_days(before=entry.start_utc_ns // DAY_NS * DAY_NS)
+        with SpectraFile(entry.path) as file:
+            for row, (start, n_segments) in enumerate(file.stretches.tolist()):
+                try:
+                    csm = converted(file.csm(row), response)
+                except ArchiveError as error:
+                    problems.append(
+                        f"{error} (stretch from {_utc(start)}): left out. Delete the file and run"
+                        f" again with {described.origin.path}"
+                    )
+                    continue
+                day = start // DAY_NS * DAY_NS
+                self._end_days(before=min(day, entry.start_utc_ns // DAY_NS * DAY_NS))
+                averages = [pooled, self._open.setdefault(day, Average())]
+                if self._plan.stretch == "hour":
+                    averages += self._times_of_day(start)
+                for average in averages:
+                    average.add(described, start, n_segments, csm)
+                alone = Average()
+                alone.add(described, start, n_segments, csm)
+                self._count(alone)
+        return problems
+
+    def _times_of_day(self, start_utc_ns: int) -> list[Average]:
+        local = datetime.fromtimestamp(start_utc_ns / 1e9, self._zone)
+        if local.hour in NIGHT_HOURS:
+            return [self._night]
+        working = local.weekday() < 5 and local.hour in WORKING_HOURS
+        return [self._weekday] if working else []
+
+    def _end_days(self, before: float) -> None:
+        for day in [day for day in self._open if day < before]:
+            self.days[day] = self._one.snapshot(self._open.pop(day))
+
+    def end(self) -> None:
+        """End the last days."""
+        self._end_days(np.inf)
+
+    def _count(self, alone: Average) -> None:
+        """Count one stretch in the density."""
+        whole = self._plan.stretch_s * self._one.welch.sampling_rate / self._one.welch.hop
+        if alone.n_segments < whole / 2:
+            self._n_short += 1
+            return
+        snapshot = self._one.snapshot(alone)
+        if not snapshot.results:
+            self._n_short += 1
+            return
+        self._n_stretches += 1
+        noise = next(iter(snapshot.results.values())).noise_psd
+        known = np.isfinite(noise)
+        total = np.cumsum(np.vstack([np.zeros(noise.shape[1]), np.where(known, noise, 0.0)]), 0)
+        number = np.cumsum(np.vstack([np.zeros(noise.shape[1]), known]), 0)
+        low, high = self._edges.T
+        n_bins = number[high] - number[low]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = (total[high] - total[low]) / n_bins
+            level = np.floor(10 * np.log10(mean)) - LOWEST_DB
+        self._not_positive += (n_bins > 0) & (mean <= 0)
+        point, channel = np.nonzero((n_bins > 0) & (mean > 0))
+        bins = np.clip(level[point, channel], 0, self._counts.shape[1] - 1).astype(np.int64)
+        np.add.at(self._counts, (point, bins, channel), 1)
+
+    def bands(self, pooled: Snapshot) -> tuple[tuple[float, float], ...]:
+        """Return the bands of the series."""
+        whole = band_of(self._one.settings, pooled)
+        if self._one.settings.band is not None:
+            return (whole,)
+        frequency = pooled.frequency
+        octaves = []
+        centre = 2.0 ** np.ceil(np.log2(whole[0]) + 0.5)
+        while centre * np.sqrt(2) <= whole[1]:
+            edges = (float(centre / np.sqrt(2)), float(centre * np.sqrt(2)))
+            if np.count_nonzero((frequency >= edges[0]) & (frequency <= edges[1])) >= _FEWEST_BINS:
+                octaves.append(edges)
+            centre *= 2
+        return (whole, *octaves)
+
+    def levels(self, bands: Sequence[tuple[float, float]]) -> Levels:
+        """Return the noise of every day."""
+        snapshots = [snapshot for _, snapshot in sorted(self.days.items())]
+        return _levels([_means(each, self._one.settings, bands) for each in snapshots])
+
+    def density(self) -> Density:
+        """Return the density."""
+        frequency = self._one.welch.frequencies
+        low, high = frequency[self._edges[:, 0]], frequency[self._edges[:, 1] - 1]
+        return Density(
+            np.sqrt(low * high),
+            self._counts,
+            self._not_positive,
+            self._n_stretches,
+            self._n_short,
+        )
+
+    def contrast(self, bands: Sequence[tuple[float, float]]) -> Contrast | None:
+        """Compare working hours and nights; None where one of them has too little."""
+        both = (self._weekday, self._night)
+        if not all(each.n_segments for each in both):
+            return None
+        snapshots = [self._one.snapshot(each) for each in both]
+        if not all(each.results for each in snapshots):
+            return None
+        weekday, night = (Levels(*_means(each, self._one.settings, bands)) for each in snapshots)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            difference = 10 * np.log10(weekday.mean / night.mean)
+            relative = np.hypot(weekday.spread / weekday.mean, night.spread / night.mean)
+        half = NORMAL_95 * 10 / np.log(10) * relative
+        sure = (weekday.mean > CERTAIN * weekday.spread) & (night.mean > CERTAIN * night.spread)
+        difference = np.where(sure, difference, np.nan)
+        return Contrast(
+            weekday,
+            night,
+            self._weekday.n_segments,
+            self._night.n_segments,
+            difference,
+            difference - half,
+            difference + half,
+        )
+
+
+def _means(
+    snapshot: Snapshot, settings: Settings, bands: Sequence[tuple[float, float]]
+) -> FloatArray:
+    """Return mean, spread, low and high, shape (4, n_bands, n_channels)."""
+    found = np.full((4, len(bands), len(snapshot.channels)), np.nan)
+    noise = next(iter(snapshot.results.values()), None)
+    for number, band in enumerate(bands):
+        if noise is None:
+            continue
+        try:
+            means = channel_means(noise, snapshot, settings, band)
+        except BandError:
+            continue
+        found[:, number] = np.array(
+            [[m.mean[0], m.spread[0], m.low[0], m.high[0]] for m in means]
+        ).T
+    return found
+
+
+def _levels(found: Iterable[FloatArray]) -> Levels:
+    return Levels(*np.stack(list(found), axis=1))
+
+
+def _octaves(frequency: FloatArray, per_octave: int) -> IntArray:
+    """Return first and last + 1 bin of overlapping octaves, shape (n_points, 2)."""
+    edges = []
+    centre = frequency[1] * np.sqrt(2)
+    while centre * np.sqrt(2) <= frequency[-1] * (1 + 1e-9):
+        low, high = np.searchsorted(frequency, [centre / np.sqrt(2), centre * np.sqrt(2)])
+        if high - low >= _FEWEST_BINS:
+            edges.append((int(low), int(high)))
+        centre *= 2 ** (1 / per_octave)
+    return np.array(edges, dtype=np.int64).reshape(-1, 2)
+
+
+def _utc(ns: int) -> str:
+    return f"{datetime.fromtimestamp(ns / 1e9, UTC):%Y-%m-%dT%H:%MZ}"

@@ -1,0 +1,216 @@
+"""Spectra of several stretches together, and the estimate from them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.units import canonical
+from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
+from daq.estimation.noise_estimates import known_gains, noise_estimates, responses, up_to
+from daq.estimation.snapshot import (
+    ChannelLabel,
+    Snapshot,
+    SnapshotDiagnostics,
+    Synchronisation,
+    added_by_clocks,
+)
+from estimator.errors import InsufficientDataError
+from estimator.spectra.multiresolution import Band
+from estimator.spectra.segment_rejection import Reason
+from estimator.spectra.welch import WelchSettings, scale
+from estimator.spectra.windows import effective_averages, get_window
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.archive.plan import Plan
+    from daq.archive.spectra_file import Described
+    from daq.bench.model import Channel
+    from daq.estimation.settings import Settings
+
+    ComplexArray = NDArray[np.complex128]
+    Channels = tuple[tuple[str, Channel], ...]
+
+
+class Estimator:
+    """Makes estimates of spectra of an archive, by one set of settings.
+
+    Parameters
+    ----------
+    plan : Plan
+    settings : Settings
+        Of the answer.
+    channels : tuple of (str, Channel)
+        Of one of the recordings.
+
+    Raises
+    ------
+    WrongSettingError
+        If a unit or gain does not fit the sensors.
+    """
+
+    def __init__(self, plan: Plan, settings: Settings, channels: Channels) -> None:
+        self.settings = settings
+        self.dims = plan.dims
+        self.welch = WelchSettings(
+            sampling_rate=plan.sampling_rate,
+            segment_length=round(plan.settings.segment * plan.sampling_rate),
+            overlap=plan.settings.overlap,
+            window=plan.settings.window,
+            detrend=plan.settings.detrend,
+        )
+        self.channels = channels
+        self.unit = canonical(settings.unit or channels[0][1].unit)
+        self.window = get_window(self.welch.window, self.welch.segment_length)
+        self._gains = known_gains(settings, channels)
+
+    def responses(self, channels: Channels) -> ComplexArray | None:
+        """Return what makes the channels' units of the answer's; None where nothing does."""
+        found = responses(self.welch.frequencies, channels, self.unit)
+        return None if np.all(found == 1) else found
+
+    def snapshot(self, average: Average, *, diagnose: bool = False) -> Snapshot:
+        """Return the estimate from an average.
+
+        Parameters
+        ----------
+        average : Average
+            Of one segment at least.
+        diagnose : bool
+            Whether the test itself is diagnosed, which takes longer.
+
+        Raises
+        ------
+        InsufficientDataError
+            If the average is empty.
+        """
+        band = up_to(average.band(self), average.usable)
+        estimates = noise_estimates(
+            (band,), self.settings, dims=self.dims, gains=self._gains, dimensions=None
+        )
+        synchronisation = bias_of_clocks(
+            Synchronisation(residual=average.residual),
+            dims=self.dims,
+            frequency=band.frequencies,
+            csm=band.csm,
+            results=estimates.results,
+        )
+        diagnostics = SnapshotDiagnostics(
+            synchronisation=synchronisation,
+            dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
+        )
+        if diagnose:
+            found, untested = diagnosis(
+                (band,),
+                self.dims,
+                self.channels,
+                dimensions=estimates.dimensions,
+                faulty={*average.clipped, *average.stood_still},
+            )
+            findings = Findings(average.clipped, average.stood_still, found, untested)
+            diagnostics = findings.added_to(diagnostics)
+        added = added_by_clocks(synchronisation, estimates.results)
+        results = {
+            name: each if added is None else replace(each, low=each.low - added)
+            for name, each in estimates.results.items()
+        }
+        return Snapshot(
+            frequency=band.frequencies,
+            csm=band.csm,
+            results=results,
+            refused=estimates.refused,
+            channels=tuple(ChannelLabel(s, c.name, self.unit) for s, c in self.channels),
+            dims=self.dims,
+            unit=self.unit,
+            n_segments=band.n_segments,
+            n_dropped=sum(average.left_out.values()),
+            n_effective=band.n_effective,
+            elapsed=average.elapsed,
+            start_utc_ns=average.start_utc_ns,
+            sensors=(),
+            clocks=(),
+            drift=np.empty((0, 1 + len(self.dims))),
+            closed=average.closed,
+            left_out={reason: average.left_out[reason] for reason in Reason},
+            diagnostics=diagnostics,
+        )
+
+
+class Average:
+    """The mean of cross-spectral matrices, by segments, in the unit of the answer."""
+
+    def __init__(self) -> None:
+        self._sum: ComplexArray | None = None
+        self._counts: Counter[str] = Counter()
+        self._squares: dict[str, float] = {}
+        self.n_segments = 0
+        self.start_utc_ns = 0
+        self.usable = np.inf
+        self.elapsed = 0.0
+        self.closed = True
+        self.left_out: Counter[Reason] = Counter()
+        self.clipped: dict[int, float] = {}
+        self.stood_still: dict[int, float] = {}
+
+    def add(
+        self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
+    ) -> None:
+        """Add a stretch of a recording, `csm` in the unit of the answer."""
+        weighted = csm * n_segments
+        if self._sum is None:
+            self._sum = weighted
+            self.start_utc_ns = start_utc_ns
+        else:
+            self._sum += weighted
+        self.start_utc_ns = min(self.start_utc_ns, start_utc_ns)
+        self.n_segments += n_segments
+        self._counts[described.origin.run_id] += n_segments
+        self.usable = min(self.usable, described.usable)
+        for sensor, residual in described.residual.items():
+            square = self._squares.get(sensor, 0.0)
+            self._squares[sensor] = square + n_segments * residual**2
+
+    def add_totals(self, described: Described) -> None:
+        """Count what is known of a recording as a whole."""
+        self.elapsed += described.elapsed
+        self.closed &= described.origin.closed
+        self.left_out.update(described.left_out)
+        for column, share in described.clipped.items():
+            self.clipped[column] = max(share, self.clipped.get(column, 0.0))
+        for column, seconds in described.stood_still.items():
+            self.stood_still[column] = seconds + self.stood_still.get(column, 0.0)
+
+    @property
+    def residual(self) -> dict[str, float]:
+        """What is left between the clocks, in seconds rms, by sensor."""
+        return {
+            sensor: float(np.sqrt(square / max(1, self.n_segments)))
+            for sensor, square in self._squares.items()
+        }
+
+    def band(self, estimator: Estimator) -> Band:
+        """Return the mean.
+
+        Raises
+        ------
+        InsufficientDataError
+            If nothing has been added.
+        """
+        if self._sum is None:
+            raise InsufficientDataError("no segment in the archive")
+        welch = estimator.welch
+        n_effective = sum(
+            effective_averages(estimator.window, welch.hop, count)
+            for count in self._counts.values()
+        )
+        csm = self._sum / self.n_segments
+        return Band(welch, welch.frequencies, csm, self.n_segments, n_effective)
+
+
+def converted(csm: ComplexArray, response: ComplexArray | None) -> ComplexArray:
+    """Return cross-spectra in the unit of the answer."""
+    return csm if response is None else scale(csm, response)

@@ -1,0 +1,161 @@
+"""Tasks in this process, in several, or on a cluster: the outcomes are the same."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import threading
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from daq.archive.task import Outcome, Task, run
+from daq.errors import ArchiveError
+from daq.python_process import python_command
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Sequence
+    from types import ModuleType
+
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+CONNECT_SECONDS = 10.0
+
+
+def carried_out(tasks: Sequence[Task], *, jobs: int = 1) -> Generator[Outcome]:
+    """Yield the outcome of each task as it comes, from this process or from several.
+
+    A process that is killed costs its task, which is reported as failed.
+    """
+    if jobs == 1 or len(tasks) < 2:
+        for task in tasks:
+            yield Outcome(**json.loads(run(json.dumps(asdict(task)))))
+        return
+    workers = [_Worker() for _ in range(min(jobs, len(tasks)))]
+    idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+    for worker in workers:
+        idle.put(worker)
+
+    def hand_over(task: Task) -> Outcome:
+        worker = idle.get()
+        try:
+            return worker.run(task)
+        finally:
+            idle.put(worker)
+
+    pool = ThreadPoolExecutor(len(workers))
+    futures = [pool.submit(hand_over, task) for task in tasks]
+    try:
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        for future in futures:
+            future.cancel()
+        for worker in workers:
+            worker.kill()
+        pool.shutdown()
+        for worker in workers:
+            worker.close()
+
+
+def on_cluster(
+    tasks: Sequence[Task],
+    scheduler: str,
+    distributed: ModuleType,
+    *,
+    connected: Callable[[str, int], None],
+) -> Iterator[Outcome]:
+    """Yield the outcome of each task as it comes, from the workers of a Dask scheduler.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        Their paths must mean the same on every worker.
+    scheduler : str
+        Address, such as ``tcp://host:8786``.
+    distributed : module
+        Dask's, which an extra installs.
+    connected : callable
+        Receives the address of the dashboard, and how many workers there are.
+
+    Raises
+    ------
+    ArchiveError
+        If the scheduler does not answer.
+    """
+    try:
+        client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ArchiveError(
+            f"--scheduler {scheduler}: no Dask scheduler answers ({error}); start one with:"
+            " dask scheduler"
+        ) from error
+    with client:
+        connected(str(client.dashboard_link), len(client.scheduler_info()["workers"]))
+        futures: dict[Any, Task] = {
+            client.submit(run, json.dumps(asdict(task)), pure=False): task for task in tasks
+        }
+        for future in distributed.as_completed(list(futures)):
+            failed = future.exception()
+            if failed is not None:
+                yield Outcome(futures[future].source, failure=f"on the cluster: {failed!r}")
+            else:
+                yield Outcome(**json.loads(future.result()))
+
+
+class _Worker:
+    """A process that carries out tasks, one at a time; a new one takes the place of a dead one."""
+
+    def __init__(self) -> None:
+        self._killed = False
+        self._lock = threading.Lock()
+        self._start()
+
+    def _start(self) -> None:
+        environment = dict.fromkeys(_ONE_THREAD, "1") | os.environ
+        self._process = subprocess.Popen(
+            python_command("daq.archive.worker"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            env=environment,
+        )
+
+    def run(self, task: Task) -> Outcome:
+        """Carry out a task."""
+        process = self._process
+        line = ""
+        if process.stdin is not None and process.stdout is not None:
+            with contextlib.suppress(OSError):
+                process.stdin.write(json.dumps(asdict(task)) + "\n")
+                process.stdin.flush()
+                line = process.stdout.readline()
+        if line.endswith("\n"):
+            return Outcome(**json.loads(line))
+        with self._lock:
+            code = process.wait()
+            if not self._killed:
+                self.close()
+                self._start()
+        return Outcome(task.source, failure=f"its process ended ({_ended(code)}); run again")
+
+    def kill(self) -> None:
+        """End the process, whatever it does: the archive stays whole."""
+        with self._lock:
+            self._killed = True
+            self._process.kill()
+
+    def close(self) -> None:
+        """Wait for the end of the process."""
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):  # what it never read
+                    pipe.close()
+
+
+def _ended(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -1,0 +1,91 @@
+"""Which recordings are new to an archive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from daq.archive.task import origin_of
+from daq.errors import HuddleError, RecordingError
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from daq.archive.store import Entry
+
+
+@dataclass(slots=True)
+class Sorted:
+    """Recordings, sorted by what there is to do.
+
+    Attributes
+    ----------
+    new : list of (str, Path)
+        Run and path of those to take: new ones, and those that have grown since.
+    current : list of Path
+        Those that the archive has.
+    failures : list of str
+        A message for each that cannot be read.
+    """
+
+    new: list[tuple[str, Path]] = field(default_factory=list)
+    current: list[Path] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+
+
+def recordings_in(sources: Iterable[Path], *, leave_out: Path) -> list[Path]:
+    """Return recordings: files as they are given, and those in folders (``*.h5``), by name.
+
+    Raises
+    ------
+    RecordingError
+        If a source does not exist, or a folder has no recording.
+    """
+    found: dict[Path, None] = {}
+    for source in sources:
+        if not source.is_dir():
+            if not source.exists():
+                raise RecordingError(f"{source}: no such file or folder")
+            found[source] = None
+            continue
+        inside = [
+            path
+            for path in sorted(source.rglob("*.h5"))
+            if leave_out not in path.parents and not path.name.startswith(".")
+        ]
+        if not inside:
+            raise RecordingError(f"{source}: no recording (*.h5) in this folder")
+        found.update(dict.fromkeys(inside))
+    return list(found)
+
+
+def sort(paths: Sequence[Path], entries: Iterable[Entry]) -> Sorted:
+    """Sort recordings by whether the archive has them as they are now."""
+    known = {entry.described.origin.run_id: entry.described.origin for entry in entries}
+    by_path = {(o.path, o.n_bytes, o.modified_ns) for o in known.values()}
+    found = Sorted()
+    seen: set[str] = set()
+    for path in paths:
+        try:
+            about = path.stat()
+            if (str(path.resolve()), about.st_size, about.st_mtime_ns) in by_path:
+                found.current.append(path)
+                continue
+            with Recording.open(path) as recording:
+                origin = origin_of(recording)
+        except (HuddleError, OSError) as error:
+            found.failures.append(str(error))
+            continue
+        before = known.get(origin.run_id)
+        same = before is not None and (before.n_samples, before.closed) == (
+            origin.n_samples,
+            origin.closed,
+        )
+        if same or origin.run_id in seen:
+            found.current.append(path)
+        else:
+            found.new.append((origin.run_id, path))
+        seen.add(origin.run_id)
+    return found

@@ -1,0 +1,167 @@
+"""The folder of an archive: its plan, one file of spectra a recording, and who may write.
+
+::
+
+    huddle-archive/
+        archive.json        settings, sensors (`daq.archive.plan`)
+        RUN.h5              spectra of one recording, named by its run (`daq.archive.spectra_file`)
+
+A file is replaced whole. One command at a time writes; others may read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import sys
+import uuid
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daq.archive.plan import Plan
+from daq.archive.spectra_file import Described, SpectraFile
+from daq.errors import ArchiveError, WrongArchiveError
+
+if sys.platform != "win32":
+    import fcntl
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+PLAN_FILE = "archive.json"
+FOLDER = "huddle-archive"
+"""Default name, beside the recordings."""
+_FAMILIAR_RUN = re.compile(r"[0-9A-Za-z-]{1,64}")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One recording of an archive: its file, and what that says."""
+
+    path: Path
+    described: Described
+    start_utc_ns: int
+    """Of its first stretch; 0 without one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """An archive on the disk."""
+
+    folder: Path
+    plan: Plan
+
+    @classmethod
+    def open(cls, folder: Path) -> Store | None:
+        """Open an archive; None if there is none yet.
+
+        Raises
+        ------
+        WrongArchiveError
+            If the folder holds something else, or an archive of a newer format.
+        ArchiveError
+            If it cannot be read.
+        """
+        plan = folder / PLAN_FILE
+        try:
+            content = plan.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            if folder.is_dir() and any(folder.glob("*.h5")):
+                raise WrongArchiveError(
+                    f"{folder}: files, but no {PLAN_FILE}: not an archive. Choose another --store,"
+                    f" or restore {PLAN_FILE}"
+                ) from None
+            return None
+        except NotADirectoryError:
+            raise WrongArchiveError(f"{folder}: not a folder; choose another --store") from None
+        except UnicodeDecodeError:
+            raise WrongArchiveError(f"{plan}: not the description of an archive") from None
+        return cls(folder, Plan.from_json(content, str(plan)))
+
+    @classmethod
+    def create(cls, folder: Path, plan: Plan) -> Store:
+        """Begin an archive in a folder, which is made if needed."""
+        folder.mkdir(parents=True, exist_ok=True)
+        part = folder / f".{PLAN_FILE}.{uuid.uuid4().hex}.part"
+        try:
+            with part.open("w", encoding="utf-8") as file:
+                file.write(plan.to_json())
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(folder / PLAN_FILE)
+        finally:
+            part.unlink(missing_ok=True)
+        return cls(folder, plan)
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[int]:
+        """Hold the archive for writing; yields how many unfinished files have been removed.
+
+        Raises
+        ------
+        ArchiveError
+            If another command is writing.
+        """
+        handle = os.open(self.folder / PLAN_FILE, os.O_RDONLY)
+        try:
+            if sys.platform != "win32":
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise ArchiveError(
+                        f"{self.folder}: another command is writing this archive; wait for its end"
+                    ) from None
+            unfinished = list(self.folder.glob(".*.part"))
+            for path in unfinished:
+                path.unlink(missing_ok=True)
+            yield len(unfinished)
+        finally:
+            os.close(handle)
+
+    def path_of(self, run_id: str) -> Path:
+        """Return the file for the spectra of a recording."""
+        familiar = _FAMILIAR_RUN.fullmatch(run_id)
+        name = run_id if familiar else hashlib.sha256(run_id.encode()).hexdigest()
+        return self.folder / f"{name}.h5"
+
+    def entries(self) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
+        """Return the recordings of the archive in order of time, and a message for each bad file.
+
+        Raises
+        ------
+        WrongArchiveError
+            If a file is of a newer format.
+        """
+        found, bad = [], []
+        for path in sorted(self.folder.glob("*.h5")):
+            try:
+                with SpectraFile(path) as file:
+                    first = int(file.stretches["start_utc_ns"][0]) if len(file.stretches) else 0
+                    self._check(file)
+                    found.append(Entry(path, file.described, first))
+            except WrongArchiveError:
+                raise
+            except ArchiveError as error:
+                bad.append(str(error))
+        return tuple(sorted(found, key=lambda e: (e.start_utc_ns, e.described.origin.run_id))), (
+            *bad,
+        )
+
+    def _check(self, file: SpectraFile) -> None:
+        """Refuse spectra of other sensors or settings than the archive's."""
+        plan = self.plan
+        wanted = [
+            (sensor, channel, unit)
+            for sensor, channels in plan.sensors
+            for channel, unit in channels
+        ]
+        labels = [(sensor, c.name, c.unit) for sensor, c in file.described.channels]
+        n_freqs = round(plan.settings.segment * plan.sampling_rate) // 2 + 1
+        if labels != wanted or file.n_freqs != n_freqs:
+            raise WrongArchiveError(
+                f"{file.path}: spectra of {len(labels)} channels and {file.n_freqs} frequencies"
+                f" that are not this archive's ({len(wanted)}, {n_freqs}); move the file away"
+            )

@@ -1,0 +1,110 @@
+"""Recordings of three small sensors, hours apart, as an archive has them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.archive.execution import carried_out
+from daq.archive.plan import Plan
+from daq.archive.sources import sort
+from daq.archive.store import Store
+from daq.archive.task import Task, software_version
+from daq.bench.model import Channel
+from daq.estimation.segment_pass import Pass
+from daq.estimation.settings import Settings
+from daq.protocols.block import HostTime
+from daq.recording.array_writer import ArrayWriter
+from daq.recording.file_format import SensorLayout
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+RATE = 10.0
+START_NS = 1_788_134_400 * 10**9  # Monday 2026-08-31, 00:00 UTC
+HOUR_NS = 3600 * 10**9
+SETTINGS = Settings(segment=10.0, methods=("three-sensor",))
+
+
+def record(
+    path: Path,
+    *,
+    hours: float = 1.5,
+    begin_ns: int = START_NS,
+    seed: int = 1,
+    noise: float = 20.0,
+    names: str = "ABC",
+    free: bool = False,
+    unit: str = "m/s²",
+) -> Path:
+    """Write a recording: one motion, noise of its own in each sensor.
+
+    Where `free`, times come from arrivals only, so that clocks have to be estimated.
+    """
+    rng = np.random.default_rng(seed)
+    n = round(hours * 3600 * RATE)
+    motion = rng.normal(size=(n, 2)) * 500
+    channels = tuple(Channel(name=c, sensitivity=1e6, unit=unit) for c in "XY")
+    layouts = [
+        SensorLayout(name, channels, RATE, np.dtype("<i4"), clock=name if free else "")
+        for name in names
+    ]
+    with ArrayWriter(path, None, sensors=layouts, created=HostTime(begin_ns, begin_ns)) as writer:
+        for name in names:
+            counts = np.rint(motion + noise * rng.normal(size=motion.shape)).astype("<i4")
+            block_rows = 600 if free else 4096
+            rows = [*range(0, n, block_rows), n]
+            times = [round(row / RATE * 1e9) for row in rows]
+            writer.samples(
+                name,
+                counts,
+                block_rows=block_rows,
+                received_ns=times[1:],
+                utc_ns=None if free else times[:-1],
+                restart=True,
+            )
+    return path
+
+
+def three(folder: Path, *, hours: float = 1.5, free: bool = False) -> list[Path]:
+    """Write recordings that begin within an hour, one of them with a night between."""
+    begin = START_NS + 2 * HOUR_NS // 3
+    return [
+        record(folder / f"{name}.h5", hours=hours, begin_ns=begin + h * HOUR_NS, seed=h, free=free)
+        for name, h in (("one", 0), ("two", 9), ("three", 24))
+    ]
+
+
+def store_for(
+    folder: Path, first: Path, settings: Settings = SETTINGS, stretch: str = "hour"
+) -> Store:
+    """Begin an archive."""
+    with Recording.open(first) as recording:
+        return Store.create(folder, Plan.of(Pass(recording, settings), settings, stretch))
+
+
+def fill(store: Store, paths: Sequence[Path], *, jobs: int = 1) -> list[str]:
+    """Take what is new into an archive; returns failures."""
+    found = sort(paths, store.entries()[0])
+    outcomes = carried_out(tasks(store, found.new), jobs=jobs)
+    return found.failures + [each.failure for each in outcomes if each.failure]
+
+
+def tasks(store: Store, new: Sequence[tuple[str, Path]]) -> list[Task]:
+    """Return tasks for recordings."""
+    plan = store.plan.to_json()
+    return [Task(str(path), str(store.path_of(run)), plan, software_version()) for run, path in new]
+
+
+def content(store: Store) -> dict[str, bytes]:
+    """Return all files of an archive."""
+    return {path.name: path.read_bytes() for path in store.folder.iterdir()}
+
+
+def with_reject(settings: Settings) -> Settings:
+    """Return settings that exclude transients."""
+    return replace(settings, reject=True)

@@ -1,0 +1,308 @@
+"""An archive: what it keeps equals the estimate, however it was made, and whatever happened."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+import pytest
+
+from daq.archive.answers import LOWEST_DB, Density, answer
+from daq.archive.execution import carried_out
+from daq.archive.sources import recordings_in, sort
+from daq.archive.spectra_file import SpectraFile, SpectraWriter
+from daq.archive.store import PLAN_FILE, Store
+from daq.archive.task import Task
+from daq.errors import ArchiveError, RecordingError, WrongArchiveError, WrongSettingError
+from daq.estimation.estimation import estimate
+from tests.daq.archive.months import (
+    HOUR_NS,
+    SETTINGS,
+    START_NS,
+    content,
+    fill,
+    record,
+    store_for,
+    tasks,
+    three,
+    with_reject,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.estimation.settings import Settings
+
+SNR = 25.0**2
+"""Of the recordings: rounding of the motion's spectra counts so many times in the noise's."""
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return three(tmp_path_factory.mktemp("recordings"))
+
+
+@pytest.fixture(scope="module")
+def store(paths: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Make an archive of all recordings, for tests that only read."""
+    made = store_for(tmp_path_factory.mktemp("archive"), paths[0])
+    assert fill(made, paths) == []
+    return made
+
+
+@pytest.fixture
+def copy(store: Store, tmp_path: Path) -> Store:
+    """Make an archive of all recordings, for tests that change it."""
+    shutil.copytree(store.folder, tmp_path / "copy")
+    return replace(store, folder=tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("free", "settings", "stretch"),
+    [(False, SETTINGS, "day"), (True, with_reject(SETTINGS), "hour")],
+)
+def test_the_pooled_estimate_is_that_of_all_recordings(
+    tmp_path: Path, *, free: bool, settings: Settings, stretch: str
+) -> None:
+    paths = three(tmp_path, hours=0.6, free=free)[: 2 if free else 3]
+    store = store_for(tmp_path / "store", paths[0], settings, stretch)
+    assert fill(store, paths) == []
+    entries, bad = store.entries()
+    pooled = answer(store.plan, entries, settings).pooled
+    direct = estimate(paths, settings)
+    assert not bad
+    assert (pooled.n_segments, pooled.n_dropped) == (direct.n_segments, direct.n_dropped)
+    assert pooled.n_effective == pytest.approx(direct.n_effective, rel=1e-12)
+    assert pooled.left_out == direct.left_out
+    rounding = 100 * SNR * np.finfo(float).eps
+    for name in ("noise_psd", "high"):
+        np.testing.assert_allclose(
+            getattr(pooled.results["three-sensor"], name),
+            getattr(direct.results["three-sensor"], name),
+            rtol=rounding,
+        )
+
+
+def test_stretches_are_whole_hours_of_utc(store: Store) -> None:
+    starts = []
+    for entry in store.entries()[0]:
+        with SpectraFile(entry.path) as file:
+            starts.append((file.stretches["start_utc_ns"] - START_NS) / HOUR_NS)
+            csm = file.csm(0)
+            assert np.array_equal(csm, csm.swapaxes(1, 2).conj())
+    assert [list(each) for each in starts] == [[0, 1, 2], [9, 10, 11], [24, 25, 26]]
+
+
+def test_processes_that_were_interrupted_and_resumed_write_the_same_bytes(
+    paths: list[Path], store: Store, tmp_path: Path
+) -> None:
+    other = store_for(tmp_path / "other", paths[0])
+    outcomes = carried_out(tasks(other, sort(paths, ()).new), jobs=2)
+    assert next(outcomes).failure == ""
+    outcomes.close()  # ends the processes, whatever they do
+    with other.writing():
+        assert fill(other, paths) == []
+    assert content(other) == content(store)
+
+
+def test_only_new_recordings_are_taken(paths: list[Path], copy: Store, tmp_path: Path) -> None:
+    moved = tmp_path / "moved.h5"
+    shutil.copyfile(paths[0], moved)  # another name and time, the same run
+    longer = record(tmp_path / "four.h5", begin_ns=START_NS + 50 * HOUR_NS, seed=4)
+    found = sort([moved, *paths, longer], copy.entries()[0])
+    assert [path for _, path in found.new] == [longer]
+    assert found.current == [moved, *paths]
+
+
+def test_a_recording_that_has_grown_replaces_what_was_kept(paths: list[Path], copy: Store) -> None:
+    entry = copy.entries()[0][0]
+    with h5py.File(entry.path, "r+") as file:
+        file.attrs["source_samples"] -= 1000
+        file.attrs["source_bytes"] -= 1
+    assert fill(copy, paths) == []
+    assert len(copy.entries()[0]) == len(paths)
+    assert sort(paths, copy.entries()[0]).new == []
+
+
+def _killed_while_writing(path: Path) -> None:
+    writer = SpectraWriter(path, n_freqs=51, n_channels=6)
+    writer.append(0, 1, np.zeros((51, 6, 6), dtype=np.complex128))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_a_killed_process_left_is_never_taken_for_spectra(
+    paths: list[Path], copy: Store
+) -> None:
+    before = content(copy)
+    process = multiprocessing.get_context("fork").Process(
+        target=_killed_while_writing, args=(copy.folder / "killed.h5",)
+    )
+    process.start()
+    process.join()
+    process.close()
+    assert len(content(copy)) == len(before) + 1
+    assert len(copy.entries()[0]) == len(paths)
+    with copy.writing() as n_unfinished:
+        assert n_unfinished == 1
+    assert content(copy) == before
+
+
+def test_a_task_that_fails_is_reported_and_the_others_are_done(
+    paths: list[Path], store: Store, tmp_path: Path
+) -> None:
+    other = store_for(tmp_path / "other", paths[0])
+    work = tasks(other, sort(paths, ()).new)
+    work.insert(1, Task("no.h5", "nowhere/no.h5", "[" * 10**5, work[0].software))
+    outcomes = list(carried_out(work))
+    assert [bool(each.failure) for each in outcomes].count(True) == 1
+    assert content(other) == content(store)
+
+
+def test_one_command_writes_at_a_time(copy: Store) -> None:
+    with (
+        copy.writing(),
+        pytest.raises(ArchiveError, match="another command is writing"),
+        copy.writing(),
+    ):
+        pass
+
+
+def test_settings_of_the_archive_cannot_be_mixed(copy: Store) -> None:
+    changed = copy.plan.changed({"unit": "g", "segment": 10.0, "band": None}, "hour")
+    assert (changed.unit, changed.segment) == ("g", 10.0)
+    with pytest.raises(WrongArchiveError, match=r"--segment 20.0 .*--overlap 0.1 .*--stretch day"):
+        copy.plan.changed({"segment": 20.0, "overlap": 0.1}, "day")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"octaves": True}, "--no-octaves"), ({"segment": 7200.0}, "choose --stretch day")],
+)
+def test_settings_that_no_stretch_can_have_are_refused(
+    paths: list[Path], tmp_path: Path, settings: dict[str, object], message: str
+) -> None:
+    with pytest.raises(WrongSettingError, match=message):
+        store_for(tmp_path / "no", paths[0], replace(SETTINGS, **settings))  # type: ignore[arg-type]  # of several types
+
+
+def test_recordings_of_other_sensors_are_named_and_the_rest_taken(
+    paths: list[Path], tmp_path: Path
+) -> None:
+    other = record(tmp_path / "other.h5", names="ABD")
+    text = tmp_path / "text.h5"
+    text.write_text("no recording")
+    store = store_for(tmp_path / "store", paths[0])
+    failures = fill(store, [other, text, *paths])
+    assert [("text.h5" in each, "other.h5" in each) for each in failures] == [
+        (True, False),
+        (False, True),
+    ]
+    assert "D (X in m/s²" in failures[1]
+    assert len(store.entries()[0]) == len(paths)
+
+
+def test_newer_formats_are_refused_by_name(copy: Store) -> None:
+    path = copy.entries()[0][1].path
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = 2
+    with pytest.raises(WrongArchiveError, match=rf"{path.name}: format version 2 is newer"):
+        copy.entries()
+    plan = copy.folder / PLAN_FILE
+    plan.write_text(plan.read_text().replace('"format_version": 1', '"format_version": 7'))
+    with pytest.raises(WrongArchiveError, match=r"archive.json: format version 7 is newer"):
+        Store.open(copy.folder)
+
+
+class _Executed:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, ("executed",)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content[: len(content) // 2],
+        lambda content: b"\0" * len(content),
+        lambda content: pickle.dumps(_Executed()) + content[:0],
+        lambda content: content[:0],
+    ],
+)
+def test_damaged_files_are_named_left_out_and_made_again(
+    paths: list[Path], copy: Store, store: Store, damage: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(copy.folder.parent)
+    path = copy.entries()[0][1].path
+    path.write_bytes(damage(path.read_bytes()))  # type: ignore[operator]  # a function
+    entries, bad = copy.entries()
+    assert len(entries) == len(paths) - 1
+    assert len(bad) == 1
+    assert path.name in bad[0]
+    assert fill(copy, paths) == []
+    assert content(copy) == content(store)
+    assert not (copy.folder.parent / "executed").exists()
+
+
+def test_a_stretch_with_a_wrong_checksum_is_named_and_left_out(copy: Store) -> None:
+    entry = copy.entries()[0][0]
+    with SpectraFile(entry.path) as file:
+        n_segments = file.stretches["n_segments"]
+    with h5py.File(entry.path) as found:
+        place = found["csm"].id.get_chunk_info(1).byte_offset
+    content = bytearray(entry.path.read_bytes())
+    content[place + 100] ^= 1
+    entry.path.write_bytes(content)
+    whole = answer(copy.plan, copy.entries()[0], SETTINGS)
+    assert len(whole.problems) == 1
+    assert "2026-08-31T01:00Z" in whole.problems[0]
+    assert whole.n_segments[0] == 3 * n_segments.sum() - n_segments[1] - whole.n_segments[1]
+
+
+def test_folders_that_are_no_archive_are_not_written_into(tmp_path: Path, store: Store) -> None:
+    assert Store.open(tmp_path / "none") is None
+    record(tmp_path / "one.h5", hours=0.01)
+    with pytest.raises(WrongArchiveError, match="not an archive"):
+        Store.open(tmp_path)
+    for text in ("", "[]", '{"format": "x"}', store.plan.to_json().replace("hour", "eon")):
+        (tmp_path / PLAN_FILE).write_text(text)
+        with pytest.raises(WrongArchiveError, match=PLAN_FILE):
+            Store.open(tmp_path)
+
+
+def test_recordings_in_folders(paths: list[Path], tmp_path: Path) -> None:
+    folder = paths[0].parent
+    assert recordings_in([folder, paths[0]], leave_out=tmp_path) == sorted(paths)
+    with pytest.raises(RecordingError, match="no recording"):
+        recordings_in([folder], leave_out=folder.parent)
+    with pytest.raises(RecordingError, match="no such file"):
+        recordings_in([tmp_path / "none.h5"], leave_out=tmp_path)
+
+
+def test_days_and_density_hold_the_noise_that_was_put_in(store: Store) -> None:
+    found = answer(store.plan, store.entries()[0], SETTINGS)
+    truth = (20.0**2 + 1 / 12) / 1e12 * 2 / 10.0  # noise and rounding, over half the rate
+    assert list((found.days_utc_ns - START_NS) / HOUR_NS) == [0, 24]
+    z = (found.levels.mean / truth - 1) / (found.levels.spread / truth)
+    assert np.abs(z).max() < 4.5  # of 2 days, 6 channels and some bands
+    assert found.density.n_stretches + found.density.n_short == 9
+    assert found.density.n_short == 6  # those of 10 and 20 minutes
+    median = found.density.percentile(0.5)
+    assert np.abs(median - 10 * np.log10(truth)).max() < 2
+    assert not found.changes.decided.any()  # two days tell nothing
+    assert np.isnan(found.drift.slope).all()
+
+
+def test_percentiles_of_the_density() -> None:
+    counts = np.zeros((1, 400, 2), dtype=np.int64)
+    counts[0, [100, 101, 102], 0] = 1, 2, 1
+    counts[0, 100, 1] = 1
+    density = Density(np.ones(1), counts, np.array([[0, 3]]), 4, 0)
+    assert density.percentile(0.5)[0, 0] == LOWEST_DB + 101.5
+    assert density.percentile(0.9)[0, 1] == pytest.approx(LOWEST_DB + 100.6)
+    assert np.isnan(density.percentile(0.5)[0, 1])  # most of them have no level
