@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
-from daq.formats.readers.csv_reader import read_delimited
+from daq.formats.readers.delimited.reader import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.readers.waveforms import waveform_parts
@@ -26,6 +26,7 @@ _BY_SUFFIX: dict[str, WholeFile] = {
     ".csv": read_delimited,
     ".tsv": read_delimited,
     ".txt": read_delimited,
+    ".lvm": read_delimited,
 }
 
 

@@ -1,0 +1,1 @@
+"""CSV and other delimited text, as loggers and spreadsheets write it."""
