@@ -30,8 +30,8 @@ LogFormatOption: TypeAlias = Annotated[
         "--log-format",
         metavar="FORMAT",
         rich_help_panel=_PANEL,
-        help="text, or json: one JSON object per line, and no other output on standard error"
-        " (default text).",
+        help="text, or json: one JSON object per line, and no other output on standard error;"
+        " or journal: entries of systemd's journal (default text).",
         show_default=False,
     ),
 ]

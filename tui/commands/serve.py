@@ -24,6 +24,7 @@ from tui.service.clock import SystemTime
 from tui.service.finish import options_table
 from tui.service.hooks import Teller
 from tui.service.locks import Lock
+from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier
 from tui.service.places import file_name, service_lock
 from tui.service.service import Service
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from tui.service.clock import Clock
+    from tui.service.run_state import Run
 
 _LOGGER = logging.getLogger(__name__)
 SHOWN = 5
@@ -139,6 +141,10 @@ async def serve(
             except (HuddleError, OSError) as error:
                 _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 
+        def told(run: Run) -> None:
+            metrics.note(run)
+            teller.tell(run)
+
         teller = Teller(lambda: service.bench.hooks, store, folder, clock)
         service = Service(
             bench,
@@ -147,9 +153,10 @@ async def serve(
             clock=clock,
             options=options_table(wanted),
             reload=lambda: _again(path, wanted, bench),
-            tell=teller.tell,
+            tell=told,
             tidy=tidied,
         )
+        metrics = ServiceMetrics(service, teller)
         _on_signals(service.request_stop, service.request_reload)
         helpers = [
             asyncio.create_task(teller.work()),
@@ -157,7 +164,11 @@ async def serve(
         ]
         _LOGGER.info("serving %s; recordings go to %s", bench.name, folder)
         try:
-            await service.run()
+            with contextlib.ExitStack() as stack:
+                if bench.metrics is not None:
+                    port = stack.enter_context(metrics.served(bench.metrics))
+                    _LOGGER.info("metrics at http://%s:%d/metrics", bench.metrics.address, port)
+                await service.run()
         finally:
             notifier.send("STOPPING=1")
             for task in helpers:

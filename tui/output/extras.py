@@ -11,7 +11,13 @@ from daq.errors import HuddleError
 if TYPE_CHECKING:
     from types import ModuleType
 
-_EXTRA = {"xarray": "notebook", "pandas": "notebook", "matplotlib": "report", "jinja2": "report"}
+_EXTRA = {
+    "xarray": "notebook",
+    "pandas": "notebook",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "prometheus_client": "metrics",
+}
 
 
 class MissingPackageError(HuddleError, ImportError):

@@ -22,7 +22,7 @@ from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
 from tui.service.run_state import Run, RunState
 from tui.service.store import StoreError
-from tui.service.window import Window
+from tui.service.window import Window, free_space
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -110,6 +110,10 @@ class Service:
     def waiting(self) -> tuple[int, int]:
         """Numbers of runs that wait to be recorded, and to be estimated."""
         return self._windows.qsize(), self._estimates.qsize()
+
+    def free(self) -> int | None:
+        """Return the bytes of free space for recordings; None if that cannot be told."""
+        return free_space(self.bench.recording_directory)
 
     async def run(self) -> None:
         """Serve until a stop is requested.
@@ -224,15 +228,13 @@ class Service:
             now = self._clock.now()
             if run.state is RunState.DUE:
                 self._tidy(self.bench)
-                window = self._window()
-                reason = self._obstacle(run, now, window)
+                reason = self._obstacle(run, now)
                 if reason:
                     self._miss(run, reason)
                     continue
                 run = run.to(RunState.RECORDING, started=now)
                 self._note(run)
-            else:
-                window = self._window()
+            window = self._window()
             self.recording, self.window = run, window
             try:
                 run = await window.record(run)
@@ -244,11 +246,11 @@ class Service:
             if run.state is RunState.ESTIMATING:
                 self._estimates.put_nowait(run)
 
-    def _obstacle(self, run: Run, now: datetime, window: Window) -> str:
+    def _obstacle(self, run: Run, now: datetime) -> str:
         """Return why a run cannot start, or nothing."""
         if not run.queue and now - run.due > GRACE:
             return BUSY
-        free, least = window.free(), self.bench.storage.min_free
+        free, least = self.free(), self.bench.storage.min_free
         if free is not None and free < least:
             return f"{free / 1e6:.0f} MB of free space; expected at least {least / 1e6:.0f} MB"
         return ""

@@ -11,7 +11,7 @@ import contextlib
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from daq.acquisition.recorder import recording_path
 from daq.errors import HuddleError, RecordingError
@@ -44,8 +44,8 @@ class Recorder(Protocol):
         """Wait this long, or until it has ended; return whether it has."""
         ...
 
-    async def progress(self) -> float | None:
-        """Return the seconds that are safe on disk, or None where it does not answer."""
+    async def status(self) -> dict[str, Any] | None:
+        """Return what it answers to ``status``; None where it does not answer."""
         ...
 
     async def stop(self) -> None:
@@ -209,8 +209,8 @@ class _OwnRecorder:
             self._close()
         return ended
 
-    async def progress(self) -> float | None:
-        return await _progress(self._process.out)
+    async def status(self) -> dict[str, Any] | None:
+        return await _status(self._process.out)
 
     async def stop(self) -> None:
         await asyncio.to_thread(self._process.stop)
@@ -257,8 +257,8 @@ class _FoundRecorder:
         self._end()
         return True
 
-    async def progress(self) -> float | None:
-        return await _progress(self._out)
+    async def status(self) -> dict[str, Any] | None:
+        return await _status(self._out)
 
     async def stop(self) -> None:
         with contextlib.suppress(HuddleError):
@@ -316,12 +316,12 @@ async def _taken(mark: Path) -> Lock:
         await asyncio.sleep(POLL)
 
 
-async def _progress(out: Path) -> float | None:
+async def _status(out: Path) -> dict[str, Any] | None:
     try:
         answer = await asyncio.to_thread(ask, out, "status")
-        return float(answer["elapsed"])
-    except (HuddleError, OSError, KeyError, TypeError, ValueError):
+    except (HuddleError, OSError, ValueError):
         return None
+    return answer if isinstance(answer.get("elapsed"), (int, float)) else None
 
 
 def _mark(out: Path) -> Path:

@@ -13,7 +13,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from daq.acquisition.retention import remove_run
-from daq.errors import HuddleError
+from daq.errors import HuddleError, RecordingError
 from daq.recording.storage.locking import is_being_written
 from tui.service.run_state import RunState
 
@@ -95,12 +95,13 @@ def remove(run: Run, folder: Path) -> None:
 
     Raises
     ------
-    OSError
-        If one cannot be removed.
+    RecordingError, OSError
+        If one is being written or cannot be removed.
     """
     paths = [folder / part for part in run.parts]
-    if any(path.exists() and is_being_written(path) for path in paths):
-        return
+    written = next((path for path in paths if path.exists() and is_being_written(path)), None)
+    if written is not None:
+        raise RecordingError(f"{written}: another program is writing it or has it open")
     for path in paths:
         remove_run(path)
 

@@ -12,7 +12,7 @@ import shutil
 from dataclasses import replace
 from datetime import timedelta
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
@@ -76,6 +76,8 @@ class Window:
     ) -> None:
         self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
         self._folder, self._min_free, self._shortest = folder, min_free, shortest
+        self.status: dict[str, Any] | None = None
+        """What the recorder last said of itself and its sensors."""
         self.progressed_at: float | None = None
         """Time of the event loop at which the recorder last made progress; None before."""
 
@@ -142,12 +144,12 @@ class Window:
             if self._stop.is_set():
                 await recorder.stop()
                 return _End.WITH_SERVICE, ""
-            if (free := self.free()) is not None and free < self._min_free:
+            if (free := free_space(self._folder)) is not None and free < self._min_free:
                 await recorder.stop()
                 return _End.EARLY, f"recording closed at {_size(free)} of free space"
-            progress = await recorder.progress()
-            if progress is not None and progress != known:
-                known, since = progress, self._clock.now()
+            self.status = await recorder.status()
+            if self.status is not None and self.status["elapsed"] != known:
+                known, since = self.status["elapsed"], self._clock.now()
                 self.progressed_at = asyncio.get_running_loop().time()
             elif self._clock.now() - since > STALL:
                 stalled = f"the recorder made no progress for {STALL.total_seconds():.0f} s"
@@ -162,20 +164,13 @@ class Window:
         said = False
         while True:
             await self._clock.sleep(min(seconds, max(0.0, self._rest(run))), self._stop)
-            free = self.free()
+            free = free_space(self._folder)
             is_full = free is not None and free < self._min_free
             if not is_full or self._stop.is_set() or self._rest(run) <= self._shortest:
                 return run
             if not said:
                 _LOGGER.warning("%s of free space; the recording waits for more", _size(free or 0))
                 said = True
-
-    def free(self) -> int | None:
-        """Return the bytes of free space for recordings; None if that cannot be told."""
-        try:
-            return shutil.disk_usage(self._folder).free
-        except OSError:
-            return None
 
     def _existing(self, run: Run) -> tuple[str, ...]:
         return tuple(part for part in run.parts if (self._folder / part).exists())
@@ -203,3 +198,11 @@ class Window:
 
 def _size(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.0f} MB"
+
+
+def free_space(folder: Path) -> int | None:
+    """Return the bytes of free space in a folder; None if that cannot be told."""
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return None

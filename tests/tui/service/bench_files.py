@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daq.bench.loading import parse
 from daq.errors import HuddleError
@@ -79,9 +79,11 @@ class FakeRecorder:
             return left <= seconds
         return True
 
-    async def progress(self) -> float | None:
+    async def status(self) -> dict[str, Any] | None:
         """Return what is safe."""
-        return None if self.steps.is_stuck else asyncio.get_running_loop().time()
+        elapsed = asyncio.get_running_loop().time()
+        sensors = {"a": {"state": "live", "samples": 7, "missing": 2, "gaps": 1}}
+        return None if self.steps.is_stuck else {"elapsed": elapsed, "sensors": sensors}
 
     async def stop(self) -> None:
         """End."""

@@ -250,7 +250,8 @@ async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
 ) -> None:
     place = Place(tmp_path)
     free = 10**9
-    monkeypatch.setattr("tui.service.window.Window.free", lambda _: free)
+    for module in ("window", "service"):
+        monkeypatch.setattr(f"tui.service.{module}.free_space", lambda _: free)
     service = place.service()
     task = asyncio.create_task(service.run())
     await asyncio.sleep(HOUR + 70)  # 13:01:40

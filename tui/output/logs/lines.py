@@ -57,13 +57,17 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        entry |= {key: value for key, value in vars(record).items() if key not in _RESERVED}
-        trace = _traceback(self, record)
-        if trace:
-            entry["traceback"] = trace
+        entry |= fields_of(record)
         from tui.output.console import finite
 
         return json.dumps(finite(entry), default=str)
+
+
+def fields_of(record: logging.LogRecord) -> dict[str, Any]:
+    """Return the typed fields of a record, and its traceback where it has one."""
+    fields = {key: value for key, value in vars(record).items() if key not in _RESERVED}
+    trace = _traceback(logging.Formatter(), record)
+    return fields | {"traceback": trace} if trace else fields
 
 
 class _ConsoleHandler(logging.Handler):
@@ -105,13 +109,17 @@ def configure(
     Raises
     ------
     OSError
-        The file cannot be opened.
+        The file cannot be opened, or there is no journal.
     """
     from tui.output.console import reserve_standard_error
 
     handler: logging.Handler
     if file is not None:
         handler = logging.FileHandler(file, encoding="utf-8")
+    elif style is LogFormat.JOURNAL:
+        from tui.output.logs.journal import JournalHandler
+
+        handler = JournalHandler(fields_of)
     else:
         handler = _ConsoleHandler() if screen else logging.NullHandler()
     handler.setFormatter(JsonFormatter() if style is LogFormat.JSON else TextFormatter())
@@ -126,7 +134,7 @@ def configure(
         logging.getLogger(name).setLevel(_number(level))
     for name in UNHEARD:
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    reserve_standard_error(for_json=style is LogFormat.JSON and file is None)
+    reserve_standard_error(for_json=style is not LogFormat.TEXT and file is None)
     logging.raiseExceptions = False  # a full disk below standard error
     logging.captureWarnings(True)
 

@@ -12,6 +12,8 @@ class LogFormat(StrEnum):
     """Time, level, logger, message."""
     JSON = "json"
     """One JSON object per line: ``time``, ``level``, ``logger``, ``message``, and typed fields."""
+    JOURNAL = "journal"
+    """Entries of systemd's journal with typed fields, and nothing on standard error."""
 
 
 class LogLevel(StrEnum):

@@ -1,0 +1,104 @@
+"""Hooks: what they read, how often they are tried, and that they are told after a restart."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.unattended import Hooks
+from tests.tui.service.bench_files import HOURLY, START, Place, VirtualClock
+from tui.service.hooks import Teller, events_of, run_hook
+from tui.service.run_state import BandNoise, Run, RunState
+from tui.service.store import RunStore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell")
+NOISE = BandNoise(
+    "a", "M", "S1", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 9e-13, float("nan")
+)
+
+
+def done(verdict: str = "") -> Run:
+    run = Run("lab", "hourly", START, 60.0).to(RunState.RECORDING, parts=("a.h5",))
+    return run.to(RunState.ESTIMATING).to(RunState.DONE, verdict=verdict, noise=(NOISE,))
+
+
+def test_each_outcome_has_its_hooks() -> None:
+    every = Hooks(on_finished=("f",), on_limit=("l",), on_failed=("x",), on_missed=("m",))
+    assert events_of(done("pass"), every) == ("on_finished",)
+    assert events_of(done("not-decided"), every) == ("on_finished",)
+    assert events_of(done("fail"), every) == ("on_finished", "on_limit")
+    assert events_of(done("fail"), Hooks(on_limit=("l",))) == ("on_limit",)
+    planned = Run("lab", "hourly", START, 60.0)
+    assert events_of(planned, every) == ()
+    assert events_of(planned.to(RunState.MISSED), every) == ("on_missed",)
+    recorded = planned.to(RunState.RECORDING)
+    assert events_of(recorded.to(RunState.FAILED), every) == ("on_failed",)
+
+
+async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path) -> None:
+    script = (
+        f"echo x >> {tmp_path}/tries; test $(wc -l < {tmp_path}/tries) -ge 2 && cat > {tmp_path}/in"
+    )
+    hooks = Hooks(on_limit=("sh", "-c", script), retries=2, retry_after=0.001)
+    store = RunStore(tmp_path)
+    run = done("fail")
+    run = Run(**{name: getattr(run, name) for name in Run.__slots__} | {"untold": ("on_limit",)})
+    store.save(run)
+    (tmp_path / "a.json").write_text("{}", encoding="utf-8")
+    teller = Teller(lambda: hooks, store, tmp_path, VirtualClock())
+    task = asyncio.create_task(teller.work())
+    teller.tell(run)
+    async with asyncio.timeout(60):
+        while True:
+            if not store.runs()[0].untold:
+                break
+            await asyncio.sleep(0.01)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    document = json.loads((tmp_path / "in").read_text(encoding="utf-8"))
+    assert document["event"] == "on_limit"
+    assert document["verdict"] == "fail"
+    assert document["recordings"] == [str(tmp_path / "a.h5")]
+    assert document["result"] == str(tmp_path / "a.json")
+    assert document["noise"][0]["serial_number"] == "S1"
+    assert document["noise"][0]["high"] is None
+    assert (tmp_path / "tries").read_text(encoding="utf-8").count("x") == 2
+    assert teller.n_failed == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        (("sh", "-c", "echo no mail >&2; exit 4"), "sh: exit code 4: no mail"),
+        (("sh", "-c", "sleep 600 & wait"), "sh: took longer than 0.2 s and was ended"),
+        (("/no/such/program",), "/no/such/program: cannot be started"),
+        (("true",), ""),
+    ],
+)
+async def test_what_goes_wrong_is_said(command: tuple[str, ...], problem: str) -> None:
+    said = await run_hook(command, b"{}\n" * 100_000, 0.2 if "sleep" in str(command) else 60)
+    assert said.startswith(problem)
+    assert bool(said) == bool(problem)
+
+
+@pytest.mark.virtual_time
+async def test_what_was_not_told_is_told_by_the_next_service(tmp_path: Path) -> None:
+    place = Place(tmp_path, HOURLY + '[hooks]\non_finished = ["true"]\non_missed = ["true"]\n')
+    await place.serve(4600.0)
+    (run, _) = place.store.runs()
+    assert run.untold == ("on_finished",)
+    place.told.clear()
+    place.clock.set_by += timedelta(hours=1)
+    await place.serve(60.0)
+    assert [(run.state, run.untold) for run in place.told] == [
+        (RunState.DONE, ("on_finished",)),
+        (RunState.MISSED, ("on_missed",)),
+    ]

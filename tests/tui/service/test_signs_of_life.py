@@ -1,0 +1,127 @@
+"""What systemd and Prometheus are told."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import sys
+import urllib.request
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.unattended import Metrics
+from tests.tui.service.bench_files import HOURLY, Place
+from tui.output.logs.journal import JournalHandler
+from tui.output.logs.lines import fields_of
+from tui.service.hooks import Teller
+from tui.service.metrics import MetricsError, ServiceMetrics
+from tui.service.notify import Notifier, watchdog_interval
+from tui.service.supervision import is_alive, signs_of_life
+from tui.service.window import STALL
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="sockets with names")
+
+
+@pytest.mark.virtual_time
+async def test_the_watchdog_is_fed_by_the_progress_of_the_recorder(tmp_path: Path) -> None:
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(address)
+        systemd.setblocking(False)
+        place = Place(tmp_path, HOURLY + 'duration = "40min"\n')
+        service = place.service()
+        tasks = [
+            asyncio.create_task(service.run()),
+            asyncio.create_task(signs_of_life(service, Notifier(address))),
+        ]
+
+        def received() -> list[str]:
+            found = []
+            while True:
+                try:
+                    found.append(systemd.recv(4096).decode())
+                except BlockingIOError:
+                    return found
+
+        for _ in range(4):
+            await asyncio.sleep(20.0)
+        assert received()[0] == "READY=1"
+        for _ in range(180):
+            await asyncio.sleep(20.0)
+            last = received()[-1]
+        assert last.startswith("STATUS=recording run hourly")
+        assert "WATCHDOG=1" in last
+        loop = asyncio.get_running_loop()
+        assert is_alive(service, loop.time())
+        assert not is_alive(service, loop.time() + 3 * STALL.total_seconds())
+        service.request_stop()
+        tasks[1].cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def test_the_interval_is_half_of_what_systemd_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+    assert watchdog_interval() is None
+    monkeypatch.setenv("WATCHDOG_USEC", "6000000")
+    assert watchdog_interval() == 3.0
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    assert watchdog_interval() is None
+
+
+@pytest.mark.virtual_time
+async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
+    place = Place(tmp_path, HOURLY)
+    service = place.service()
+    teller = Teller(lambda: service.bench.hooks, place.store, tmp_path, place.clock)
+    metrics = ServiceMetrics(service, teller)
+    task = asyncio.create_task(service.run())
+    await asyncio.sleep(2 * 3600.0)  # 14:00:30
+    for run in place.told:
+        metrics.note(run)
+    with metrics.served(Metrics(port=0)) as port:
+        with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):
+            metrics.served(Metrics(port=port)).__enter__()
+        address = f"http://127.0.0.1:{port}/metrics"
+        text = await asyncio.to_thread(_read, address)
+    service.request_stop()
+    await task
+    lines = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+    assert lines['huddle_runs_total{state="done"}'] == "1.0"
+    assert lines['huddle_runs_total{state="missed"}'] == "0.0"
+    assert lines["huddle_recording"] == "1.0"
+    assert lines['huddle_sensor_samples{sensor="a"}'] == "7.0"
+    assert lines['huddle_sensor_state{sensor="a",state="live"}'] == "1.0"
+    assert float(lines["huddle_disk_free_bytes"]) > 0
+
+
+def _read(address: str) -> str:
+    with urllib.request.urlopen(address) as answer:  # noqa: S310 - our own
+        return str(answer.read().decode())
+
+
+def test_metrics_stay_on_this_computer_unless_the_bench_file_says_otherwise() -> None:
+    assert Metrics(port=9310).address == "127.0.0.1"
+    with pytest.raises(ValueError, match="expected an IP address"):
+        Metrics(port=9310, address="everywhere")
+
+
+def test_the_journal_gets_typed_fields(tmp_path: Path) -> None:
+    address = str(tmp_path / "journal")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
+        journal.bind(address)
+        handler = JournalHandler(fields_of, address)
+        record = logging.makeLogRecord(
+            {"name": "tui", "levelno": logging.ERROR, "msg": "two\nlines", "run": "failed", "n": 3}
+        )
+        handler.emit(record)
+        handler.close()
+        entry = journal.recv(4096)
+    assert b"MESSAGE\n\x09\0\0\0\0\0\0\0two\nlines\n" in entry
+    assert b"PRIORITY=3\n" in entry
+    assert b"HUDDLE_RUN=failed\n" in entry
+    assert b"HUDDLE_N=3\n" in entry

@@ -1,0 +1,154 @@
+"""Metrics of the service for Prometheus, served over HTTP on the address in the bench file."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from daq.errors import HuddleError
+from tui.output.extras import load
+from tui.service.run_state import Run, RunState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daq.bench.unattended import Metrics
+    from tui.service.hooks import Teller
+    from tui.service.service import Service
+
+
+class MetricsError(HuddleError):
+    """The metrics cannot be served."""
+
+
+class ServiceMetrics:
+    """Counts what the service tells, and looks at it when asked.
+
+    Parameters
+    ----------
+    service : Service
+    teller : Teller
+    """
+
+    def __init__(self, service: Service, teller: Teller) -> None:
+        self._service, self._teller = service, teller
+        self._counts = dict.fromkeys((RunState.DONE, RunState.FAILED, RunState.MISSED), 0)
+        self._last: dict[RunState, float] = {}
+        self._done: Run | None = None
+
+    def note(self, run: Run) -> None:
+        """Count a run that has reached its last state."""
+        if run.state not in self._counts:
+            return
+        self._counts[run.state] += 1
+        if run.ended is not None:
+            self._last[run.state] = run.ended.timestamp()
+        if run.state is RunState.DONE:
+            self._done = run
+
+    @contextlib.contextmanager
+    def served(self, settings: Metrics) -> Iterator[int]:
+        """Serve the metrics while the context lasts; yields the port.
+
+        Raises
+        ------
+        MissingPackageError
+            Without prometheus-client.
+        MetricsError
+            If the address is taken or not one of this computer.
+        """
+        client = load("prometheus_client")
+        registry = client.CollectorRegistry()
+        registry.register(self)
+        try:
+            server, thread = client.start_http_server(
+                settings.port, addr=settings.address, registry=registry
+            )
+        except OSError as error:
+            raise MetricsError(
+                f"metrics: {settings.address} port {settings.port}: {error.strerror}; expected a"
+                " free port of this computer"
+            ) from error
+        try:
+            yield int(server.server_port)
+        finally:
+            server.shutdown()
+            server.server_close()
+            thread.join()
+
+    def collect(self) -> Iterator[Any]:
+        """Yield all metrics, as the library asks for them."""
+        core = load("prometheus_client.core")
+
+        def gauge(name: str, text: str, value: float | None) -> Iterator[Any]:
+            if value is not None:
+                yield core.GaugeMetricFamily(name, text, value=value)
+
+        service = self._service
+        window, bench = service.window, service.bench
+        runs = core.CounterMetricFamily(
+            "huddle_runs", "Runs since the start of the service.", labels=["state"]
+        )
+        last = core.GaugeMetricFamily(
+            "huddle_last_run_timestamp_seconds", "End of the last run.", labels=["state"]
+        )
+        for state, count in self._counts.items():
+            runs.add_metric([state], count)
+            if state in self._last:
+                last.add_metric([state], self._last[state])
+        yield runs
+        yield last
+        recording = service.recording
+        yield from gauge("huddle_recording", "Whether a run is recorded.", recording is not None)
+        planned = service.next_run
+        yield from gauge(
+            "huddle_next_run_timestamp_seconds",
+            "Time at which the next run is due.",
+            None if planned is None else planned.due.timestamp(),
+        )
+        queue = core.GaugeMetricFamily("huddle_queue", "Runs that wait.", labels=["for"])
+        for name, number in zip(("recording", "estimate"), service.waiting, strict=True):
+            queue.add_metric([name], number)
+        yield queue
+        yield from gauge("huddle_disk_free_bytes", "Free space.", service.free())
+        least = bench.storage.min_free
+        yield from gauge("huddle_disk_min_free_bytes", "Space at which recordings end.", least)
+        yield core.CounterMetricFamily(
+            "huddle_hooks_given_up", "Hooks without success.", value=self._teller.n_failed
+        )
+        status = None if window is None else window.status
+        if status is not None:
+            yield from _sensors(core, status)
+        if self._done is not None:
+            yield _noise(core, self._done)
+
+
+def _sensors(core: Any, status: dict[str, Any]) -> Iterator[Any]:  # noqa: ANN401 - a module
+    names = ("samples", "missing", "gaps")
+    texts = ("Samples safe on disk.", "Samples missing in gaps.", "Gaps.")
+    families = [
+        core.GaugeMetricFamily(
+            f"huddle_sensor_{name}", f"{text} Of the recording that runs.", labels=["sensor"]
+        )
+        for name, text in zip(names, texts, strict=True)
+    ]
+    state = core.GaugeMetricFamily(
+        "huddle_sensor_state", "1 for the state that the sensor has.", labels=["sensor", "state"]
+    )
+    for sensor, found in status.get("sensors", {}).items():
+        for name, family in zip(names, families, strict=True):
+            family.add_metric([sensor], found[name])
+        state.add_metric([sensor, str(found["state"])], 1)
+    yield from families
+    yield state
+
+
+def _noise(core: Any, run: Run) -> Any:  # noqa: ANN401 - a module, and a class of it
+    labels = ["sensor", "channel", "serial_number", "unit", "low_hz", "high_hz"]
+    family = core.GaugeMetricFamily(
+        "huddle_noise_psd", "Mean noise of the last run in unit²/Hz.", labels=labels
+    )
+    for each in run.noise:
+        values = [str(getattr(each, name)) for name in labels]
+        family.add_metric(values, each.psd)
+    return family
