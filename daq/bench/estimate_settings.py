@@ -17,6 +17,7 @@ from daq.bench.durations import format_duration, parse_duration
 
 METHODS = ("two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
 CLOCKS = ("refined", "arrivals", "nominal")
+EQUALISATIONS = ("auto", "known", "estimated", "off")
 TRENDS = ("none", "constant", "linear")
 WINDOWS = (
     "rectangular",
@@ -155,6 +156,10 @@ def _method_or_methods(value: tuple[str, ...]) -> object:
 
 def _clocks(value: object) -> str:
     return one_of(value, CLOCKS)
+
+
+def _equalisation(value: object) -> str:
+    return one_of(value, EQUALISATIONS)
 
 
 def _trend(value: object) -> str:
@@ -304,6 +309,17 @@ class EstimateSettings:
             metavar="SOURCE",
         ),
     ] = "refined"
+    equalise: Annotated[
+        Literal["auto", "known", "estimated", "off"],
+        Option(
+            "Filter sensors before the window so that all have one response: by the poles and zeros"
+            " of the bench file (known), by the responses that the averages show (estimated),"
+            " where unequal responses matter (auto), or not at all (off).",
+            check=_equalisation,
+            flags=("--equalise",),
+            metavar="MODE",
+        ),
+    ] = "auto"
     reject: Annotated[
         bool | None,
         Option(

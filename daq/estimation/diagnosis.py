@@ -10,13 +10,15 @@ import numpy as np
 from daq.estimation.noise_estimates import neighbours
 from daq.estimation.snapshot import (
     Diagnosis,
+    EdgeLeakage,
     FrequencyDiagnosis,
     SnapshotDiagnostics,
     Synchronisation,
 )
 from estimator.diagnostics.advice import Advice, Gain
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
-from estimator.diagnostics.kinds import Untested
+from estimator.diagnostics.equalisation import leakage_advice
+from estimator.diagnostics.kinds import Level, Untested
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -45,11 +47,41 @@ class Findings:
     stood_still: Mapping[int, float] = field(default_factory=dict)
     diagnosis: Diagnosis | None = None
     untested: Untested | None = Untested.UNFINISHED
+    edge_leakage: EdgeLeakage | None = None
+
+    @classmethod
+    def of(
+        cls,
+        found: tuple[Diagnosis | None, Untested | None],
+        edges: EdgeLeakage | None,
+        *,
+        bands: Sequence[Band],
+        dims: tuple[int, ...],
+        clipped: Mapping[int, float],
+        stood_still: Mapping[int, float],
+    ) -> Findings:
+        """Return findings with advice on leakage at the edges of segments, worst first."""
+        whole, untested = found
+        if whole is not None and edges is not None:
+            leaks = leakage_advice(
+                np.concatenate([band.frequencies for band in bands]),
+                edges.share,
+                edges.whole_share,
+                dims=dims,
+                n_effective=min(band.n_effective for band in bands),
+                equalised_by=edges.sources,
+            )
+            order = list(Level)
+            advice = sorted([*whole.advice, *leaks], key=lambda each: order.index(each.level))
+            whole = replace(whole, advice=tuple(advice))
+        return cls(clipped, stood_still, whole, untested, edges)
 
     def fits(self, frequency: FloatArray) -> bool:
         """Whether it is about these frequencies: with octaves, there are more as time goes by."""
-        found = self.diagnosis
-        return found is None or len(found.per_frequency.dimension) == len(frequency)
+        found, edges = self.diagnosis, self.edge_leakage
+        lengths = set() if found is None else {len(found.per_frequency.dimension)}
+        lengths |= set() if edges is None else {len(edges.left)}
+        return lengths <= {len(frequency)}
 
     def added_to(self, diagnostics: SnapshotDiagnostics) -> SnapshotDiagnostics:
         """Return diagnostics with these findings."""
@@ -59,6 +91,7 @@ class Findings:
             stood_still=self.stood_still,
             diagnosis=self.diagnosis,
             untested=self.untested,
+            edge_leakage=self.edge_leakage,
         )
 
 

@@ -26,6 +26,7 @@ from daq.bench.units import canonical
 from daq.errors import CannotAlignError
 from daq.estimation.clipping import clipped_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
+from daq.estimation.equalisation import ROUNDS, SETTLED, Equalisation
 from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
@@ -48,7 +49,7 @@ from daq.estimation.snapshot import (
     SensorTotals,
     Snapshot,
     SnapshotDiagnostics,
-    added_by_clocks,
+    added,
 )
 from daq.estimation.throttle import Throttle
 from estimator.spectra.segment_rejection import Reason
@@ -109,6 +110,13 @@ class Estimation:
                 self.settings.unit or self._passes[0].aligned.channels[0][1].unit
             )
             self._gains = known_gains(self.settings, self._passes[0].aligned.channels)
+            self._equalisation = Equalisation(
+                self.settings.equalise,
+                self._passes[0].welch,
+                self._passes[0].aligned.channels,
+                self._passes[0].aligned.dims,
+            )
+            self._filter()
         except BaseException:
             self.close()
             raise
@@ -149,7 +157,7 @@ class Estimation:
         """Seconds that the recording, as of the last `update`, lacks to hold one more segment."""
         last = self._passes[-1]
         welch = last.welch
-        end = last.n_seen * welch.hop + welch.segment_length
+        end = last.n_seen * welch.hop + welch.segment_length + 2 * last.reach
         return (end - last.aligned.n_available) / welch.sampling_rate
 
     def update(self, progress: Progress | None = None) -> bool:
@@ -180,6 +188,8 @@ class Estimation:
             each.advance(count)
         seen = self.n_seen
         if seen >= self._next_review:
+            if not self._equalisation.is_settled:
+                self._equalise_growing()
             for each in self._passes:
                 for _ in range(_MOST_LIVE_PASSES):
                     each.set_clocks()
@@ -206,10 +216,15 @@ class Estimation:
         WrongSettingError
             If nothing lies between start and end.
         """
-        for number, each in enumerate(self._passes):
+        for each in self._passes:
             each.aligned.refresh()
+        is_exact = all(each.aligned.is_exact for each in self._passes)
+        if not is_exact:
+            self._equalisation.reset()
+        for number, each in enumerate(self._passes):
             if each.n_seen and not each.aligned.is_exact:
                 self._passes[number] = Pass(each.recording, self.settings)
+        self._filter()
         check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
         done = self.n_seen
@@ -224,12 +239,52 @@ class Estimation:
             nonlocal total
             total += n
 
+        if is_exact and not self._equalisation.is_settled:
+            self._settle(count)  # before all segments are taken: most of them are taken once
         for each in self._passes:
             each.finish(count, repeat)
+        if not is_exact:  # clocks that are wrong look like responses that differ
+            self._equalise_in_rounds(count)
+            for each in self._passes:
+                each.advance(count)
         snapshot = self._snapshot(final=True)
         if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
             raise NoResultError(self._why_nothing(snapshot), snapshot)
         return snapshot
+
+    def _filter(self) -> None:
+        """Begin all passes again with the filters as they are now."""
+        for each in self._passes:
+            if each.filters is not self._equalisation.filters:
+                each.equalise(self._equalisation.filters)
+
+    def _equalise_growing(self) -> None:
+        """Find filters from the segments so far; for good once there are enough of them."""
+        enough = all(each.n_seen >= SETTLED and each.aligned.is_exact for each in self._passes)
+        if enough:
+            self._settle()
+        elif self._equalisation.revise(averages(self._passes)):
+            self._filter()
+        self._equalisation.is_settled = enough
+        for each in self._passes:
+            each.advance()
+
+    def _settle(self, progress: Callable[[int], None] | None = None) -> None:
+        """Find filters from the first segments: the same from a growing and a finished file."""
+        self._equalisation.reset()
+        for each in self._passes:
+            if each.filters is not self._equalisation.filters or each.n_seen > SETTLED:
+                each.equalise(self._equalisation.filters)
+            each.advance(progress, most=SETTLED)
+        self._equalise_in_rounds(progress)
+
+    def _equalise_in_rounds(self, progress: Callable[[int], None] | None) -> None:
+        for _ in range(ROUNDS):
+            if not self._equalisation.revise(averages(self._passes)):
+                break
+            self._filter()
+            for each in self._passes:
+                each.advance(progress, most=SETTLED)
 
     def snapshot(self) -> Snapshot:
         """Return the estimate as it stands, from the segments taken so far."""
@@ -239,8 +294,15 @@ class Estimation:
         first, last = self._passes[0], self._passes[-1]
         dims, channels = first.aligned.dims, first.aligned.channels
         usable = min(each.aligned.usable for each in self._passes)
+        raw = averages(self._passes)
         bands = tuple(
-            in_units(up_to(band, usable), channels, self._unit) for band in averages(self._passes)
+            in_units(
+                up_to(band, usable),
+                channels,
+                self._unit,
+                self._equalisation.response(band.frequencies),
+            )
+            for band in raw
         )
         if bands:
             frequency = np.concatenate([band.frequencies for band in bands])
@@ -267,15 +329,15 @@ class Estimation:
         )
         if final or self._diagnoses.is_due:
             with self._diagnoses:
-                self._findings = self._diagnose(bands, estimates)
+                self._findings = self._diagnose(raw, bands, estimates)
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
-        added = added_by_clocks(diagnostics.synchronisation, estimates.results)
+        too_much = added(diagnostics, estimates.results)
         return Snapshot(
             frequency=frequency,
             csm=csm,
             results={
-                name: found if added is None else replace(found, low=found.low - added)
+                name: found if too_much is None else replace(found, low=found.low - too_much)
                 for name, found in estimates.results.items()
             },
             refused=estimates.refused,
@@ -304,20 +366,25 @@ class Estimation:
             ),
         )
 
-    def _diagnose(self, bands: tuple[Band, ...], estimates: Estimates) -> Findings:
+    def _diagnose(
+        self, raw: tuple[Band, ...], bands: tuple[Band, ...], estimates: Estimates
+    ) -> Findings:
         """Say what the averages show of the test itself: costly, and so not at every snapshot."""
-        channels = self._passes[0].aligned.channels
+        dims, channels = self._passes[0].aligned.dims, self._passes[0].aligned.channels
         clipped = clipped_columns(self._recordings, channels)
         stood_still = still_for_a_while(self._passes, self.settings)
-        found, untested = diagnosis(
+        found = diagnosis(
             bands,
-            self._passes[0].aligned.dims,
+            dims,
             channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
             course=segment_course(self._passes, channels, self._unit),
         )
-        return Findings(clipped, stood_still, found, untested)
+        edges = self._equalisation.leakage(raw, channels, self._unit)
+        return Findings.of(
+            found, edges, bands=bands, dims=dims, clipped=clipped, stood_still=stood_still
+        )
 
     def _counting_rates(self) -> dict[str, float]:
         """Return the rates of the sensors whose samples are whole numbers, in Hz."""

@@ -94,9 +94,16 @@ def up_to(band: Band, usable: float) -> Band:
     return replace(band, csm=csm)
 
 
-def in_units(band: Band, channels: Channels, unit: str) -> Band:
-    """Return averages in ``unit**2/Hz``, the channels' responses taken out."""
+def in_units(
+    band: Band, channels: Channels, unit: str, filters: ComplexArray | None = None
+) -> Band:
+    """Return averages in ``unit**2/Hz``, the responses of channels and of their filters taken out.
+
+    `filters` has the shape (n_freqs, n_channels).
+    """
     response = responses(band.frequencies, channels, unit)
+    if filters is not None:
+        response = response * filters
     return band if np.all(response == 1) else replace(band, csm=scale(band.csm, response))
 
 

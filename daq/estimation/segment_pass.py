@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
+    from estimator.spectra.equaliser import Equaliser
 
     FloatArray = NDArray[np.float64]
 
@@ -65,6 +67,7 @@ class Pass:
         )
         self.n_channels = len(self.aligned.channels)
         self._settings = settings
+        self.filters: Equaliser | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -122,6 +125,16 @@ class Pass:
             return self.octaves.n_segments
         return self._n_taken if self._undisturbed is None else self.spectra.n_segments
 
+    def equalise(self, filters: Equaliser | None) -> None:
+        """Begin again, with samples filtered."""
+        self.filters = filters
+        self.restart()
+
+    @property
+    def reach(self) -> int:
+        """Samples that filters need before and after each; the lattice begins so many later."""
+        return 0 if self.filters is None else self.filters.reach
+
     @property
     def kept_at(self) -> NDArray[np.int64]:
         """Grid samples at which the segments of `single` begin."""
@@ -131,7 +144,7 @@ class Pass:
     @property
     def n_complete(self) -> int:
         """Segments of the lattice that are available now."""
-        beyond = self.aligned.n_available - self.welch.segment_length
+        beyond = self.aligned.n_available - self.welch.segment_length - 2 * self.reach
         return max(0, beyond // self.welch.hop + 1)
 
     @property
@@ -140,27 +153,36 @@ class Pass:
         if self.n_seen == 0:
             return 0.0
         length = (self.n_seen - 1) * self.welch.hop + self.welch.segment_length
-        return length / self.welch.sampling_rate
+        return (length + 2 * self.reach) / self.welch.sampling_rate
 
-    def advance(self, progress: Callable[[int], None] | None = None) -> None:
-        """Take every segment that is complete."""
-        hop, length = self.welch.hop, self.welch.segment_length
+    def advance(
+        self, progress: Callable[[int], None] | None = None, *, most: int | None = None
+    ) -> None:
+        """Take every segment that is complete; no more than the first `most` of all."""
+        hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
         at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
-        total = self.n_complete
+        total = self.n_complete if most is None else min(most, self.n_complete)
         pieces = [
             (first, min(at_once, total - first)) for first in range(self.n_seen, total, at_once)
         ]
 
-        def read(piece: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
+        def read(piece: tuple[int, int]) -> _Samples:
             first, count = piece
-            return self.aligned.read(first * hop, (first + count - 1) * hop + length)
-
-        for (first, count), (samples, valid) in zip(pieces, _ahead(read, pieces), strict=True):
-            starts = np.arange(count) * hop
+            begin, end = first * hop, (first + count - 1) * hop + length
+            samples, valid = self.aligned.read(begin, end + 2 * reach)
             usable = valid & self._finite(samples)
             self._silence(samples)
-            self.stillness.add(samples[: count * hop], usable[: count * hop])
-            clipped = self._clipped(first * hop, len(samples))
+            clipped = self._clipped(begin, len(samples))
+            raw, flat = samples[reach : reach + count * hop], usable[reach : reach + count * hop]
+            if self.filters is not None:
+                samples = self.filters.apply(np.where(usable[:, None], samples, 0.0))
+                usable = _surrounded(usable, reach)
+                clipped = None if clipped is None else ~_surrounded(~clipped, reach)
+            return _Samples(samples, usable, clipped, raw, flat)
+
+        for (first, count), part in zip(pieces, _ahead(read, pieces), strict=True):
+            samples, usable, clipped = part.samples, part.usable, part.clipped
+            self.stillness.add(part.raw, part.raw_usable)
             starts = np.arange(count) * hop
             whole = _whole(usable, starts, length)
             clean = whole if clipped is None else _whole(usable & ~clipped, starts, length)
@@ -173,7 +195,7 @@ class Pass:
                 self.octaves.add(samples[new:], complete[new:])
                 self._fed = first * hop + len(samples)
             else:
-                self._take(samples, starts, first * hop)
+                self._take(samples, starts, first * hop + reach)
             self._n_taken += len(starts)
             self.taken_at.append(self._positions(np.arange(first, first + count)))
             self._measure(samples, starts, first * hop)
@@ -289,7 +311,7 @@ class Pass:
         """Return middles of segments in seconds, and every sensor's delay there."""
         n_sensors = len(self.aligned.dims)
         taken = np.concatenate(self.taken_at) if self.taken_at else np.empty((0, n_sensors))
-        middle = np.arange(len(taken)) * self.welch.hop + self.welch.segment_length / 2
+        middle = self._middles(np.arange(len(taken)))
         return np.column_stack([middle / self.welch.sampling_rate, taken])
 
     def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
@@ -303,7 +325,7 @@ class Pass:
             window = get_window(self.welch.window, self.welch.segment_length)
             self._meter = DelayEstimator(self.welch.sampling_rate, window, columns)
         delays, std = self._meter.measure(samples, starts)
-        at = first + starts + self.welch.segment_length / 2
+        at = first + starts + self.reach + self.welch.segment_length / 2
         self.aligned.learn(
             np.asarray(at, dtype=np.float64),
             delays,
@@ -312,8 +334,28 @@ class Pass:
         )
 
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
-        middle = segments * float(self.welch.hop) + self.welch.segment_length / 2
-        return self.aligned.delays(np.asarray(middle, dtype=np.float64))
+        return self.aligned.delays(self._middles(segments))
+
+    def _middles(self, segments: NDArray[np.int64]) -> FloatArray:
+        """Return the middles of segments, in samples of the grid."""
+        middle = segments * float(self.welch.hop) + self.welch.segment_length / 2 + self.reach
+        return np.asarray(middle, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """Samples of a piece, filtered where sensors are equalised, and as they were read."""
+
+    samples: FloatArray
+    usable: NDArray[np.bool_]
+    clipped: NDArray[np.bool_] | None
+    raw: FloatArray
+    raw_usable: NDArray[np.bool_]
+
+
+def _surrounded(usable: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Return which samples, `reach` from either end, have usable ones as far as that around."""
+    return _whole(usable, np.arange(len(usable) - 2 * reach), 2 * reach + 1)
 
 
 def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:

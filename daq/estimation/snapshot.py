@@ -36,6 +36,10 @@ MOST_ADDED = 4.0
 """What clocks add goes with the square of what is left between them: twice its rms is allowed."""
 
 
+PREDICTED_WITHIN = 1.2
+"""Leakage at the edges of segments is predicted within 20 %."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChannelLabel:
     """Which channel a column of the result is, and its unit (of the motion, not of the PSD)."""
@@ -133,6 +137,39 @@ class Synchronisation:
     noise_bias: FloatArray | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeLeakage:
+    """What unequal responses of sensors leak into the noise at the edges of segments.
+
+    Attributes
+    ----------
+    left : float64, shape (n_freqs, n_channels)
+        Expected in the noise PSD, in unit**2/Hz; may be negative.
+    whole : float64, shape (n_freqs, n_channels)
+        The same without equalisation.
+    unseen : float64, shape (n_freqs, n_channels)
+        What equalisation may have left that averages do not show; likewise.
+    share, whole_share : float64, shape (n_freqs, n_channels)
+        What the first two are at least, over the noise estimate, in bands of third octaves.
+    sources : tuple of str
+        Where the responses come from that are equalised: "known" (the bench file) and
+        "estimated"; empty where nothing is.
+    """
+
+    left: FloatArray
+    whole: FloatArray
+    unseen: FloatArray
+    share: FloatArray
+    whole_share: FloatArray
+    sources: tuple[str, ...] = ()
+
+    @property
+    def most(self) -> FloatArray:
+        """What may be in the noise PSD at most, shape (n_freqs, n_channels)."""
+        found = PREDICTED_WITHIN * np.maximum(self.left, 0.0) + self.unseen
+        return np.where(np.isfinite(found), found, 0.0)
+
+
 def added_by_clocks(
     synchronisation: Synchronisation, results: Mapping[str, SelfNoise]
 ) -> FloatArray | None:
@@ -217,6 +254,8 @@ class SnapshotDiagnostics:
         segments before: it takes too long to be made for every snapshot.
     untested : Untested or None
         Why the model of one common motion was tested in no band; None where it was.
+    edge_leakage : EdgeLeakage or None
+        None where it is not known.
     """
 
     synchronisation: Synchronisation = field(default_factory=Synchronisation)
@@ -225,11 +264,22 @@ class SnapshotDiagnostics:
     stood_still: Mapping[int, float] = field(default_factory=dict)
     diagnosis: Diagnosis | None = None
     untested: Untested | None = Untested.UNFINISHED
+    edge_leakage: EdgeLeakage | None = None
 
     @property
     def advice(self) -> tuple[Advice, ...]:
         """Advice on the test; none before it is diagnosed."""
         return () if self.diagnosis is None else self.diagnosis.advice
+
+
+def added(diagnostics: SnapshotDiagnostics, results: Mapping[str, SelfNoise]) -> FloatArray | None:
+    """Return `Snapshot.added`."""
+    clocks, edges = added_by_clocks(diagnostics.synchronisation, results), diagnostics.edge_leakage
+    if edges is None or not results:
+        return clocks
+    psd = np.abs(next(iter(results.values())).noise_psd)
+    known = np.where(np.isfinite(psd), psd, 0.0)
+    return np.minimum(edges.most + (0.0 if clocks is None else clocks), known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,6 +383,14 @@ class Snapshot:
         an estimate.
         """
         return added_by_clocks(self.diagnostics.synchronisation, self.results)
+
+    @property
+    def added(self) -> FloatArray | None:
+        """What clocks and the edges of segments may have added to the noise PSD at most.
+
+        Shape and unit as of `added_by_clocks`.
+        """
+        return added(self.diagnostics, self.results)
 
     @property
     def data_psd(self) -> FloatArray:

@@ -65,7 +65,7 @@ def channel_means(
     edges = band_edges(frequency, band)
     correlation, width = correlation_of(settings), np.gradient(frequency)
     at_bound = (noise.flags & Flag.BOUNDARY) != 0
-    added = snapshot.added_by_clocks
+    added = snapshot.added
     means = [
         band_means(
             noise.noise_psd[:, column],

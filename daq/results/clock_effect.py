@@ -46,7 +46,7 @@ def added_in_bands(
 
     Shape (n_bands,), in unit²/Hz: no more than the noise itself, and 0 where it is not known.
     """
-    found = snapshot.added_by_clocks
+    found = snapshot.added
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if found is None or noise is None:
         return np.zeros(len(edges) - 1)

@@ -359,3 +359,27 @@ class Delay(Advice):
     kind: ClassVar[AdviceKind] = AdviceKind.DELAY
     delay: float
     delay_samples: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnequalResponses(Advice):
+    """Responses of `sensors` differ from those of others: motion leaks at the edges of segments.
+
+    Attributes
+    ----------
+    channel : int
+        Into whose noise most leaks.
+    share : float
+        What leaks at least, as a fraction of the noise estimate of that channel, in the third of
+        an octave where it is largest.
+    share_without : float
+        The same without equalisation.
+    equalised_by : tuple of str
+        "known", "estimated", both, or neither: where the responses come from that are equalised.
+    """
+
+    kind: ClassVar[AdviceKind] = AdviceKind.UNEQUAL_RESPONSES
+    channel: int
+    share: float
+    share_without: float
+    equalised_by: tuple[str, ...]

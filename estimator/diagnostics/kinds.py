@@ -59,6 +59,8 @@ class AdviceKind(enum.StrEnum):
     """A channel has the opposite sign of its counterpart."""
     GAIN = "gain"
     """A channel's gain differs from that of its counterpart."""
+    UNEQUAL_RESPONSES = "unequal-responses"
+    """Sensors with different responses leak motion into their noise at the edges of segments."""
     DELAY = "delay"
     """One sensor lags another."""
 

@@ -133,6 +133,10 @@ def estimate(
     clocks : str
         Time of samples: from arrival times, refined by the common motion (``"refined"``, default);
         from arrival times alone (``"arrivals"``); from the nominal rates (``"nominal"``).
+    equalise : str
+        Filters that give all sensors one response before the window: by poles and zeros
+        (``"known"``), by the averages (``"estimated"``), where it matters (``"auto"``, default),
+        or none (``"off"``).
     reject : bool
         Whether to exclude segments with transients also. Segments with gaps are always excluded,
         clipped ones unless this is False.

@@ -32,6 +32,7 @@ class EstimateOptions(TypedDict, total=False):
     detrend: str
     correct: bool
     clocks: str
+    equalise: str
     reject: bool
     octaves: bool
     dimension: int | str

@@ -61,8 +61,10 @@ def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
     if not (psd > 0 and high > psd):
         return level(psd)
     up = decibels(high) - decibels(psd)
-    if math.isnan(low) or low <= 0:
+    if math.isnan(low):
         return f"{level(psd)} ±{up:.2f}"
+    if low <= 0:  # no lower end in dB
+        return f"{level(psd)} +{up:.2f} −∞"
     down = decibels(psd) - decibels(low)
     return f"{level(psd)} {f'±{up:.2f}' if down < ONE_SIDED * up else f'+{up:.2f} −{down:.2f}'}"
 

@@ -238,6 +238,8 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
     }
     if found.synchronisation.noise_bias is not None:
         document["synchronisation"] = found.synchronisation
+    if found.edge_leakage is not None:
+        document["edge_leakage"] = found.edge_leakage
     if found.dimensions:
         document["dimension"] = found.dimensions
     if found.diagnosis is not None:

@@ -47,6 +47,7 @@ VALUES: dict[str, Any] = {
     "detrend": "linear",
     "correct": False,
     "clocks": "arrivals",
+    "equalise": "known",
     "reject": True,
     "octaves": True,
     "dimension": 2,

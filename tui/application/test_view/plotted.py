@@ -74,7 +74,7 @@ def _noise(
     style: tuple[str, str, str],
     n_points: int,
 ) -> Curve:
-    noise, added = snapshot.results[method], snapshot.added_by_clocks
+    noise, added = snapshot.results[method], snapshot.added
     return noise_curve(
         snapshot.frequency,
         noise.noise_psd[:, column],

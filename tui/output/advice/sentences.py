@@ -26,6 +26,7 @@ from estimator.diagnostics.advice import (
     SwappedChannels,
     TooFewDimensions,
     TooFewSensors,
+    UnequalResponses,
     WeakMotion,
 )
 from estimator.diagnostics.kinds import Level
@@ -390,6 +391,36 @@ def _delay(advice: Delay, names: Names) -> Explanation:
         f"Sensor {late} lags sensor {early} by {abs(advice.delay) * 1e3:.3g} ms "
         f"({abs(advice.delay_samples):.2g} samples): {EFFECT_OF_DELAY}.",
         "Synchronise the clocks, and use a tapered window.",
+    )
+
+
+_SOURCES = {"known": "by the poles and zeros of the bench file", "estimated": "by the measured one"}
+
+
+@explain.register(UnequalResponses)
+def _unequal_responses(advice: UnequalResponses, names: Names) -> Explanation:
+    differ = f"The response of {names.list_sensors(advice.sensors)} differs from that of the others"
+    if len(advice.sensors) == len(names.sensors):
+        differ = "The responses of all sensors differ"
+    differ += f" at {where(advice)}"
+    channel = names.channels[advice.channel]
+    if not advice.equalised_by:
+        return Explanation(
+            f"{differ}: motion leaks into the noise at the edges of segments, "
+            f"{percent(advice.share)} of the estimate of {channel} or more.",
+            "Equalise the responses (--equalise auto), or use longer segments: leakage falls with "
+            "the square of their length.",
+        )
+    sources = " and ".join(_SOURCES[source] for source in advice.equalised_by)
+    text = (
+        f"{differ}: equalised before the window, {sources}. Without, leakage at the edges of "
+        f"segments would be {ratio(advice.share_without)} times the noise of {channel}"
+    )
+    if advice.level is Level.NOTE:
+        return Explanation(f"{text}.")
+    return Explanation(
+        f"{text}; {percent(advice.share)} of the estimate is left.",
+        "Use longer segments, or give poles and zeros in the bench file.",
     )
 
 

@@ -230,7 +230,7 @@ def _curves(
     centre = centres(frequency, edges)
     width = np.gradient(frequency)
     correlation = correlation_of(settings)
-    added = snapshot.added_by_clocks
+    added = snapshot.added
     curves = []
     for column, label in enumerate(snapshot.channels):
         means = band_means(

@@ -27,6 +27,7 @@ from estimator.diagnostics.advice import (
     SwappedChannels,
     TooFewDimensions,
     TooFewSensors,
+    UnequalResponses,
     WeakMotion,
 )
 from estimator.diagnostics.kinds import AdviceKind, Level
@@ -286,6 +287,30 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
     (
         LEADS,
         ("Sensor a lags sensor b by 20 ms (0.8 samples)",),
+    ),
+    (
+        UnequalResponses(
+            level=Level.PROBLEM,
+            sensors=(1,),
+            band=BAND,
+            channel=3,
+            share=0.94,
+            share_without=0.94,
+            equalised_by=(),
+        ),
+        ("The response of b differs from that of the others at", "94 % of the estimate of b.x"),
+    ),
+    (
+        UnequalResponses(
+            level=Level.WARNING,
+            sensors=(0, 1, 2),
+            band=BAND,
+            channel=3,
+            share=0.12,
+            share_without=40.0,
+            equalised_by=("known", "estimated"),
+        ),
+        ("The responses of all sensors differ", "would be 40 times the noise of b.x", "12 % of"),
     ),
 ]
 

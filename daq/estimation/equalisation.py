@@ -1,0 +1,251 @@
+"""Equalises sensors before their samples are windowed, where their responses differ.
+
+Theory of operation
+-------------------
+Filters come from the poles and zeros of the bench file, from the responses that the averages show,
+or from both in turn. They are found from the first `SETTLED` segments of each recording, in a few
+rounds: each shows what the filters so far have left. So an estimate is a function of its files,
+whether these were followed while they grew or not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.estimation.noise_estimates import responses
+from daq.estimation.snapshot import EdgeLeakage
+from estimator.diagnostics.edge_leakage import band_shares, channel_responses, slope_factor
+from estimator.diagnostics.equalisation import correction, matters, surely
+from estimator.errors import InsufficientDataError
+from estimator.methods import self_noise
+from estimator.spectra.equaliser import Equaliser, bounded, design, tail_leakage, with_short_tails
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Channel
+    from estimator.spectra.multiresolution import Band
+    from estimator.spectra.welch import WelchSettings
+
+    FloatArray = NDArray[np.float64]
+    ComplexArray = NDArray[np.complex128]
+
+SETTLED = 240
+"""Segments of each recording, from its start, that filters are found from."""
+ROUNDS = 3
+_METHOD = "three-sensor"  # whose noise the leakage is compared with: it takes little time
+_ASSUMED_SNR = 1e6  # of known responses that differ
+_EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
+_IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
+_AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
+_FINE = 4  # points of known responses for each of a spectrum
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Leaks:
+    """What leaks in the averages of one spectrum, in the digitised channels' own units."""
+
+    noise_psd: FloatArray
+    motion_psd: FloatArray
+    left: FloatArray
+    share: FloatArray
+
+
+class Equalisation:
+    """Finds filters for the channels of recordings.
+
+    Parameters
+    ----------
+    mode : {"auto", "known", "estimated", "off"}
+    welch : WelchSettings
+    channels : sequence of (str, Channel)
+        With their sensors.
+    dims : tuple of int
+        Channels of each sensor.
+    """
+
+    def __init__(
+        self,
+        mode: str,
+        welch: WelchSettings,
+        channels: Sequence[tuple[str, Channel]],
+        dims: tuple[int, ...],
+    ) -> None:
+        self._mode, self._welch, self._dims = mode, welch, dims
+        window = get_window(welch.window, welch.segment_length)
+        self._factor = slope_factor(window, welch.sampling_rate)
+        known = mode in {"auto", "known"} and len(channels) > 1
+        self._known = self._by_bench(channels) if known else None
+        self._can_estimate = mode in {"auto", "estimated"} and welch.segment_length % 2 == 0
+        self.is_settled = not self._can_estimate or len(dims) < 3
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was estimated."""
+        self._wanted: ComplexArray | None = None
+        self._reference: int | None = None
+        self.filters = self._known
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Where filters come from: "known", "estimated", both or neither."""
+        return ("known",) * (self._known is not None) + ("estimated",) * (self._wanted is not None)
+
+    def _by_bench(self, channels: Sequence[tuple[str, Channel]]) -> Equaliser | None:
+        """Return filters that make all channels answer like one, by their poles and zeros."""
+        if all(channel.response is None for _, channel in channels) and (
+            len({channel.unit for _, channel in channels}) == 1
+        ):
+            return None
+        length, rate = self._welch.segment_length, self._welch.sampling_rate
+        grid = np.arange(_FINE * length // 2 + 1) * rate / (_FINE * length // 2 * 2)
+        response = responses(
+            np.where(grid > 0, grid, 1e-3 * grid[1]), channels, channels[0][1].unit
+        )
+        snr = np.full((len(grid), 1), _ASSUMED_SNR)
+        best: tuple[float, ComplexArray] | None = None
+        for target in np.unique(np.round(response, 12), axis=1).T:
+            like = int(np.argmin(np.abs(response - target[:, None]).sum(axis=0)))
+            wanted = np.ones_like(response)
+            cost = 0.0
+            for column in range(len(channels)):
+                ratio = response[:, like] / response[:, column]
+                slope = np.gradient(ratio, grid[1]) / ratio
+                if np.mean(np.log1p(self._factor * np.abs(slope) ** 2 * _ASSUMED_SNR)) < _EQUAL:
+                    continue
+                wanted[:, column] = bounded(ratio)
+                wanted[:, [column]] = with_short_tails(wanted[:, [column]])
+                tails = tail_leakage(wanted[:, [column]], rate, snr=snr, factor=self._factor)
+                cost += float(tails[0]) + _EQUAL
+            if best is None or cost < best[0]:
+                best = cost, wanted
+        if best is None or (best[1] == 1).all():
+            return None
+        return design(best[1], rate, longest=length)
+
+    def response(self, frequency: FloatArray) -> ComplexArray | None:
+        """Return what the filters do to each channel; None without filters."""
+        return None if self.filters is None else self.filters.response(frequency)
+
+    def revise(self, bands: Sequence[Band]) -> bool:
+        """Change the filters by what averages show; return whether that was necessary.
+
+        Parameters
+        ----------
+        bands : sequence of Band
+            Of samples filtered as now, in the channels' own units.
+        """
+        found = None if self.is_settled else self._leaks(bands)
+        if found is None or not bands:
+            return False
+        n_effective = min(band.n_effective for band in bands)
+        if not found.share.max(initial=0.0) > matters(n_effective):
+            return False
+        frequency = np.concatenate([band.frequencies for band in bands])
+        csm = np.concatenate([band.csm for band in bands])
+        wanted, self._reference = correction(
+            channel_responses(csm, frequency, dims=self._dims),
+            self._welch.frequencies,
+            dims=self._dims,
+            motion_psd=found.motion_psd,
+            noise_psd=found.noise_psd,
+            n_effective=n_effective,
+            factor=self._factor,
+            reference=self._reference,
+        )
+        if (wanted == 1).all():
+            return False
+        self._wanted = wanted if self._wanted is None else self._wanted * wanted
+        longest = self._welch.segment_length // 2 - 1
+        estimated = design(self._wanted, self._welch.sampling_rate, longest=longest)
+        self.filters = estimated if self._known is None else self._known.then(estimated)
+        return True
+
+    def leakage(
+        self, bands: Sequence[Band], channels: Sequence[tuple[str, Channel]], unit: str
+    ) -> EdgeLeakage | None:
+        """Return what still leaks, and what leaked without filters; None where it is not known.
+
+        Parameters
+        ----------
+        bands : sequence of Band
+            As `revise` takes them.
+        channels : sequence of (str, Channel)
+        unit : str
+            Of the motion.
+        """
+        found = self._leaks(bands)
+        if found is None:
+            return None
+        whole = found
+        frequency = np.concatenate([band.frequencies for band in bands])
+        response = responses(frequency, channels, unit)
+        if self.filters is not None:
+            own = self.filters.response(frequency)
+            response = response * own
+            plain = self._leaks(bands, filters=own)
+            whole = found if plain is None else plain
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.abs(response) ** -2.0
+            unseen = np.concatenate([_unseen(band) for band in bands])[:, None]
+            unseen = unseen * np.maximum(whole.left, 0.0) * (self.filters is not None)
+        return EdgeLeakage(
+            left=found.left * scale,
+            whole=np.maximum(whole.left, found.left) * scale,
+            unseen=unseen * scale,
+            share=found.share,
+            whole_share=np.maximum(whole.share, found.share),
+            sources=self.sources,
+        )
+
+    def _leaks(self, bands: Sequence[Band], filters: ComplexArray | None = None) -> _Leaks | None:
+        """Return what leaks, or would leak without the filters of this response."""
+        if len(self._dims) < 3 or not bands:
+            return None
+        parts: list[_Leaks] = []
+        at = 0
+        for band in bands:
+            try:
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    noise = self_noise(
+                        _METHOD,
+                        band.csm,
+                        dims=self._dims,
+                        n_effective=band.n_effective,
+                        real=band.settings.real(band.frequencies),
+                    ).noise_psd
+            except InsufficientDataError:
+                return None
+            motion = np.einsum("fpp->fp", band.csm).real - noise
+            csm = band.csm
+            if filters is not None:
+                own = filters[at : at + len(band.frequencies)]
+                inverse = np.where(own != 0, 1 / np.where(own != 0, own, 1.0), np.nan)
+                csm = csm * inverse[:, :, None] * inverse[:, None, :].conj()
+            at += len(band.frequencies)
+            window = get_window(band.settings.window, band.settings.segment_length)
+            factor = slope_factor(window, band.settings.sampling_rate)
+            left, deviation = channel_responses(csm, band.frequencies, dims=self._dims).leakage(
+                motion, factor, n_effective=band.n_effective
+            )
+            shares = band_shares(left, deviation, np.abs(noise), band.frequencies)
+            parts.append(_Leaks(noise, motion, left, surely(*shares, band.frequencies)))
+        return _Leaks(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("noise_psd", "motion_psd", "left", "share")
+            )
+        )
+
+
+def _unseen(band: Band) -> FloatArray:
+    """Return the share of leakage that may be left unseen at each frequency of a band."""
+    length = band.settings.segment_length / band.settings.sampling_rate
+    line = np.maximum(band.frequencies * length, 1.0)
+    return np.asarray(_IMPERFECT * (1 + (_AT_LOW / line) ** 2))

@@ -1,0 +1,250 @@
+"""What unequal transfer functions leak at the edges of segments, and by which responses.
+
+Theory of operation
+-------------------
+A window w sees of a channel with response D to the motion m not ``D M`` alone, but to first order
+``D M + D' M'``, with D' the slope of D per Hz and M' the transform of m under the slope of the
+window. M' is independent of M, and its PSD is `slope_factor` times that of M: 1 / (3 T²) for a Hann
+window of length T. What all channels have in common of it is common motion; the rest counts as
+noise of the channels that differ.
+
+The responses come from the averages themselves. A constant real combination of the channels of
+sensor j predicts channel c but for one complex factor, ``D_cj = S_cz / S_yz``: y the prediction by
+j, z that by the sensors that are neither j nor of c. The noise of no channel biases it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.diagnostics.relative_response import own_channels
+from estimator.likelihood.dimension import bands
+from estimator.self_noise.coherency import check_dims
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray, FloatArray
+
+LEAST_COHERENCE = 0.3
+"""Between a channel and its prediction, for a frequency to count."""
+_TWO_FREQUENCIES = 1.67  # 2 (1 - 1/6): variance of a difference two bins apart under Hann
+_CORRELATED = 2.0  # variance of a sum over that of independent frequencies
+_MOST_FREQUENCIES = 256  # that the directions are found from
+_RIDGE = 1e-9  # of the mean power: keeps a dead direction from stopping everything
+
+
+def slope_factor(window: FloatArray, sampling_rate: float) -> float:
+    """Return the PSD of motion under the slope of a window, over that of the motion, in Hz².
+
+    ``sum (dw/dt)² / (4 pi² sum w²)``, the jumps at both ends included.
+
+    Parameters
+    ----------
+    window : float64, shape (length,)
+    sampling_rate : float
+        Hz.
+    """
+    steps = np.diff(window, prepend=0.0, append=0.0) * sampling_rate
+    return float(steps @ steps / (4 * np.pi**2 * (window @ window)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelResponses:
+    """Every channel as seen by each other sensor.
+
+    Attributes
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    ratio : complex128, shape (n_freqs, n_channels, n_sensors)
+        D: what the channel makes of the motion over what the sensor's channels make of it, one
+        factor where 1 is their mean size in direction only. NaN for the channel's own sensor and
+        for sensors by which it cannot be predicted.
+    coherence : float64, shape (n_freqs, n_channels, n_sensors)
+        Magnitude squared, of the channel with its prediction.
+    """
+
+    frequency: FloatArray
+    ratio: ComplexArray
+    coherence: FloatArray
+
+    def slopes(self) -> ComplexArray:
+        """Return ``D' / D`` per Hz, by central differences, shape as `ratio`."""
+        f, ratio = self.frequency, self.ratio
+        slopes = np.full_like(ratio, np.nan)
+        width = (f[2:] - f[:-2])[:, None, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes[1:-1] = (ratio[2:] - ratio[:-2]) / width / ratio[1:-1]
+        return slopes
+
+    def leakage(
+        self, motion_psd: FloatArray, factor: float, *, n_effective: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what leaks into the noise of every channel, and its standard deviation.
+
+        Parameters
+        ----------
+        motion_psd : float64, shape (n_freqs, n_channels)
+            PSD of the motion in each channel.
+        factor : float
+            `slope_factor` of the window.
+        n_effective : float
+
+        Returns
+        -------
+        leakage, deviation : float64, shape (n_freqs, n_channels)
+            PSD that estimates by triads of sensors have too much; 0 where it is not known.
+
+        Notes
+        -----
+        ``factor Re[(D_cj'/D_cj) conj(D_ck'/D_ck)] P_c``, averaged over the pairs of sensors j, k:
+        the same product of errors by which a triad predicts channel c twice. Their common noise
+        is that of the channel, a share 0.14 / n of it; the variance of ``D'/D`` is that of a
+        ratio of averages, ``(1 / g - 1) / n`` at coherence g, at two frequencies.
+        """
+        slopes, f = self.slopes(), self.frequency
+        variance = np.full(slopes.shape, np.inf)
+        width = (f[2:] - f[:-2])[:, None, None]
+        with np.errstate(divide="ignore"):
+            own = (1 / self.coherence[1:-1] - 1) / max(n_effective, 1.0)
+        own[self.coherence[1:-1] < LEAST_COHERENCE] = np.inf
+        variance[1:-1] = _TWO_FREQUENCIES * own / width**2
+        pairs = list(combinations(range(slopes.shape[2]), 2))
+        products = np.array([(slopes[:, :, j] * slopes[:, :, k].conj()).real for j, k in pairs])
+        with np.errstate(invalid="ignore"):
+            spread = np.array([np.sqrt(variance[:, :, j] * variance[:, :, k]) for j, k in pairs])
+        known = np.isfinite(products) & np.isfinite(spread)
+        count = np.maximum(known.sum(axis=0), 1)
+        power = np.where(np.isfinite(motion_psd), np.maximum(motion_psd, 0.0), 0.0) * factor
+        total = np.where(known, products, 0.0).sum(axis=0) / count
+        deviation = np.where(known, spread, 0.0).sum(axis=0) / count
+        return np.asarray(power * total), np.asarray(power * deviation)
+
+
+def band_shares(
+    leakage: FloatArray, deviation: FloatArray, noise_psd: FloatArray, frequency: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return leakage over noise in bands of third octaves, given at each of their frequencies.
+
+    Parameters
+    ----------
+    leakage, deviation, noise_psd : float64, shape (n_freqs, n_channels)
+        As of `ChannelResponses.leakage`.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+
+    Returns
+    -------
+    share, deviation : float64, shape (n_freqs, n_channels)
+        0 where no noise is known.
+    """
+    number = bands(frequency)
+    known = np.isfinite(leakage) & np.isfinite(noise_psd)
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    noise = np.add.reduceat(np.where(known, noise_psd, 0.0), starts)
+    total = np.add.reduceat(np.where(known, leakage, 0.0), starts)
+    squares = np.add.reduceat(np.where(known, deviation**2, 0.0), starts)
+    scale = np.where(noise > 0, 1 / np.where(noise > 0, noise, 1.0), 0.0)
+    return (total * scale)[number], (np.sqrt(_CORRELATED * squares) * scale)[number]
+
+
+def channel_responses(
+    csm: ComplexArray, frequency: FloatArray, *, dims: tuple[int, ...]
+) -> ChannelResponses:
+    """Return every channel as seen by each other sensor.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+        Channels of each sensor.
+
+    Returns
+    -------
+    ChannelResponses
+    """
+    check_dims(dims)
+    n_freqs, n_channels = csm.shape[:2]
+    n_sensors = len(dims)
+    usable = np.isfinite(csm).all(axis=(1, 2)) & (frequency > 0)
+    csm = np.where(usable[:, None, None], csm, 0.0)
+    own = [np.array(own_channels(dims, sensor)) for sensor in range(n_sensors)]
+    ratio = np.full((n_freqs, n_channels, n_sensors), np.nan, dtype=np.complex128)
+    coherence = np.zeros((n_freqs, n_channels, n_sensors))
+    directions = _directions(csm, dims, own)
+    for c in range(n_channels):
+        around = [j for j in range(n_sensors) if (c, j) in directions]
+        if len(around) < 2:
+            continue
+        # Predictions of channel c by each sensor, and their cross-spectra.
+        to = np.zeros((len(around), n_channels))
+        for row, j in enumerate(around):
+            to[row, own[j]] = directions[c, j]
+        predicted = csm @ to.T
+        crossed = predicted[:, c]  # S_c,y
+        among = to @ predicted  # S_y,y'
+        power = np.maximum(csm[:, c, c].real, 0.0)
+        for row, j in enumerate(around):
+            others = [n for n in range(len(around)) if n != row]
+            S_cz, S_yz = crossed[:, others].sum(axis=1), among[:, row, others].sum(axis=1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                ratio[:, c, j] = np.where(usable & (S_yz != 0), S_cz / S_yz, np.nan)
+                found = np.abs(crossed[:, row]) ** 2 / (power * among[:, row, row].real)
+            coherence[:, c, j] = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
+    return ChannelResponses(frequency, ratio, coherence)
+
+
+def _directions(
+    csm: ComplexArray, dims: tuple[int, ...], own: list[np.ndarray]
+) -> dict[tuple[int, int], FloatArray]:
+    """Return the real combination of a sensor's channels that predicts a channel, up to a factor.
+
+    It is the direction in which the rows ``S_ck S_jk^-1`` of the relative response lie at most
+    frequencies, weighted by their signal-to-noise ratio: a complex factor at each does not turn it.
+    """
+    power = np.einsum("fpp->fp", csm).real
+    alive = (power > 0).all(axis=1)
+    some = np.flatnonzero(alive)
+    some = some[:: max(1, len(some) // _MOST_FREQUENCIES)]
+    found: dict[tuple[int, int], FloatArray] = {}
+    if not len(some):
+        return found
+    scale = np.sqrt(power[some])
+    part = csm[some] / (scale[:, :, None] * scale[:, None, :])
+    for j in range(len(dims)):
+        for i in range(len(dims)):
+            rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate([own[i], own[j]]))
+            if i == j or len(rest) < dims[j]:
+                continue
+            S_jk = part[:, own[j][:, None], rest]
+            S_ck = part[:, own[i][:, None], rest]
+            adjoint = S_jk.conj().swapaxes(1, 2)
+            normal = S_jk @ adjoint
+            ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2).real / dims[j] + 1e-300
+            rows = np.linalg.solve(
+                (normal + ridge[:, None, None] * np.eye(dims[j])).swapaxes(1, 2),
+                (S_ck @ adjoint).swapaxes(1, 2),
+            ).swapaxes(1, 2)  # in units of the channels' own amplitudes
+            own_csm = part[:, own[j][:, None], own[j]]
+            predicted = np.einsum("fcj,fjk,fck->fc", rows, own_csm, rows.conj()).real
+            with np.errstate(invalid="ignore", divide="ignore"):
+                cross = np.einsum(
+                    "fcj,fcj->fc", rows, part[:, own[j][:, None], own[i]].swapaxes(1, 2)
+                )
+                g = np.clip(np.abs(cross) ** 2 / predicted, 0.0, 1 - 1e-9)
+            g = np.where(np.isfinite(g) & (g > LEAST_COHERENCE), g, 0.0)
+            rows = rows * scale[:, own[i]][:, :, None] / scale[:, None, own[j]]
+            size = np.einsum("fcj,fcj->fc", rows, rows.conj()).real
+            weight = g / (1 - g) / np.where(size > 0, size, np.inf)
+            moment = np.einsum("fc,fcj,fck->cjk", weight, rows, rows.conj()).real
+            for row, c in enumerate(own[i].tolist()):
+                if weight[:, row].any():
+                    found[c, j] = np.linalg.eigh(moment[row])[1][:, -1]
+    return found

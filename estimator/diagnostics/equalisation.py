@@ -1,0 +1,195 @@
+"""Which filters make sensors answer alike, by their measured responses.
+
+One sensor stays as it is, and channels of the others are filtered towards it. Any will do in
+theory; one whose filters are short is chosen: to undo a resonance takes a few samples, to imitate
+it many.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.diagnostics.advice import UnequalResponses
+from estimator.diagnostics.edge_leakage import band_shares
+from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.relative_response import own_channels
+from estimator.spectra.equaliser import (
+    USABLE,
+    bounded,
+    smoothed,
+    tail_leakage,
+    with_short_tails,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from estimator.diagnostics.edge_leakage import ChannelResponses
+    from estimator.types import ComplexArray, FloatArray
+
+MATTERS = 0.01
+"""Leakage, as a share of the noise in a third of an octave, from which on channels are filtered."""
+PER_AVERAGE = 1.0
+"""Added to it over the averages: the prediction has noise of its own."""
+LARGE = 0.3
+"""Share of the noise estimate from which on it is wrong."""
+WITH_MOST = 0.1
+"""Of the largest share, from which on a sensor is named with the one that leaks most."""
+SURE = 3.0
+"""Standard deviations by which leakage must exceed it."""
+_EQUAL_ENOUGH = 0.5  # of it, below which a channel is left as it is beside one that is not
+_STIFFNESS = 1.0
+_MORE_CHANNELS = 0.02  # in terms of `tail_leakage`: the price of a channel that is filtered
+
+
+def matters(n_effective: float) -> float:
+    """Return the share of the noise from which on leakage matters."""
+    return MATTERS + PER_AVERAGE / max(n_effective, 1.0)
+
+
+def surely(share: FloatArray, deviation: FloatArray, frequency: FloatArray) -> FloatArray:
+    """Return what a share is at least, for all its deviation.
+
+    0 near half the sampling rate, above `estimator.spectra.equaliser.USABLE` of the largest
+    frequency (Hz, shape (n_freqs,)), where nothing can be equalised.
+    """
+    least = np.maximum(share - SURE * deviation, 0.0)
+    return np.where((frequency <= USABLE * frequency[-1])[:, None], least, 0.0)
+
+
+def leakage_advice(
+    frequency: FloatArray,
+    share: FloatArray,
+    share_without: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    equalised_by: tuple[str, ...],
+) -> Iterator[UnequalResponses]:
+    """Say what leaks at the edges of segments, or would without equalisation.
+
+    Parameters
+    ----------
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    share, share_without : float64, shape (n_freqs, n_channels)
+        As of `surely`; with and without equalisation.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+    equalised_by : tuple of str
+    """
+    least = matters(n_effective)
+    most = np.maximum(share, share_without)
+    where = most.max(axis=1, initial=0.0) > least
+    if not where.any():
+        return
+    of_channels = most.max(axis=0)
+    channel = int(np.argmax(of_channels))
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    left = float(share.max())
+    level = Level.NOTE
+    if left > LARGE:
+        level = Level.PROBLEM
+    elif left > least:
+        level = Level.WARNING
+    yield UnequalResponses(
+        level=level,
+        sensors=tuple(
+            np.unique(sensor_of[of_channels > WITH_MOST * of_channels[channel]]).tolist()
+        ),
+        band=(float(frequency[where][0]), float(frequency[where][-1])),
+        channel=channel,
+        share=left,
+        share_without=float(share_without.max()),
+        equalised_by=equalised_by,
+    )
+
+
+def correction(
+    responses: ChannelResponses,
+    grid: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    motion_psd: FloatArray,
+    noise_psd: FloatArray,
+    n_effective: float,
+    factor: float,
+    reference: int | None = None,
+) -> tuple[ComplexArray, int]:
+    """Return the responses of filters that make channels answer like those of one sensor.
+
+    Parameters
+    ----------
+    responses : ChannelResponses
+    grid : float64, shape (n_grid,)
+        Frequencies wanted, evenly from 0 Hz to half the sampling rate.
+    dims : tuple of int
+    motion_psd, noise_psd : float64, shape (n_freqs, n_channels)
+    n_effective : float
+    factor : float
+        `estimator.diagnostics.edge_leakage.slope_factor`.
+    reference : int, optional
+        The sensor that stays as it is; the one with the shortest filters by default.
+
+    Returns
+    -------
+    wanted : complex128, shape (n_grid, n_channels)
+        1 throughout for channels that are left as they are.
+    reference : int
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        snr = np.maximum(motion_psd, 0.0) / np.abs(noise_psd)
+    snr = np.where(np.isfinite(snr), snr, 0.0)
+    on_grid = np.stack([np.interp(grid, responses.frequency, each) for each in snr.T], axis=1)
+    best: tuple[float, int, ComplexArray] | None = None
+    for sensor in range(len(dims)) if reference is None else (reference,):
+        wanted = _towards(
+            sensor, responses, grid, dims=dims, snr=snr, n_effective=n_effective, factor=factor
+        )
+        tails = tail_leakage(wanted, 2 * float(grid[-1]), snr=on_grid, factor=factor)
+        n_filtered = int((wanted != 1).any(axis=0).sum())
+        cost = float(tails.max()) + _MORE_CHANNELS * n_filtered
+        if best is None or cost < best[0]:
+            best = cost, sensor, wanted
+    if best is None:  # no sensors
+        return np.ones((len(grid), 0), dtype=np.complex128), 0
+    return best[2], best[1]
+
+
+def _towards(
+    sensor: int,
+    responses: ChannelResponses,
+    grid: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    snr: FloatArray,
+    n_effective: float,
+    factor: float,
+) -> ComplexArray:
+    ratio, coherence = responses.ratio[:, :, sensor], responses.coherence[:, :, sensor]
+    f = responses.frequency
+    wanted = np.ones((len(grid), ratio.shape[1]), dtype=np.complex128)
+    slopes = responses.slopes()[:, :, sensor]
+    leakage = np.where(np.isfinite(slopes), factor * np.abs(slopes) ** 2 * snr, 0.0)
+    share = surely(*band_shares(leakage, np.zeros_like(snr), np.ones_like(snr), f), f)
+    least = _EQUAL_ENOUGH * matters(n_effective)
+    for channel in range(ratio.shape[1]):
+        own = channel in own_channels(dims, sensor)
+        if own or not share[:, channel].max(initial=0.0) > least:
+            continue
+        g = coherence[:, channel]
+        usable = np.isfinite(ratio[:, channel]) & (ratio[:, channel] != 0) & (f > 0) & (g > 0)
+        inverse = np.where(usable, 1 / np.where(usable, ratio[:, channel], 1.0), 0.0)
+        weight = n_effective * g / np.maximum(1 - g, 1e-9)
+        weight = np.where(usable, weight / np.maximum(np.abs(inverse), 1e-150) ** 2, 0.0)
+        if usable.sum() < len(usable) // 2:
+            continue
+        even = smoothed(inverse, weight, stiffness=_STIFFNESS)
+        if len(f) != len(grid) or not np.array_equal(f, grid):
+            even = np.interp(grid, f, even.real) + 1j * np.interp(grid, f, even.imag)
+        wanted[:, channel] = bounded(even)
+        wanted[:, [channel]] = with_short_tails(wanted[:, [channel]])
+    return wanted

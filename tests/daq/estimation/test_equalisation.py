@@ -1,0 +1,160 @@
+"""Sensors with unequal responses: without equalisation biased as predicted, with it not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.bench.model import PolesZeros
+from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.settings import Settings
+from estimator.diagnostics.advice import UnequalResponses
+from tests.daq.alignment.recordings import Sensor, blocks, create, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daq.estimation.snapshot import Snapshot
+
+    FloatArray = NDArray[np.float64]
+
+RATE, N = 50.0, 20_000
+NOISE = 2 * 100.0**2 / RATE  # one-sided PSD of white noise of 100 counts
+CORNER = 2 * np.pi * 4.0
+LOW_PASS = PolesZeros(
+    zeros=(),
+    poles=(CORNER * (-1 + 1j) / 2**0.5, CORNER * (-1 - 1j) / 2**0.5),
+    frequency=0.01,
+)
+
+OFF = Settings(segment=4.0, equalise="off")
+
+
+@cache
+def samples() -> dict[str, FloatArray]:
+    """Three triaxial sensors at an SNR of 1e4; b is a low-pass of 4 Hz."""
+    rng = np.random.default_rng(3)
+    motion = 1e4 * rng.standard_normal((N, 3))
+    frequency = np.arange(N // 2 + 1) * RATE / N
+    found = {}
+    for name in "abc":
+        turned = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        if name == "b":
+            spectrum = np.fft.rfft(turned, axis=0) * LOW_PASS.at(frequency)[:, None]
+            turned = np.fft.irfft(spectrum, N, axis=0)
+        found[name] = turned + 100 * rng.standard_normal((N, 3))
+    return found
+
+
+def recorded(*, known: bool = False) -> dict[str, Sensor]:
+    return {
+        name: Sensor(
+            counts,
+            rate=RATE,
+            clock="one",
+            channel={"response": LOW_PASS} if known and name == "b" else None,
+        )
+        for name, counts in samples().items()
+    }
+
+
+def excess(snapshot: Snapshot, low: float, high: float, *, known: bool = False) -> FloatArray:
+    """Return the mean noise of each sensor in a band over the true one, less 1."""
+    inside = (snapshot.frequency >= low) & (snapshot.frequency < high)
+    noise = snapshot.results["three-sensor"].noise_psd[inside] / NOISE
+    if known:
+        noise[:, 3:6] *= np.abs(LOW_PASS.at(snapshot.frequency[inside]))[:, None] ** 2
+    return np.asarray(noise.reshape(-1, 3, 3).mean(axis=(0, 2)) - 1)
+
+
+@pytest.fixture(scope="module")
+def biased(tmp_path_factory: pytest.TempPathFactory) -> Snapshot:
+    return estimate([write(tmp_path_factory.mktemp("off") / "r.h5", recorded())], OFF)
+
+
+def test_what_leaks_is_predicted_and_widens_intervals(biased: Snapshot) -> None:
+    edges = biased.diagnostics.edge_leakage
+    assert edges is not None
+    assert edges.sources == ()
+    inside = (biased.frequency >= 1) & (biased.frequency < 8)
+    predicted = edges.left[inside, 3:6].mean() / NOISE
+    seen = excess(biased, 1, 8)
+    assert seen[1] > 5  # of |H'|² SNR / (3 T²)
+    assert seen[1] == pytest.approx(predicted, rel=0.2)
+    # 28 frequencies of 198 averages, three channels: 1.6 % of scatter
+    assert abs(seen[[0, 2]]).max() < 0.08
+    low = biased.results["three-sensor"].low[inside, 3:6]
+    assert (low < 1.2 * NOISE).all()
+    (advice,) = (a for a in biased.diagnostics.advice if isinstance(a, UnequalResponses))
+    assert advice.sensors == (1,)
+    assert advice.share > 0.8
+
+
+def test_equalised_by_measured_responses_the_noise_is_the_true_one(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    writer = create(path, recorded())
+    arriving = sorted(
+        (block for name, sensor in recorded().items() for block in blocks(name, sensor)),
+        key=lambda block: block.received.monotonic_ns,
+    )
+    with Estimation([path], replace(OFF, equalise="auto")) as live:
+        for number, block in enumerate(arriving):
+            writer.append(block)
+            if number % 600 == 599:
+                writer.commit()
+                live.update()
+        writer.close()
+        live.update()
+        growing = live.snapshot()
+        ended = live.finish()
+    offline = estimate([path], replace(OFF, equalise="estimated"))
+    edges = ended.diagnostics.edge_leakage
+    assert edges is not None
+    assert edges.sources == ("estimated",)
+    for snapshot in (growing, ended):
+        # 1 % of scatter, and 0.2 % of 25 times the noise
+        assert abs(excess(snapshot, 1, 8)).max() < 0.08
+        low = snapshot.results["three-sensor"].low
+        assert ((low < NOISE) | ~np.isfinite(low)).mean() > 0.95
+    np.testing.assert_allclose(ended.csm, offline.csm, rtol=1e-9)
+    # data are as they were, not as they were filtered
+    plain = estimate([path], OFF)
+    inside = (plain.frequency > 1) & (plain.frequency < 8)
+    np.testing.assert_allclose(ended.data_psd[inside], plain.data_psd[inside], rtol=0.2)
+
+
+def test_equalised_by_the_bench_file_the_noise_is_the_true_one(tmp_path: Path) -> None:
+    snapshot = estimate(
+        [write(tmp_path / "r.h5", recorded(known=True))], replace(OFF, equalise="known")
+    )
+    edges = snapshot.diagnostics.edge_leakage
+    assert edges is not None
+    assert edges.sources == ("known",)
+    assert abs(excess(snapshot, 1, 8, known=True)).max() < 0.08
+
+
+def test_equal_sensors_are_left_alone(tmp_path: Path) -> None:
+    sensors = recorded()
+    sensors["b"] = sensors["a"]
+    rng = np.random.default_rng(5)
+    sensors = {
+        name: replace(sensors["a"], counts=samples()["a"] + 100 * rng.standard_normal((N, 3)))
+        for name in "abc"
+    }
+    path = write(tmp_path / "r.h5", sensors)
+    plain, automatic = (estimate([path], replace(OFF, equalise=mode)) for mode in ("off", "auto"))
+    np.testing.assert_array_equal(plain.csm, automatic.csm)
+
+
+def test_segments_around_a_gap_are_left_out_as_far_as_filters_reach(tmp_path: Path) -> None:
+    sensors = recorded(known=True)
+    sensors["c"].gaps = ((9_990, 10_010),)
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], replace(OFF, equalise="known"))
+    assert 2 <= snapshot.n_dropped <= 7  # 4 s, and filters of as much to either side at most
+    assert abs(excess(snapshot, 1, 8, known=True)).max() < 0.08

@@ -1,0 +1,144 @@
+"""Leakage of unequal responses, against closed forms and exact matrices."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from estimator.diagnostics.edge_leakage import band_shares, channel_responses, slope_factor
+from estimator.diagnostics.equalisation import correction, leakage_advice, matters, surely
+from estimator.diagnostics.kinds import Level
+from estimator.methods import self_noise
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from estimator.diagnostics.advice import UnequalResponses
+
+DIMS = (3, 3, 3)
+T = 10.0
+FREQUENCY = np.arange(1001) / T
+SNR = 1e5
+FACTOR = 1 / (3 * T**2)
+
+
+def turned(seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in DIMS]
+
+
+def low_pass(f: np.ndarray) -> np.ndarray:
+    s = 1j * f / 30
+    return np.asarray(1 / (1 + np.sqrt(2) * s + s**2))
+
+
+def exact(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return averages without scatter: motion, what leaks of it, noise; and the response of B."""
+    response = low_pass(FREQUENCY)
+    slope = (low_pass(FREQUENCY + 1e-4) - low_pass(FREQUENCY - 1e-4)) / 2e-4
+    one, other = np.ones((2, 9, 1001), dtype=np.complex128)
+    one[3:6], other[:] = response, 0.0
+    other[3:6] = slope
+    directions = np.vstack(turned(seed))
+    csm = np.zeros((1001, 9, 9), dtype=np.complex128)
+    for factor, by in ((1.0, one), (FACTOR, other)):
+        loading = by.T[:, :, None] * directions
+        csm += factor * SNR * loading @ loading.conj().swapaxes(1, 2)
+    return csm + np.eye(9), slope
+
+
+def test_the_slope_factor_of_a_hann_window_is_that_of_the_integral() -> None:
+    assert slope_factor(get_window("hann", 2000), 200.0) == pytest.approx(FACTOR, rel=1e-5)
+
+
+def test_a_delay_of_one_sample_under_a_rectangular_window() -> None:
+    # method.md, item 6: seen +1070 % at SNR 1e4
+    factor = slope_factor(np.ones(2000), 200.0)
+    assert factor * (2 * np.pi / 200) ** 2 * 1e4 == pytest.approx(10.7, rel=0.1)
+
+
+def test_responses_are_found_whatever_way_sensors_point() -> None:
+    csm, _ = exact()
+    found = channel_responses(csm, FREQUENCY, dims=DIMS)
+    inside = slice(10, 990)
+    for channel in (3, 4, 5):
+        for other in (0, 2):
+            ratio = found.ratio[inside, channel, other] / found.ratio[200, channel, other]
+            expected = low_pass(FREQUENCY)[inside] / low_pass(FREQUENCY[200:201])
+            np.testing.assert_allclose(ratio, expected, rtol=2e-3)
+    assert np.isnan(found.ratio[:, 3, 1]).all()
+
+
+def test_leakage_is_predicted_as_the_three_sensor_estimate_has_it() -> None:
+    csm, slope = exact()
+    noise = self_noise("three-sensor", csm, dims=DIMS, n_effective=1e9).noise_psd
+    motion = np.einsum("fpp->fp", csm).real - noise
+    leakage, deviation = channel_responses(csm, FREQUENCY, dims=DIMS).leakage(
+        motion, FACTOR, n_effective=200.0
+    )
+    inside = slice(20, 980)
+    expected = FACTOR * np.abs(slope[inside]) ** 2 * SNR
+    assert expected.max() > 0.9
+    np.testing.assert_allclose(leakage[inside, 3:6].mean(axis=1), expected, rtol=0.03)
+    np.testing.assert_allclose(noise[inside, 3:6].mean(axis=1) - 1, expected, rtol=0.03)
+    assert np.abs(leakage[inside, [0]]).max() < 0.01
+    # (1 / g - 1) P / n at two frequencies: noise and leakage of the channel, noise of the other
+    own = noise[200, 3] + np.abs(low_pass(FREQUENCY[200])) ** 2
+    assert deviation[200, 3] == pytest.approx(1.67 / 4 / 3 * own / 200, rel=0.1)
+
+
+def test_the_sensor_that_differs_is_the_one_filtered() -> None:
+    csm, _ = exact()
+    noise = self_noise("three-sensor", csm, dims=DIMS, n_effective=1e9).noise_psd
+    motion = np.einsum("fpp->fp", csm).real - noise
+    wanted, reference = correction(
+        channel_responses(csm, FREQUENCY, dims=DIMS),
+        FREQUENCY,
+        dims=DIMS,
+        motion_psd=motion,
+        noise_psd=noise,
+        n_effective=200.0,
+        factor=FACTOR,
+    )
+    assert reference in {0, 2}
+    np.testing.assert_array_equal((wanted != 1).any(axis=0), np.repeat([False, True, False], 3))
+    equal = wanted[10:890, 4] * low_pass(FREQUENCY)[10:890]
+    np.testing.assert_allclose(equal / equal[100], 1.0, atol=0.005)
+
+
+def test_shares_are_of_bands_and_allow_for_scatter() -> None:
+    leakage = np.full((1001, 1), 0.1)
+    share, deviation = band_shares(leakage, leakage, np.full((1001, 1), 0.5), FREQUENCY)
+    np.testing.assert_allclose(share, 0.2)
+    # 0.2 times the root of 2 over the number of frequencies: 8 at first, 206 in the last band
+    assert deviation[1, 0] == pytest.approx(0.1)
+    assert deviation[-1, 0] == pytest.approx(0.2 * np.sqrt(2 / 206), rel=0.3)
+    least = surely(share, deviation, FREQUENCY)[:, 0]
+    assert least[1] == 0
+    assert 0.1 < least[880] < 0.2
+    assert least[-1] == 0  # near half the sampling rate
+
+
+def advised(share: np.ndarray, share_without: np.ndarray, *by: str) -> list[UnequalResponses]:
+    return list(
+        leakage_advice(
+            FREQUENCY, share, share_without, dims=DIMS, n_effective=200.0, equalised_by=by
+        )
+    )
+
+
+def test_advice_names_the_sensor_that_leaks_and_how_much() -> None:
+    share = np.zeros((1001, 9))
+    share[100:200, 4] = 0.4
+    share[100:200, 0] = 0.02
+    (found,) = advised(share, share)
+    assert found.sensors == (1,)
+    assert found.channel == 4
+    assert found.band == (FREQUENCY[100], FREQUENCY[199])
+    assert found.level is Level.PROBLEM
+    (better,) = advised(0 * share, share, "estimated")
+    assert better.level is Level.NOTE
+    assert better.share_without == 0.4
+    assert not advised(0.01 * share, 0.01 * share)
+    assert matters(1e9) == pytest.approx(0.01)
