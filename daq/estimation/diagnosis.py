@@ -17,9 +17,9 @@ from daq.estimation.snapshot import (
 )
 from estimator.diagnostics.advice import Advice, Gain
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
-from estimator.diagnostics.equalisation import leakage_advice
 from estimator.diagnostics.kinds import Level, Untested
 from estimator.errors import InsufficientDataError
+from estimator.responses.equalisation import leakage_advice
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -17,10 +17,10 @@ import numpy as np
 
 from daq.estimation.noise_estimates import responses
 from daq.estimation.snapshot import EdgeLeakage
-from estimator.diagnostics.edge_leakage import band_shares, channel_responses, slope_factor
-from estimator.diagnostics.equalisation import correction, matters, surely
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
+from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
+from estimator.responses.equalisation import correction, matters, surely
 from estimator.spectra.equaliser import Equaliser, bounded, design, tail_leakage, with_short_tails
 from estimator.spectra.windows import get_window
 

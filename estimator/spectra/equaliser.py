@@ -194,7 +194,7 @@ def tail_leakage(
     snr : float64, shape (n_freqs, n_channels)
         Motion over noise in each channel.
     factor : float
-        As of `estimator.diagnostics.edge_leakage.slope_factor`, Hz².
+        As of `estimator.responses.edge_leakage.slope_factor`, Hz².
     """
     n = 2 * (len(wanted) - 1)
     full = np.fft.irfft(wanted, n, axis=0)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from estimator.diagnostics.edge_leakage import band_shares, channel_responses, slope_factor
-from estimator.diagnostics.equalisation import correction, leakage_advice, matters, surely
 from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise
+from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
+from estimator.responses.equalisation import correction, leakage_advice, matters, surely
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.diagnostics.advice import UnequalResponses
-from estimator.diagnostics.edge_leakage import band_shares
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.relative_response import own_channels
+from estimator.responses.edge_leakage import band_shares
 from estimator.spectra.equaliser import (
     USABLE,
     bounded,
@@ -26,7 +26,7 @@ from estimator.spectra.equaliser import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from estimator.diagnostics.edge_leakage import ChannelResponses
+    from estimator.responses.edge_leakage import ChannelResponses
     from estimator.types import ComplexArray, FloatArray
 
 MATTERS = 0.01
@@ -130,7 +130,7 @@ def correction(
     motion_psd, noise_psd : float64, shape (n_freqs, n_channels)
     n_effective : float
     factor : float
-        `estimator.diagnostics.edge_leakage.slope_factor`.
+        `estimator.responses.edge_leakage.slope_factor`.
     reference : int, optional
         The sensor that stays as it is; the one with the shortest filters by default.
 

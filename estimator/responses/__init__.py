@@ -1,0 +1,1 @@
+"""How sensors answer the same motion: leakage, equalisation, calibration."""
