@@ -78,23 +78,24 @@ def predict(
     longest = max(LONGEST, LONGER * elapsed)
     length = np.geomspace(elapsed, longest, STEPS)[1:]
     mean, error, variance = _population(margins)
-    weights = np.exp(-(np.array(_NODES) ** 2) / 2)
-    decided = []
-    for seconds in length:
-        share = elapsed / float(seconds)
-        chances = [
-            _chance(
-                margins,
-                share,
-                quantile=quantile,
-                averages=averages / share,
-                mean=mean + node * error,
-                variance=variance,
-            )
-            for node in _NODES
-        ]
-        chance = float(weights @ np.array(chances) / weights.sum())
-        decided.append(chance >= CAUTIOUS and averages / share >= least)
+    nodes = np.array(_NODES)
+    weights = np.exp(-(nodes**2) / 2)
+    likely = None
+    for seconds in length.tolist():
+        share = elapsed / seconds
+        if averages / share < least:
+            continue
+        chances = _chances(
+            margins,
+            share,
+            quantile=quantile,
+            averages=averages / share,
+            mean=mean + nodes * error,
+            variance=variance,
+        )
+        if float(weights @ chances / weights.sum()) >= CAUTIOUS:
+            likely = seconds
+            break
     closest = int(np.argmin(np.abs(margins.margin)))
     low, high = interval_of_cov(
         margins.cov[[closest]] * math.sqrt(elapsed / longest),
@@ -102,7 +103,7 @@ def predict(
         np.array([averages * longest / elapsed]),
     )
     return Prediction(
-        seconds=float(length[decided.index(True)]) if True in decided else None,
+        seconds=likely,
         longest=longest,
         resolution_db=float(5 * np.log10(high[0] / low[0])) if low[0] > 0 else math.inf,
     )
@@ -121,19 +122,22 @@ def _population(margins: Margins) -> tuple[float, float, float]:
     return float(weight @ margins.margin / weight.sum()), float(weight.sum() ** -0.5), variance
 
 
-def _chance(
+def _chances(
     margins: Margins,
     share: float,
     *,
     quantile: float,
     averages: float,
-    mean: float,
+    mean: FloatArray,
     variance: float,
-) -> float:
-    """Return the probability of a decision after so many averages, `share` of which are there."""
+) -> FloatArray:
+    """Return the probability of a decision after so many averages, `share` of which are there.
+
+    One for each mean of the true margins, shape (n_means,).
+    """
     estimate, scatter = margins.margin, margins.cov**2
     trust = 1 / (1 + scatter / variance) if variance else np.zeros_like(scatter)
-    truth = trust * estimate + (1 - trust) * mean
+    truth = trust * estimate + (1 - trust) * mean[:, None]
     then = share * estimate + (1 - share) * truth
     deviation = np.sqrt((1 - share) ** 2 * trust * scatter + share * (1 - share) * scatter)
     low, high = interval_of_cov(
@@ -143,7 +147,7 @@ def _chance(
         passes = _normal_cdf((then - np.log(high)) / deviation)
         short = np.where(low > 0, np.log(low), -np.inf) - margins.clocks
         fails = np.where(margins.can_fail, _normal_cdf((short - then) / deviation), 0.0)
-    return float(passes.prod() + 1 - (1 - fails).prod())
+    return np.asarray(passes.prod(axis=1) + 1 - (1 - fails).prod(axis=1))
 
 
 @cache
