@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.results.verdict import TestVerdict
     from estimator.types import FloatArray
+    from tui.application.plan import TestPlan
 
 SETTINGS = Settings(
     segment=2.0, methods=("three-sensor", "three-channel"), band=(1.0, 20.0), target_cov=0.05
@@ -255,16 +256,24 @@ class ProgressCallback:
     bench: Bench | None = None
     running: Path | None = None
     told: list[str] = field(default_factory=list)
+    announced: list[str] = field(default_factory=list)
+    plan: TestPlan | None = None
 
-    def start(self) -> Path:
+    def start(self, plan: TestPlan) -> Path:
         """Note it."""
         self.told.append("start")
+        self.plan = plan
         return self.path
 
     @property
     def folder(self) -> Path:
         """Return where its recordings are."""
         return self.path.parent
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Note it."""
+        del path
+        self.announced.append(f"{event}: {text}")
 
     def about(
         self, path: Path, changes: Mapping[str, object]

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, ClassVar
 from textual import work
 from textual.binding import Binding, BindingType
 
-from tui.application.dialogs import MarkScreen, StartScreen, StopScreen
+from tui.application.dialogs import MarkScreen, StopScreen
 from tui.application.following import FollowingApp
 from tui.application.messages import RecordingOpened
+from tui.application.plan import TestPlan
 from tui.application.reference import can_open
+from tui.application.start_form import StartForm
 from tui.application.state import TITLES, VIEWS
 from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from daq.estimation.settings import Settings
@@ -65,7 +66,8 @@ class HuddleApp(FollowingApp):
         if self._given is not None:
             self.post_message(RecordingOpened(self._given))
         elif self._start_at_once:
-            self.action_start()
+            bench = self._controls.bench
+            self._begin(TestPlan(duration=None if bench is None else bench.recording.duration))
         else:
             self._find_running()
 
@@ -82,32 +84,31 @@ class HuddleApp(FollowingApp):
         return True
 
     def action_start(self) -> None:
-        """Start a recorder; asked before where a test is shown."""
-        if self.path is None:
-            self._begin()
-            return
+        """Ask what is wanted of a test, and start a recorder."""
 
-        def start(really: bool | None) -> None:
-            if really:
-                self._begin()
+        def start(plan: TestPlan | None) -> None:
+            if plan is not None:
+                self._begin(plan)
 
-        self.push_screen(StartScreen(self.path.name), start)
+        kept = "" if self.path is None else self.path.name
+        self.push_screen(StartForm(self._controls.bench, kept), start)
 
-    def _begin(self) -> None:
+    def _begin(self, plan: TestPlan) -> None:
         note = "connecting to the sensors …"
         self.state = replace(self.state, is_starting=True, failure="", note=note)
-        self._start()
+        self._start(plan)
 
     @work(thread=True, group="control", exclusive=True)
-    def _start(self) -> None:
-        self._control(self._controls.start)
+    def _start(self, plan: TestPlan) -> None:
+        path = self._try(partial(self._controls.start, plan))
+        if path is not None:
+            self.post_message(RecordingOpened(path, plan=plan))
+            if plan.note:
+                self._try(partial(self._controls.mark, path, plan.note))
 
     @work(thread=True, group="control", exclusive=True)
     def _find_running(self) -> None:
-        self._control(self._controls.find_running)
-
-    def _control(self, act: Callable[[], Path | None]) -> None:
-        path = self._try(act)
+        path = self._try(self._controls.find_running)
         if path is not None:
             self.post_message(RecordingOpened(path))
 

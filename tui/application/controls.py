@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.verdict import TestVerdict
+    from tui.application.plan import TestPlan
 
 
 class Controls(Protocol):
@@ -42,7 +43,7 @@ class Controls(Protocol):
         """Whether a recording can be started from here."""
         ...
 
-    def start(self) -> Path:
+    def start(self, plan: TestPlan) -> Path:
         """Start a recorder; return its file once it exists. Blocks."""
         ...
 
@@ -56,6 +57,10 @@ class Controls(Protocol):
 
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
+        ...
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Tell the world of the end of a test (``ended``), or of ``trouble``. Blocks."""
         ...
 
     def about(

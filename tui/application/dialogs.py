@@ -160,11 +160,3 @@ class StopScreen(QuestionScreen):
 
     def __init__(self, so_far: str) -> None:
         super().__init__("stop", f"Stop the recording after {so_far}?", does="stops")
-
-
-class StartScreen(QuestionScreen):
-    """Asks whether a new recording is to take the place of a test that is shown."""
-
-    def __init__(self, name: str) -> None:
-        question = f"Start a new recording? {name} is kept."
-        super().__init__("start", question, does="starts")

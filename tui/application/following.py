@@ -36,6 +36,7 @@ from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
 from tui.application.test_view.plot import PlainMonochrome
 from tui.application.test_view.view import TestView
 from tui.application.view import View
+from tui.output.verdict_text import WORDS
 from tui.runs.catalogue import delete_recording
 
 if TYPE_CHECKING:
@@ -72,6 +73,8 @@ class FollowingApp(App[None]):
         self._controls = controls
         self._ended = threading.Event()
         self._quitting = threading.Event()
+        self._is_stopping = False
+        self._lost: frozenset[str] = frozenset()
         self._bench = controls.bench
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
         views: tuple[type[View], ...] = (BenchView, TestView, ResultView, RecordingsView)
@@ -138,7 +141,11 @@ class FollowingApp(App[None]):
         own = message.settings is None
         settings = self._controls.settings if own else message.settings
         self._bench = self._controls.bench if own else message.bench
-        self.state = self._state_of(message.path)
+        self.state = replace(self._state_of(message.path), plan=message.plan)
+        if message.plan is not None and message.plan.cov is not None and settings is not None:
+            settings = replace(settings, target_cov=message.plan.cov)
+        self._is_stopping = False
+        self._lost = frozenset()
         self._ended.set()
         self._ended = threading.Event()
         self._follow(message.path, settings, self._ended, is_kept=message.is_kept)
@@ -166,6 +173,10 @@ class FollowingApp(App[None]):
     @on(StatusUpdated)
     def _on_looked(self, message: StatusUpdated) -> None:
         self.state = replace(self.state, now=message.now)
+        lost = frozenset(sensor.name for sensor in message.now.sensors if sensor.state.is_lost)
+        if lost - self._lost and not message.now.closed:
+            self.announce("trouble", f"lost: {', '.join(sorted(lost))}")
+        self._lost = lost
 
     @on(Progress)
     def _on_progress(self, message: Progress) -> None:
@@ -184,8 +195,32 @@ class FollowingApp(App[None]):
             verdict=judge(self._bench, snapshot, message.settings),
             note="",
         )
-        if snapshot.closed and before is not None and not before.closed:
+        if not snapshot.closed:
+            self._end_if_reached(snapshot, message.settings)
+        elif before is not None and not before.closed:
+            said = "" if self.state.verdict is None else WORDS[self.state.verdict.verdict]
+            self.announce("ended", said)
             await self._show_result()
+
+    def _end_if_reached(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Stop the test if what was wanted of it is reached."""
+        plan, path = self.state.plan, self.path
+        if plan is None or path is None or self._is_stopping:
+            return
+        if plan.is_reached(snapshot, settings, self.state.verdict):
+            self._is_stopping = True
+            self.state = replace(self.state, note="reached what was wanted: stopping …")
+            self._stop(path)
+
+    @work(thread=True, group="control")
+    def _stop(self, path: Path) -> None:
+        self._try(partial(self._controls.stop, path))
+
+    @work(thread=True, group="announce")
+    def announce(self, event: str, text: str) -> None:
+        """Ring the bell, and start the command for events."""
+        self.call_from_thread(self.bell)
+        self._try(partial(self._controls.announce, event, text, self.path))
 
     async def _show_result(self) -> None:
         """Show the result of a test that has just ended, unless somebody is at something else."""
@@ -200,6 +235,7 @@ class FollowingApp(App[None]):
         self.state = replace(self.state, is_starting=False, note="")
         if message.ended:
             self.state = replace(self.state, trouble=message.text)
+            self.announce("trouble", message.text)
         elif starting:
             self.state = replace(self.state, failure=message.text)
         else:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from daq.results.verdict import TestVerdict
+    from tui.application.plan import TestPlan
 
 BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
 TITLES: Final = {BENCH: "Bench", TEST: "Test", RESULT: "Result", RECORDINGS: "Recordings"}
@@ -56,6 +57,8 @@ class State:
         Notice in place of the progress.
     is_starting : bool
         Whether a recorder is being started.
+    plan : TestPlan or None
+        When the test ends by itself, if it was started here.
     reference : Reference or None
         What the recording is compared with.
     """
@@ -74,6 +77,7 @@ class State:
     failure: str = ""
     note: str = ""
     is_starting: bool = False
+    plan: TestPlan | None = None
     reference: Reference | None = None
 
     @property

@@ -31,6 +31,15 @@ def tui(
         Path | None,
         typer.Argument(metavar="BENCH", help="Bench file, or a recording to view."),
     ] = None,
+    on_event: Annotated[
+        str,
+        typer.Option(
+            "--on-event",
+            metavar="COMMAND",
+            help="Command to start when a test ends and when a sensor is lost. It gets"
+            " HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and HUDDLE_RECORDING.",
+        ),
+    ] = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application: start, watch and stop a huddle test.
@@ -47,7 +56,7 @@ def tui(
         )
     from tui.commands.tui import open_application
 
-    open_application(source, **wanted)
+    open_application(source, on_event=on_event, **wanted)
 
 
 @examples(
@@ -110,13 +119,17 @@ def record(
     bench: BenchArgument,
     *,
     duration: DurationOption = None,
+    operator: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator in place of that of the bench file."),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
     """Record without estimating, until the duration has passed or Ctrl-C."""
     from tui.commands.record import record_bench
 
-    record_bench(bench, duration=duration, out=out, json=json)
+    record_bench(bench, duration=duration, operator=operator, out=out, json=json)
 
 
 @examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")

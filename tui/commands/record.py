@@ -28,7 +28,14 @@ GAP_INTERVAL = 60.0
 """Minimum seconds between two log lines about gaps; a polled sensor can have many."""
 
 
-def record_bench(path: Path, *, duration: float | None, out: Path | None, json: str | None) -> None:
+def record_bench(
+    path: Path,
+    *,
+    duration: float | None,
+    operator: str | None = None,
+    out: Path | None,
+    json: str | None,
+) -> None:
     """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
 
     Raises
@@ -37,6 +44,8 @@ def record_bench(path: Path, *, duration: float | None, out: Path | None, json: 
         With a DeviceError for every sensor that cannot be used at the start.
     """
     bench = load(path)
+    if operator is not None:
+        bench = bench.model_copy(update={"operator": operator})
     if duration is None:
         duration = bench.recording.duration
     if out is None:

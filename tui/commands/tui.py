@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,9 +34,12 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.results.verdict import TestVerdict
+    from tui.application.plan import TestPlan
 
 ALWAYS = ("three-sensor", "three-channel")
 """Cheap methods, shown for comparison with the chosen ones."""
+HOOK_TIMEOUT = 60.0
+"""Seconds after which a command for events is ended."""
 FOREIGN = {".npz", ".npy", ".csv", ".txt", ".mat", ".mseed", ".miniseed", ".seed", ".sac", ".gcf"}
 """Suffixes of files that must be imported first."""
 
@@ -48,6 +54,8 @@ class BenchControls:
     can_start: bool = True
     reports: Path | None = None
     """Folder of reports; None: beside their recordings."""
+    on_event: str = ""
+    """Command for the end of a test, and for trouble."""
     started: list[RecorderProcess] = field(default_factory=list)
 
     @property
@@ -60,10 +68,10 @@ class BenchControls:
         """Where the bench file wants recordings."""
         return self.bench.recording_directory
 
-    def start(self) -> Path:
+    def start(self, plan: TestPlan) -> Path:
         """Start a recorder; return its file once it exists."""
         out = recording_path(self.bench, SystemClock().now())
-        recorder = RecorderProcess(self.path, out, duration=self.bench.recording.duration)
+        recorder = RecorderProcess(self.path, out, duration=plan.duration, operator=plan.operator)
         self.started.append(recorder)
         recorder.wait_for_file()
         return out
@@ -79,6 +87,10 @@ class BenchControls:
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
         ask(path, "mark", text)
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Start the command that the user gave for events."""
+        announce(self.on_event, event, text, path)
 
     def about(
         self, path: Path, changes: Mapping[str, object]
@@ -111,6 +123,7 @@ class RecordingControls:
     settings: Settings
     bench: Bench | None = None
     can_start: bool = False
+    on_event: str = ""
 
     @property
     def name(self) -> str:
@@ -122,8 +135,9 @@ class RecordingControls:
         """The folder of the recording."""
         return self.path.parent
 
-    def start(self) -> Path:
+    def start(self, plan: TestPlan) -> Path:
         """Raise an error: a recording cannot be started again."""
+        del plan
         raise HuddleError("this is a recording; huddle tui BENCH starts one")
 
     def find_running(self) -> Path:
@@ -138,6 +152,10 @@ class RecordingControls:
         """Ask the recorder to record a remark."""
         ask(path, "mark", text)
 
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Start the command that the user gave for events."""
+        announce(self.on_event, event, text, path)
+
     def about(
         self, path: Path, changes: Mapping[str, object]
     ) -> tuple[Settings | None, Bench | None]:
@@ -150,6 +168,34 @@ class RecordingControls:
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report beside the recording."""
         return _report(path, snapshot, settings)
+
+
+def announce(command: str, event: str, text: str, path: Path | None) -> None:
+    """Start a command with the environment variables HUDDLE_EVENT, _TEXT and _RECORDING.
+
+    Raises
+    ------
+    HuddleError
+        If it cannot be started, or ends with an error.
+    """
+    if not command:
+        return
+    about = {"HUDDLE_EVENT": event, "HUDDLE_TEXT": text, "HUDDLE_RECORDING": str(path or "")}
+    try:
+        ended = subprocess.run(
+            shlex.split(command),
+            env=os.environ | about,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=HOOK_TIMEOUT,
+            check=False,
+        )
+    except (OSError, ValueError, subprocess.TimeoutExpired) as error:
+        raise HuddleError(f"--on-event {command}: {error}") from error
+    if ended.returncode:
+        said = ended.stderr.strip() or f"exit code {ended.returncode}"
+        raise HuddleError(f"--on-event {command}: {said}")
 
 
 def about(path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
@@ -178,7 +224,12 @@ def _report(
     return out
 
 
-def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
+def open_application(
+    source: Path,
+    *,
+    on_event: str = "",
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
     """Open the application on a bench file, or on a recording (``.h5``).
 
     Raises
@@ -189,7 +240,7 @@ def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fie
         Standard input or output is not a terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
-        open_recording(source, **wanted)
+        open_recording(source, on_event=on_event, **wanted)
     elif source.suffix.lower() in FOREIGN:
         problem = (
             "neither a bench file (.toml) nor a recording (.h5); convert it to a recording first:"
@@ -203,16 +254,16 @@ def open_application(source: Path, **wanted: Any) -> None:  # noqa: ANN401 - fie
         )
         raise BenchFileError(FileFault("", problem), source=source)
     else:
-        open_bench(source, **wanted)
+        open_bench(source, on_event=on_event, **wanted)
 
 
-def open_bench(path: Path, **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
+def open_bench(path: Path, *, on_event: str = "", **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
     """Open the application on a bench file."""
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
     settings = _with_comparison(settings, wanted)
-    controls = BenchControls(path, bench, settings)
+    controls = BenchControls(path, bench, settings, on_event=on_event)
     try:
         _run(HuddleApp(controls), again=path)
     finally:
@@ -264,12 +315,14 @@ def open_recording(
     *,
     start: str | None = None,
     end: str | None = None,
+    on_event: str = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application on a recording, growing or closed."""
     settings, bench = settings_for(path, start=start, end=end, **wanted)
     settings = _with_comparison(settings, wanted)
-    _run(HuddleApp(RecordingControls(path, settings, bench), path=path), again=path)
+    controls = RecordingControls(path, settings, bench, on_event=on_event)
+    _run(HuddleApp(controls, path=path), again=path)
 
 
 def _with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:

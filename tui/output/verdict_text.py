@@ -150,6 +150,19 @@ def margin(result: LimitResult) -> str:
     return f"{middle} ({signed(low, '+.1f')} to {signed(high, '+.1f')})"
 
 
+def worst_by_channel(found: TestVerdict | None) -> dict[tuple[str, str], LimitResult]:
+    """Return for each channel the limit that it does worst beside, by verdict, then by margin."""
+    order = (Verdict.PASS, Verdict.NOT_DECIDED, Verdict.FAIL)
+    worst: dict[tuple[str, str], LimitResult] = {}
+    for each in () if found is None else found.limits:
+        key = each.sensor, each.channel
+        before = worst.get(key)
+        rank = order.index(each.verdict), -each.margin_low_db
+        if before is None or rank > (order.index(before.verdict), -before.margin_low_db):
+            worst[key] = each
+    return worst
+
+
 def _obstacle(obstacle: Obstacle, found: TestVerdict) -> str:
     concerned = [each for each in found.limits if each.obstacle is obstacle]
     return OBSTACLES[obstacle].format(

@@ -51,6 +51,8 @@ class RecorderProcess:
         In seconds; without it, until a stop is requested.
     lock : int, optional
         Descriptor of a lock that the process holds as long as it lives (not on Windows).
+    operator : str, optional
+        In place of that of the bench file.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class RecorderProcess:
         *,
         duration: float | None = None,
         lock: int | None = None,
+        operator: str | None = None,
     ) -> None:
         if out.exists():
             raise RecordingError(f"{out}: exists already; expected a new file")
@@ -73,6 +76,8 @@ class RecorderProcess:
         arguments += logs.arguments_for_child()
         if duration is not None:
             arguments += ["--duration", repr(duration)]
+        if operator is not None:
+            arguments += ["--operator", operator]
         descriptor, name = tempfile.mkstemp(prefix="huddle-recorder-", suffix=".log")
         try:
             self._process = subprocess.Popen(

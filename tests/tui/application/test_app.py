@@ -101,7 +101,7 @@ async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
 ) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW, notifications=True) as pilot:
-        await pilot.press("s")
+        await pilot.press("s", "enter")
         await app.workers.wait_for_complete()
         await pilot.pause()
         await app.workers.wait_for_complete()

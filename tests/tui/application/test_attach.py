@@ -53,7 +53,7 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
     controls = BenchControls(bench, load(bench), settings)
     first = HuddleApp(controls)
     async with first.run_test(size=(80, 24)) as pilot:
-        await pilot.press("s")
+        await pilot.press("s", "enter")
         await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 6)
         await pilot.press("q")
     (recorder,) = controls.started

@@ -30,13 +30,16 @@ from tui.output.formatting import clock_time
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tui.application.plan import TestPlan
+
 
 @dataclass
 class Refusing(ProgressCallback):
     """Controls whose recorder does not start."""
 
-    def start(self) -> Path:
+    def start(self, plan: TestPlan) -> Path:
         """Refuse."""
+        del plan
         raise HuddleError(
             "sensor A at /dev/ttyUSB0: no answer\nsensor C at /dev/ttyUSB2: no such port"
         )
@@ -58,11 +61,10 @@ async def test_starting_over_a_result_is_asked_first(
         await shown(pilot, app, *ended())
         await pilot.press("s")
         await shown(pilot, app)
-        assert "Start a new recording? old.h5 is kept" in screen_text(app)
-        await pilot.press("s", "enter", "x", "escape")  # none of them starts
-        await pilot.press("s", "n")
+        assert "start a test; old.h5 is kept" in screen_text(app)
+        await pilot.press("s", "y", "tab", "x", "escape")  # none of them starts
         assert told.told == []
-        await pilot.press("s", "y")
+        await pilot.press("s", "enter")
         await app.workers.wait_for_complete()
     assert told.told == ["start"]
 
@@ -74,7 +76,7 @@ async def test_why_no_recording_started_stays_on_the_screen(
     app = HuddleApp(Refusing(tmp_path / "run.h5"))
     async with app.run_test(size=size) as pilot:
         await app.workers.wait_for_complete()
-        await pilot.press("s")
+        await pilot.press("s", "enter")
         await app.workers.wait_for_complete()
         await shown(pilot, app)
         await pilot.press("escape", "2", "d", "escape", "1")
@@ -180,4 +182,4 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
         text = screen_text(app)
     assert "✗ FAIL: 1 of 9 channels above data sheet: C.Z." in text
     assert "C.Z fails 'data sheet'" in text
-    assert "✓ +8." in next(line for line in text.splitlines() if line.startswith("  A.X"))
+    assert "✓ +9." in next(line for line in text.splitlines() if line.startswith("  A.X"))

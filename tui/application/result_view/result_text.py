@@ -13,7 +13,6 @@ from daq.results.band_summary import band_of, channel_means, data_means, judged_
 from daq.results.comparison import compare
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
-from daq.results.verdict import Verdict
 from tui.application.dialogs import item
 from tui.application.test_view.panels import alerts, known_to
 from tui.output.diagnostics import summary
@@ -27,6 +26,7 @@ from tui.output.verdict_text import (
     margin,
     not_judged,
     what_to_do,
+    worst_by_channel,
 )
 from tui.output.vocabulary import PARTNER_WORDS
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.comparison import Difference
-    from daq.results.verdict import LimitResult, TestVerdict
+    from daq.results.verdict import TestVerdict
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
@@ -94,7 +94,7 @@ def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: in
     band = band_of(settings, snapshot)
     data, cov = data_means(snapshot, band), channel_covs(snapshot, settings, method)
     means = channel_means(noise, snapshot, settings, band)
-    margins, differences = _margins(state.verdict), _differences(state)
+    margins, differences = worst_by_channel(state.verdict), _differences(state)
     table = Table(
         box=None,
         pad_edge=False,
@@ -140,19 +140,6 @@ def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: in
             cells.append(difference_text(differences.get(key)))
         table.add_row(name, *cells)
     return table
-
-
-def _margins(found: TestVerdict | None) -> dict[tuple[str, str], LimitResult]:
-    """Return for each channel the limit that it does worst beside, by verdict, then by margin."""
-    order = (Verdict.PASS, Verdict.NOT_DECIDED, Verdict.FAIL)
-    worst: dict[tuple[str, str], LimitResult] = {}
-    for each in () if found is None else found.limits:
-        key = each.sensor, each.channel
-        before = worst.get(key)
-        rank = order.index(each.verdict), -each.margin_low_db
-        if before is None or rank > (order.index(before.verdict), -before.margin_low_db):
-            worst[key] = each
-    return worst
 
 
 def _differences(state: State) -> dict[tuple[str, str], Difference]:

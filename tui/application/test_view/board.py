@@ -9,9 +9,11 @@ from textual.containers import Vertical, VerticalScroll
 from textual.widgets import Static
 
 from tui.application.test_view import clocks, panels
+from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
-from tui.application.test_view.plotted import Choice, curves, plot_title
+from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
 from tui.application.view import TALL
+from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,6 +33,7 @@ class Board(Vertical):
         super().__init__()
         self._shown: State | None = None
         self._choice = Choice()
+        self._frozen: State | None = None
         self._written: dict[str, tuple[RenderableType, int]] = {}
         self._drawn: object = None
         self._means: tuple[object, tuple[BandMeans, ...]] = (None, ())
@@ -53,8 +56,9 @@ class Board(Vertical):
         self._drawn = None
         self.call_after_refresh(self._draw)
 
-    def show(self, shown: State, choice: Choice) -> None:
-        """Show this."""
+    def show(self, shown: State, choice: Choice, *, frozen: State | None = None) -> None:
+        """Show this; the curves are those of `frozen`, if it is given."""
+        self._frozen = frozen
         before, self._shown = self._choice, shown
         self._choice = choice
         self.set_class(choice.clocks, "-clocks")
@@ -83,6 +87,8 @@ class Board(Vertical):
             return
         if choice.clocks:
             table = clocks.clock_table(snapshot, settings, chosen=self._sensor(), width=width - 1)
+        elif choice.channels:
+            table = channel_table(shown, choice, means=self._noise(shown), width=width - 1)
         else:
             table = panels.sensor_table(
                 now,
@@ -123,12 +129,13 @@ class Board(Vertical):
         self._write("#alert", Text("\n").join(alerts), n_lines=len(alerts))
 
     def _draw_curves(self) -> None:
-        shown = self._shown
+        shown = self._frozen or self._shown
         if shown is None or shown.snapshot is None or shown.settings is None:
             return
         snapshot, choice = shown.snapshot, self._choice
         psd, drift = self.query_one(PsdPlot), self.query_one(DriftPlot)
-        drawn = (id(snapshot), id(shown.reference), choice, (drift if choice.clocks else psd).size)
+        size = (drift if choice.clocks else psd).size
+        drawn = (id(snapshot), id(shown.reference), choice, self._frozen is None, size)
         if drawn == self._drawn:
             return
         self._drawn = drawn
@@ -138,8 +145,12 @@ class Board(Vertical):
             drift.show(lines)
         else:
             psd.visible = snapshot.n_segments > 0
-            self._write("#title", plot_title(snapshot, choice))
-            psd.show(curves(shown, choice, n_points=psd.n_points))
+            shown_curves = curves(shown, choice, n_points=psd.n_points)
+            title = read_out(snapshot, choice, shown_curves) or plot_title(snapshot, choice)
+            frozen = f"frozen at {clock_time(snapshot.elapsed)}  " if self._frozen else ""
+            self._write("#title", Text.assemble((frozen, "reverse"), title))
+            unit = unit_of(snapshot, choice)
+            psd.show(shown_curves, unit=unit, span=choice.span, cursor=choice.cursor)
 
     def _write(self, selector: str, text: RenderableType, *, n_lines: int = 1) -> None:
         """Write a part of the screen; its layout changes only with its height."""
@@ -154,7 +165,10 @@ class Board(Vertical):
         shown = self._shown
         if shown is None or shown.snapshot is None or shown.now is None:
             return
-        row = 1 + [sensor.name for sensor in shown.now.sensors].index(self._sensor())
+        if self._choice.channels:
+            row = 1 + self._choice.channel
+        else:
+            row = 1 + [sensor.name for sensor in shown.now.sensors].index(self._sensor())
         area = self.query_one("#sensors", VerticalScroll)
         if not area.scroll_y <= row < area.scroll_y + area.size.height:
             area.scroll_to(y=max(0, row + 1 - area.size.height), animate=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +36,18 @@ class Curve:
     low_db: FloatArray
     high_db: FloatArray
     negative: NDArray[np.bool_]
+
+    def within(self, low: float, high: float) -> Curve:
+        """Return the points between two frequencies, as log10 of Hz."""
+        inside = (self.log_frequency >= low) & (self.log_frequency <= high)
+        return replace(
+            self,
+            log_frequency=self.log_frequency[inside],
+            level_db=self.level_db[inside],
+            low_db=self.low_db[inside],
+            high_db=self.high_db[inside],
+            negative=self.negative[inside],
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.test_view.curves import level_limits
+from tui.application.test_view.units import SpectrumUnit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,16 +58,18 @@ class FrequencyAxis(AxisFormatter):
 
 
 class LevelAxis(AxisFormatter):
-    """Ticks in dB at round multiples."""
+    """Ticks at round values of a unit, on an axis in dB."""
+
+    def __init__(self) -> None:
+        self.unit = SpectrumUnit("dB", is_db=True)
 
     def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
         """Return tick positions in dB."""
-        step = next((s for s in (5, 10, 20, 40, 50) if (max_ - min_) / s <= max_ticks), 100)
-        return [float(t) for t in np.arange(math.ceil(min_ / step) * step, max_ + 1e-9, step)]
+        return self.unit.ticks(min_, max_, max_ticks)
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
-        """Return levels with a real minus sign."""
-        return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
+        """Return values in the unit."""
+        return self.unit.labels(ticks)
 
 
 class TimeAxis(AxisFormatter):
@@ -154,26 +157,52 @@ class PsdPlot(FullPlot):
     """Curves with their 95 % bands, redrawn as a whole when any of them changes."""
 
     def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
-        super().__init__(FrequencyAxis(), LevelAxis(), id=id)
+        self._level_axis = LevelAxis()
+        super().__init__(FrequencyAxis(), self._level_axis, id=id)
 
     def on_mount(self) -> None:
         """Say which curve is which."""
         super().on_mount()
         self.show_legend(LegendLocation.TOPRIGHT)
 
-    def show(self, curves: Sequence[Curve]) -> None:
-        """Draw these curves and no others; the last one on top."""
+    def show(
+        self,
+        curves: Sequence[Curve],
+        *,
+        unit: SpectrumUnit,
+        span: tuple[float, float] | None = None,
+        cursor: float | None = None,
+    ) -> None:
+        """Draw these curves and no others; the last one on top.
+
+        Parameters
+        ----------
+        curves : sequence of Curve
+        unit : SpectrumUnit
+            Of the labels.
+        span : (float, float), optional
+            Shown part, as log10 of Hz.
+        cursor : float, optional
+            Frequency of a vertical line, as log10 of Hz.
+        """
         self.clear()
         if not curves:
             return
+        self._level_axis.unit = unit
         frequencies = np.concatenate([curve.log_frequency for curve in curves])
+        first, last = span or (float(frequencies.min()), float(frequencies.max()))
+        curves = [curve.within(first, last) for curve in curves]
+        curves = [curve for curve in curves if curve.log_frequency.size]
         low, high = level_limits(curves)
-        self.set_xlimits(float(frequencies.min()), float(frequencies.max()))
+        self.set_xlimits(first, last)
         self.set_ylimits(low, high)
+        if cursor is not None:
+            self.add_v_line(cursor, "#e8edf6")
         rows = max(4, self.size.height - self.margin_bottom - 2)
         dot = (high - low) / (rows * DOTS_PER_ROW)
         for curve in curves:
-            self._draw_band(curve, dot=dot, limits=(low, high))
+            if curve.band_style:
+                self._draw_band(curve, dot=dot, limits=(low, high))
         for curve in curves:
             self.plot(
                 curve.log_frequency,

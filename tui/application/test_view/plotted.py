@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from daq.results.band_summary import correlation_of
 from daq.results.limits import concerns, mask_psd
+from tui.application.test_view.clocks import COLOURS
 from tui.application.test_view.curves import data_curve, mask_curve, noise_curve
+from tui.application.test_view.units import units_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.application.state import State
     from tui.application.test_view.curves import Curve
+    from tui.application.test_view.units import SpectrumUnit
 
+NARROWEST = 0.02  # of a decade
 DATA_STYLE = "#7d8799"
 LIMIT_STYLE, LIMIT_MARKER = "#ff6b6b", "■"
+MARKERS = "●×◆+■▲"
 REFERENCE_STYLE = ("#7bd88f", "#3f6d4b", "≈")
 STYLES = {
     "three-sensor": ("#4cc9f0", "#1d6f8c", "●"),
@@ -29,11 +39,92 @@ STYLES = {
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What the technician looks at: a channel, methods by name, or clocks in place of noise."""
+    """What the technician looks at.
+
+    Attributes
+    ----------
+    channel : int
+    methods : tuple of str
+        By name; the first one also fills the table.
+    clocks : bool
+        Clocks in place of noise.
+    channels : bool
+        A row per channel in place of one per sensor.
+    overlay : bool
+        The like channels of all sensors in place of one channel.
+    unit : int
+        Among those of `units_of`.
+    span : (float, float) or None
+        Shown part of the frequencies, as log10 of Hz; None for all.
+    cursor : float or None
+        Where values are read off, as log10 of Hz.
+    """
 
     channel: int = 0
     methods: tuple[str, ...] = ()
     clocks: bool = False
+    channels: bool = False
+    overlay: bool = False
+    unit: int = 0
+    span: tuple[float, float] | None = None
+    cursor: float | None = None
+
+
+def whole_span(snapshot: Snapshot) -> tuple[float, float]:
+    """Return all frequencies that are plotted, as log10 of Hz."""
+    frequency = snapshot.frequency
+    return math.log10(frequency[1]), math.log10(frequency[-2])
+
+
+def zoomed(choice: Choice, snapshot: Snapshot, factor: float) -> Choice:
+    """Return a choice with this factor of the frequencies: closer about the cursor, if placed."""
+    low, high = choice.span or whole_span(snapshot)
+    middle = (low + high) / 2 if choice.cursor is None or factor > 1 else choice.cursor
+    return _spanning(choice, snapshot, *(middle + factor * (end - middle) for end in (low, high)))
+
+
+def panned(choice: Choice, snapshot: Snapshot, share: float) -> Choice:
+    """Return a choice moved by a share of what is shown."""
+    low, high = choice.span or whole_span(snapshot)
+    first, last = whole_span(snapshot)
+    shift = min(max(share * (high - low), first - low), last - high)
+    return _spanning(choice, snapshot, low + shift, high + shift)
+
+
+def _spanning(choice: Choice, snapshot: Snapshot, low: float, high: float) -> Choice:
+    first, last = whole_span(snapshot)
+    low, high = max(low, first), min(high, last)
+    if high - low < NARROWEST:
+        return choice
+    is_whole = high - low >= last - first - 1e-9
+    cursor = None if choice.cursor is None else min(max(choice.cursor, low), high)
+    return replace(choice, span=None if is_whole else (low, high), cursor=cursor)
+
+
+def moved(choice: Choice, snapshot: Snapshot, step: float) -> Choice:
+    """Return a choice with the cursor moved by a share of what is shown; placed, if it was not."""
+    low, high = choice.span or whole_span(snapshot)
+    if choice.cursor is None:
+        return replace(choice, cursor=(low + high) / 2)
+    return replace(choice, cursor=min(max(choice.cursor + step * (high - low), low), high))
+
+
+def stepped(choice: Choice, snapshot: Snapshot, *, channel: int = 0, sensor: int = 0) -> Choice:
+    """Return a choice of another channel, or of the like channel of another sensor."""
+    if channel:
+        return replace(choice, channel=(choice.channel + channel) % len(snapshot.channels))
+    starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
+    now = max(n for n, start in enumerate(starts) if start <= choice.channel)
+    place, other = choice.channel - starts[now], (now + sensor) % len(starts)
+    return replace(choice, channel=starts[other] + min(place, snapshot.dims[other] - 1))
+
+
+def like_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
+    """Return the channels at the place that the chosen one has in its sensor, of every sensor."""
+    starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
+    now = max(n for n, start in enumerate(starts) if start <= choice.channel)
+    place = choice.channel - starts[now]
+    return [start + place for start, d in zip(starts, snapshot.dims, strict=True) if place < d]
 
 
 def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
@@ -44,7 +135,12 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     snapshot, settings = state.snapshot, state.settings
     if snapshot is None or settings is None or snapshot.n_segments == 0:
         return []
+    if choice.span is not None:  # finer, where less is shown
+        first, last = whole_span(snapshot)
+        n_points = round(n_points * (last - first) / (choice.span[1] - choice.span[0]))
     column, frequency = choice.channel, snapshot.frequency
+    if choice.overlay:
+        return _limits(state, choice, n_points=n_points) + _like(state, choice, n_points=n_points)
     shown = [
         data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
     ]
@@ -62,6 +158,25 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
                 )
             )
     return shown
+
+
+def _like(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
+    """Return the noise of the like channels of all sensors, the chosen one on top."""
+    snapshot, settings = state.snapshot, state.settings
+    method = next(iter(choice.methods), "")
+    if snapshot is None or settings is None or method not in snapshot.results:
+        return []
+    columns = like_channels(choice, snapshot)
+    return [
+        _noise(
+            *(snapshot, settings, column),
+            method=method,
+            label=snapshot.channels[column].name,
+            style=(COLOURS[n % len(COLOURS)], "", MARKERS[n % len(MARKERS)]),
+            n_points=n_points,
+        )
+        for n, column in sorted(enumerate(columns), key=lambda each: each[1] == choice.channel)
+    ]
 
 
 def _noise(
@@ -138,5 +253,34 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
 
 def plot_title(snapshot: Snapshot, choice: Choice) -> str:
     """Return what the plot shows, with its unit."""
-    label = snapshot.channels[choice.channel]
-    return f"{label.sensor} {label.channel}   power spectral density re 1 ({snapshot.unit})²/Hz"
+    label, unit = snapshot.channels[choice.channel], unit_of(snapshot, choice)
+    if choice.overlay:
+        names = ", ".join(snapshot.channels[c].name for c in like_channels(choice, snapshot))
+        return f"{names}   noise in {unit.name}"
+    return f"{label.sensor} {label.channel}   power spectral density in {unit.name}"
+
+
+def unit_of(snapshot: Snapshot, choice: Choice) -> SpectrumUnit:
+    """Return the chosen unit."""
+    units = units_of(snapshot.unit)
+    return units[choice.unit % len(units)]
+
+
+def read_out(snapshot: Snapshot, choice: Choice, curves: Sequence[Curve]) -> str:
+    """Return the values of all curves at the cursor, estimates with their 95 % interval."""
+    if choice.cursor is None or not curves:
+        return ""
+    unit, cursor, parts = unit_of(snapshot, choice), choice.cursor, []
+    estimates = [each for each in curves if each.label in choice.methods]
+    for curve in (*estimates, *(each for each in curves if each.label not in choice.methods)):
+        at = int(np.argmin(np.abs(curve.log_frequency - cursor)))
+        level, low, high = curve.level_db[at], curve.low_db[at], curve.high_db[at]
+        if math.isnan(level) and math.isnan(high):
+            continue
+        text = f"below {unit.text(high)}" if math.isnan(level) else unit.text(level)
+        if math.isfinite(level) and math.isfinite(high):
+            text += f" ({'0' if math.isnan(low) else unit.text(low)} to {unit.text(high)})"
+        parts.append(f"{curve.label} {text}")
+    name = snapshot.channels[choice.channel].name
+    what = "" if choice.overlay else f"{name}  "
+    return f"{10**cursor:.3g} Hz  {what}{' · '.join(parts)}  {unit.name}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from textual.binding import Binding, BindingType
@@ -12,14 +13,25 @@ from tui.application.dialogs import TextScreen
 from tui.application.state import TEST
 from tui.application.test_view.board import Board
 from tui.application.test_view.details import details
-from tui.application.test_view.plotted import Choice
+from tui.application.test_view.plotted import Choice, moved, panned, stepped, zoomed
+from tui.application.test_view.units import units_of
 from tui.application.view import View
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rich.console import RenderableType
     from textual.app import ComposeResult
 
+    from daq.estimation.snapshot import Snapshot
     from tui.application.state import State
+
+
+OF_A_SNAPSHOT = {
+    *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "freeze"),
+    *("cursor", "zoom", "pan", "whole"),
+}
+"""What can be done once there is an estimate."""
 
 
 class TestView(View):
@@ -31,25 +43,48 @@ class TestView(View):
         Binding("s", "app.start", "Start"),
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
-        Binding("c", "clocks", "Clocks"),
-        Binding("d", "details", "Details"),
-        Binding("e", "method", "Estimate"),
-        Binding("right", "channel(1)", "Select", key_display="←→↑↓"),
+        Binding("right", "channel(1)", "Channel", key_display="←→↑↓"),
         Binding("left", "channel(-1)", "Channel", show=False),
         Binding("down", "sensor(1)", "Sensor", show=False),
         Binding("up", "sensor(-1)", "Sensor", show=False),
+        Binding("e", "method", "Method"),
+        Binding("u", "unit", "Unit", show=False),
+        Binding("t", "table", "Table", show=False),
+        Binding("c", "clocks", "Clocks"),
+        Binding("d", "details", "Details"),
+        Binding("l", "overlay", "Like channels", show=False),
+        Binding("f", "freeze", "Freeze", show=False),
+        Binding("full_stop", "cursor(0.02)", "Cursor right", show=False),
+        Binding("comma", "cursor(-0.02)", "Cursor left", show=False),
+        Binding("greater_than_sign", "cursor(0.1)", "Cursor far right", show=False),
+        Binding("less_than_sign", "cursor(-0.1)", "Cursor far left", show=False),
+        Binding("plus,equals_sign", "zoom(0.5)", "Zoom in", show=False),
+        Binding("minus", "zoom(2.0)", "Zoom out", show=False),
+        Binding("right_square_bracket", "pan(0.25)", "Higher frequencies", show=False),
+        Binding("left_square_bracket", "pan(-0.25)", "Lower frequencies", show=False),
+        Binding("escape,0", "whole", "Whole spectrum", show=False),
     ]
     KEYS = (
-        ("s", "start a recording of this bench"),
+        ("s", "start a test: operator, note, and when it ends by itself"),
         ("x", "stop it; the result is then computed from the whole recording"),
         ("m", "mark this moment in the recording, with a remark"),
         ("← → ↑ ↓", "channel, and sensor"),
         ("e", "estimate shown: each method in turn, then all"),
+        ("u", "unit of the curves: dB, unit²/Hz, g²/Hz, ng/√Hz"),
+        ("l", "like channels of all sensors in one plot; l again: one channel"),
+        (", .  < >", "cursor left and right, and far: values are read off above the plot"),
+        ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor"),
+        ("f", "freeze the curves; recording goes on"),
+        ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
-        ("d", "details: states, segments, diagnosis, events"),
+        ("d", "details: states, segments, pairs of sensors, diagnosis, events"),
     )
 
     choice: var[Choice] = var(Choice)
+
+    def __init__(self, state: State) -> None:
+        super().__init__(state)
+        self._frozen: State | None = None
 
     def parts(self) -> ComposeResult:
         """Yield the board."""
@@ -60,37 +95,70 @@ class TestView(View):
         settings, snapshot = self.state.settings, self.state.snapshot
         if settings is not None and snapshot is not None:
             self.choice = fitting(self.choice, self.state)
-        self.query_one(Board).show(self.state, self.choice)
+        if self._frozen is not None and self._frozen.path != self.state.path:
+            self._frozen = None
+        self.query_one(Board).show(self.state, self.choice, frozen=self._frozen)
 
     def watch_choice(self) -> None:
         """Draw another channel, method or picture."""
         if self.is_attached and self.query(Board):
-            self.query_one(Board).show(self.state, self.choice)
+            self.query_one(Board).show(self.state, self.choice, frozen=self._frozen)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
-        if action in {"channel", "sensor", "method", "clocks"}:
-            return self.state.snapshot is not None
-        return True
+        return action not in OF_A_SNAPSHOT or self.state.snapshot is not None
+
+    def _change(self, change: Callable[[Choice, Snapshot], Choice]) -> None:
+        """Look at something else."""
+        snapshot = self._plotted.snapshot
+        if snapshot is not None:
+            self.choice = change(self.choice, snapshot)
+
+    @property
+    def _plotted(self) -> State:
+        return self._frozen or self.state
 
     def action_channel(self, step: int) -> None:
         """Show the next or previous channel."""
-        if self.state.snapshot is not None:
-            channel = (self.choice.channel + step) % len(self.state.snapshot.channels)
-            self.choice = replace(self.choice, channel=channel)
+        self._change(partial(stepped, channel=step))
 
     def action_sensor(self, step: int) -> None:
         """Show the same channel of the next or previous sensor."""
-        snapshot = self.state.snapshot
-        if snapshot is None:
-            return
-        starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
-        sensor = max(n for n, start in enumerate(starts) if start <= self.choice.channel)
-        place = self.choice.channel - starts[sensor]
-        other = (sensor + step) % len(starts)
-        channel = starts[other] + min(place, snapshot.dims[other] - 1)
-        self.choice = replace(self.choice, channel=channel)
+        self._change(partial(stepped, sensor=step))
+
+    def action_cursor(self, share: float) -> None:
+        """Move the cursor by a share of the plot."""
+        self._change(partial(moved, step=share))
+
+    def action_zoom(self, factor: float) -> None:
+        """Show this factor of the frequencies."""
+        self._change(partial(zoomed, factor=factor))
+
+    def action_pan(self, share: float) -> None:
+        """Move by a share of the plot."""
+        self._change(partial(panned, share=share))
+
+    def action_whole(self) -> None:
+        """Show all frequencies, without a cursor."""
+        self.choice = replace(self.choice, span=None, cursor=None)
+
+    def action_unit(self) -> None:
+        """Show the next unit."""
+        self._change(lambda c, s: replace(c, unit=(c.unit + 1) % len(units_of(s.unit))))
+
+    def action_overlay(self) -> None:
+        """Show like channels of all sensors, or one channel again."""
+        self.choice = replace(self.choice, overlay=not self.choice.overlay)
+
+    def action_table(self) -> None:
+        """Show a row per channel, or per sensor again."""
+        self.choice = replace(self.choice, channels=not self.choice.channels)
+
+    def action_freeze(self) -> None:
+        """Keep the curves as they are, or let them go on."""
+        self._frozen = None if self._frozen is not None else self.state
+        self.draw()
 
     def action_method(self) -> None:
         """Show the next method, and after the last one all of them."""

@@ -1,0 +1,139 @@
+"""When a test ends by itself, and who is told: the start form, targets, bell and command."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daq.bench.model import Limit
+from daq.errors import HuddleError
+from daq.recording.sensor_state import SensorState
+from daq.results.limits import judge
+from daq.results.verdict import Verdict
+from tests.tui.application.screen_text import screen_text
+from tests.tui.application.test_app import NARROW, ended, running, shown
+from tests.tui.example_snapshot import (
+    SETTINGS,
+    ProgressCallback,
+    demo_bench,
+    growing,
+    made_now,
+    made_snapshot,
+)
+from tui.application.app import HuddleApp
+from tui.application.messages import RecordingOpened, StatusUpdated
+from tui.application.plan import TestPlan, end_text, is_surely_decided, parse_end
+from tui.commands.tui import announce
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
+
+
+@pytest.mark.parametrize(
+    ("text", "plan"),
+    [
+        ("", TestPlan()),
+        ("3h", TestPlan(duration=10800.0)),
+        ("5 %", TestPlan(cov=0.05)),
+        ("decided, 90 min", TestPlan(until_decided=True, duration=5400.0)),
+    ],
+)
+def test_the_end_is_read_and_written_alike(text: str, plan: TestPlan) -> None:
+    assert parse_end(text) == plan
+    assert parse_end(end_text(plan)) == plan
+
+
+@pytest.mark.parametrize("text", ["soon", "120 %", "x %", "decided or so", "-3h"])
+def test_what_is_no_end_is_refused_with_what_was_expected(text: str) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        parse_end(text)
+
+
+async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("s", *"ann", "tab", *"hot", "tab")
+        entry = app.screen.query_one("#end")
+        entry.value = "decided"  # type: ignore[attr-defined]
+        await pilot.press("enter")
+        await shown(pilot, app)
+        assert "the bench file has no limits" in screen_text(app)
+        assert told.told == []
+        entry.value = "10 %"  # type: ignore[attr-defined]
+        await pilot.press("enter")
+        await app.workers.wait_for_complete()
+        await shown(pilot, app)
+    assert told.plan is not None
+    assert told.plan.note == "hot"
+    assert told.plan.cov == 0.1
+    assert told.plan.operator is not None
+    assert told.plan.operator.endswith("ann")
+    assert told.told == ["start", "mark run.h5 hot"]
+
+
+async def test_a_test_is_stopped_once_when_its_precision_is_reached(
+    told: ProgressCallback, tmp_path: Path
+) -> None:
+    app, path = HuddleApp(told), tmp_path / "grows.h5"
+    with growing(path):
+        async with app.run_test(size=NARROW) as pilot:
+            await shown(pilot, app, RecordingOpened(path, plan=TestPlan(cov=0.2)), *running())
+            assert told.told == []
+            for _ in range(2):
+                await shown(pilot, app, *running(n_effective=1000.0))
+            for worker in [worker for worker in app.workers if worker.group == "control"]:
+                await worker.wait()
+    assert told.told == ["stop grows.h5"]
+
+
+def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -> None:
+    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    snapshot = made_snapshot(n_effective=2000.0)
+    found = judge(bench, snapshot, SETTINGS)
+    assert found is not None
+    assert found.verdict is Verdict.FAIL
+    assert is_surely_decided(found)
+    assert TestPlan(until_decided=True).is_reached(snapshot, SETTINGS, found)
+    passed = [each for each in found.limits if each.verdict is Verdict.PASS]
+    assert is_surely_decided(replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])))
+    barely = replace(passed[0], limit_psd=passed[0].high * 1.001)
+    assert not is_surely_decided(replace(found, verdict=Verdict.PASS, limits=(barely,)))
+    failed = next(each for each in found.limits if each.verdict is Verdict.FAIL)
+    barely = replace(failed, limit_psd=failed.low * 0.999)
+    assert not is_surely_decided(replace(found, limits=(barely,)))
+    assert not is_surely_decided(replace(found, verdict=Verdict.NOT_DECIDED))
+
+
+async def test_the_end_and_each_lost_sensor_are_announced_once(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        now = made_now()
+        lost = replace(now.sensors[1], state=SensorState.DISCONNECTED, overdue_for=5.0)
+        for _ in range(2):
+            await shown(pilot, app, StatusUpdated(replace(now, sensors=(now.sensors[0], lost))))
+        await shown(pilot, app, *ended())
+        await app.workers.wait_for_complete()
+    assert told.announced == ["trouble: lost: C", "trouble: lost: B", "ended: "]
+
+
+def test_the_command_for_events_gets_the_event(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    said = "os.environ['HUDDLE_EVENT'] + os.environ['HUDDLE_TEXT']"
+    script = f"import os; open({str(out)!r}, 'w').write({said})"
+    announce(f'{sys.executable} -c "{script}"', "ended", " PASS", None)
+    assert out.read_text() == "ended PASS"
+    with pytest.raises(HuddleError, match="--on-event"):
+        announce("/no/such/command", "ended", "", None)
+    with pytest.raises(HuddleError, match="exit code 3"):
+        announce(f'{sys.executable} -c "raise SystemExit(3)"', "ended", "", None)

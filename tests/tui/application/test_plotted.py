@@ -1,0 +1,117 @@
+"""The plot of the Test view: units, cursor, zoom, like channels, freezing, table of channels."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import pytest
+from textual.widgets import Static
+
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
+from tests.tui.example_snapshot import ProgressCallback, demo_bench, made_snapshot
+from tui.application.app import HuddleApp
+from tui.application.test_view.plotted import Choice, moved, panned, whole_span, zoomed
+from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
+
+
+def test_units_agree_with_their_definitions() -> None:
+    level = -120.0  # dB re 1 (m/s²)²/Hz
+    by_name = {unit.name: unit for unit in units_of("m/s²")}
+    assert by_name["(m/s²)²/Hz"].value(level) == pytest.approx(1e-12)
+    assert by_name["g²/Hz"].value(level) == pytest.approx(1e-12 / GRAVITY**2)
+    assert by_name["ng/√Hz"].value(level) == pytest.approx(1e-6 / GRAVITY * 1e9)
+    assert [unit.name for unit in units_of("m/s")][2:] == ["m/s/√Hz"]
+
+
+@pytest.mark.parametrize("unit", units_of("m/s²"), ids=lambda unit: unit.name)
+@pytest.mark.parametrize("span", [(-130.0, -80.0), (-121.0, -119.0), (-200.0, 20.0)])
+def test_ticks_are_round_few_and_within(unit: SpectrumUnit, span: tuple[float, float]) -> None:
+    ticks = unit.ticks(*span)
+    assert len(ticks) <= 8
+    assert all(span[0] <= tick <= span[1] for tick in ticks)
+    assert len(set(unit.labels(ticks))) == len(ticks)
+    for tick in ticks:
+        digits = f"{abs(unit.value(tick)):.6e}"
+        assert unit.is_db or digits[:3] in {"1.0", "2.0", "3.0", "5.0"}
+
+
+def test_zoom_pan_and_cursor_stay_within_the_spectrum() -> None:
+    snapshot = made_snapshot()
+    first, last = whole_span(snapshot)
+    choice = moved(Choice(), snapshot, 0.0)
+    assert choice.cursor == pytest.approx((first + last) / 2)
+    near = zoomed(choice, snapshot, 0.25)
+    assert near.span is not None
+    assert near.span[1] - near.span[0] == pytest.approx((last - first) / 4)
+    for _ in range(20):
+        near = panned(near, snapshot, 0.5)
+    assert near.span is not None
+    assert near.span[1] == pytest.approx(last)
+    assert near.cursor is not None
+    assert near.span[0] <= near.cursor <= near.span[1]
+    for _ in range(20):
+        near = zoomed(near, snapshot, 0.5)
+    assert near.span is not None
+    assert near.span[1] - near.span[0] >= 0.02  # ends somewhere
+    assert zoomed(near, snapshot, 1e6).span is None  # all of it
+
+
+async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, *running())
+        await pilot.press("full_stop", "full_stop", "plus", "u", "u", "u")
+        await shown(pilot, app)
+        title = str(app.screen.query_one("#title", Static).render())
+        choice = view(app).choice
+        assert choice.cursor is not None
+        assert title.startswith(f"{10**choice.cursor:.3g} Hz  A.X")
+        noise = 1e-12 / GRAVITY**2  # of A.X, in g²/Hz
+        shown_noise = float(title.split("three-sensor ")[1].split(maxsplit=1)[0])
+        assert shown_noise == pytest.approx(1e9 * math.sqrt(noise), rel=0.3)  # 100 averages
+        await pilot.press("escape")
+        await shown(pilot, app)
+        assert "ng/√Hz" in screen_text(app)
+        assert view(app).choice.span is None
+
+
+async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await shown(pilot, app, *running())
+        await pilot.press("f")
+        await shown(pilot, app)
+        assert "known to 46 %" in screen_text(app)
+        curves = screen_text(app).splitlines()[2:15]
+        await shown(pilot, app, *running(n_effective=5000.0))
+        text = screen_text(app)
+        assert "frozen at 1:40" in text
+        assert "known to 6.4 %" in text
+        assert text.splitlines()[2:15] == curves
+        await pilot.press("f")
+        await shown(pilot, app)
+        assert "frozen" not in screen_text(app)
+        assert screen_text(app).splitlines()[2:15] != curves
+
+
+@pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
+async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await shown(pilot, app, *running())
+        await pilot.press("full_stop", "plus", "u", "t")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-test-cursor")
+        await pilot.press("escape", "l", "u", "u", "u", "e")
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-test-like")

@@ -1,0 +1,78 @@
+"""A row per channel: noise, SNR, margin, gaps, excluded segments. Does not use Textual."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+from rich.text import Text
+
+from daq.results.band_summary import band_of, data_means, decibels
+from daq.results.partners import without_partners
+from daq.results.precision import channel_covs
+from tui.application.test_view.panels import MUTED, grouped
+from tui.output.formatting import level, level_with_error, percent, signed
+from tui.output.verdict_text import MARKS, STYLES, worst_by_channel
+from tui.output.vocabulary import PARTNER_WORDS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from estimator.self_noise.band_means import BandMeans
+    from tui.application.state import State
+    from tui.application.test_view.plotted import Choice
+
+
+def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], width: int) -> Table:
+    """Return a row per channel; without room, columns are omitted from the right."""
+    snapshot, settings = state.snapshot, state.settings
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
+    if snapshot is None or settings is None:
+        return table
+    band = band_of(settings, snapshot)
+    titles = ["noise, 95 %", "known to", "margin, dB", "SNR, dB", "data", "gaps"]
+    columns: dict[str, list[Text]] = {title: [] for title in ("channel", *titles)}
+    margins = worst_by_channel(state.verdict)
+    if not margins:
+        del columns["margin, dB"]
+    alone, covs = without_partners(snapshot, band), channel_covs(snapshot, settings)
+    data = data_means(snapshot, band)
+    gaps = {} if state.now is None else {sensor.name: sensor.n_gaps for sensor in state.now.sensors}
+    for column, label in enumerate(snapshot.channels):
+        name = Text(label.name, "bold reverse" if column == choice.channel else "bold")
+        cells = {"channel": name, "data": Text(level(float(data[column])))}
+        if column in alone:
+            cells["noise, 95 %"] = Text(PARTNER_WORDS[alone[column]], "bold #ff6b6b")
+        elif means:
+            mean, high = float(means[column].mean[0]), float(means[column].high[0])
+            cells["noise, 95 %"] = Text(level_with_error(mean, high))
+            cells["SNR, dB"] = Text(_ratio(float(data[column]), mean))
+        if not math.isnan(covs[column]):
+            cells["known to"] = Text(percent(covs[column]))
+        worst = margins.get((label.sensor, label.channel))
+        if worst is not None and worst.known:
+            words = f"{MARKS[worst.verdict]} {signed(worst.margin_db, '+.1f')}"
+            cells["margin, dB"] = Text(words, STYLES[worst.verdict].removeprefix("bold "))
+        cells["gaps"] = Text(grouped(gaps.get(label.sensor, 0)))
+        for title, column_cells in columns.items():
+            column_cells.append(cells.get(title, Text("…", MUTED)))
+    while _width(columns) > width and len(columns) > 2:
+        columns.popitem()
+    for title in columns:
+        table.add_column(title, justify="left" if title == "channel" else "right", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
+    return table
+
+
+def _ratio(data: float, noise: float) -> str:
+    """Return the motion over the noise in dB."""
+    if noise <= 0:
+        return "?"
+    motion = data - noise
+    return "< 0" if motion <= noise else signed(decibels(motion / noise), ".1f")
+
+
+def _width(columns: dict[str, list[Text]]) -> int:
+    return sum(2 + max(len(title), *map(len, cells)) for title, cells in columns.items())
