@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import html
-import io
 import os
 import re
 import subprocess
@@ -30,8 +29,7 @@ from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
 from tui.commands.tui import RecordingControls
 from tui.report.contents import report_of
-from tui.report.figures import drawing
-from tui.report.paper import pages
+from tui.report.paper import write_paper
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -147,12 +145,12 @@ def report(folder: Path) -> None:
     subprocess.run([*command, "--out", str(recording)], check=True)
     settings = Settings(segment=2.0, band=(2.0, 20.0))
     contents = report_of(estimate([recording], settings), settings, sources([recording]))
-    sheets = []
-    with drawing.look():
-        for page in pages(contents)[:2]:
-            file = io.BytesIO()
-            page.savefig(file, dpi=240, facecolor="white")
-            sheets.append(Image.open(file).convert("RGB").reduce(3))
+    paper = folder / "report.pdf"
+    with paper.open("wb") as file:
+        write_paper(contents, file)
+    # of poppler-utils
+    subprocess.run(["pdftoppm", "-l", "2", "-r", "80", "-png", paper, folder / "page"], check=True)
+    sheets = [Image.open(path).convert("RGB") for path in sorted(folder.glob("page*.png"))]
     width, height = sheets[0].size
     picture = Image.new("RGB", (2 * width + 8, height), "#c8cdd2")
     for number, sheet in enumerate(sheets):

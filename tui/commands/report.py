@@ -59,7 +59,7 @@ def checked(out: Path) -> Path:
     MissingPackageError
         A package that writes reports is missing.
     """
-    require("matplotlib", "jinja2")
+    require("matplotlib", "jinja2", *(["fpdf"] if out.suffix.lower() == ".pdf" else []))
     if out.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{out}: expected a file name that ends in .html or .pdf")
     check_places(str(out))

@@ -16,6 +16,7 @@ _EXTRA = {
     "pandas": "notebook",
     "matplotlib": "report",
     "jinja2": "report",
+    "fpdf": "report",
     "prometheus_client": "metrics",
 }
 

@@ -114,7 +114,7 @@ def noise_section(
             f"Below: one-sided power spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and "
             f"its root in ({snapshot.unit})/√Hz (right). Each point is a mean over its share of "
             "the axis. Dotted: the band of the table. Where the interval reaches the bottom, the "
-            "noise is known only to be below its upper end. Hatched: nothing can be said."
+            "noise is known only to be below its upper end. Shaded: nothing can be said."
             + _about_models(models),
             "quiet",
         )

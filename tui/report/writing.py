@@ -11,7 +11,6 @@ from daq.results.sources import sources
 from tui.output.console import write_whole
 from tui.report.contents import report_of
 from tui.report.page import page
-from tui.report.paper import write_paper
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,6 +71,8 @@ def write(
     check_suffix(path)
     report = report_of(snapshot, settings, sources(recordings), models)
     if path.suffix.lower() in PAPER:
+        from tui.report.paper import write_paper  # noqa: PLC0415 - loads fpdf2
+
         paper = io.BytesIO()
         write_paper(report, paper)
         content = paper.getvalue()

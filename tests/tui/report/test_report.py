@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 import resource
 import shutil
@@ -11,10 +12,12 @@ import sys
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
+from pypdf.generic import Destination
 from typer.testing import CliRunner
 
 from daq.drivers.bench_file import load
@@ -25,13 +28,14 @@ from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tui.cli.main import app
 from tui.commands.tui import BenchControls
 from tui.report.contents import report_of
-from tui.report.figures import drawing
 from tui.report.figures.drift import without_line
-from tui.report.paper import pages
-from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
+from tui.report.paper import write_paper
+from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Section, Table
 from tui.report.writing import ReportError, write
 
 if TYPE_CHECKING:
+    from pypdf import PageObject
+
     from daq.estimation.snapshot import Snapshot
     from tui.report.parts import Part
 
@@ -260,14 +264,18 @@ def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
 # ------------------------------------------------------------------------------- files
 
 
-def test_the_same_recording_gives_the_same_files(reported: Reported, tmp_path: Path) -> None:
-    for name in ("a.html", "a.pdf", "b.pdf"):
+def test_the_same_recording_gives_the_same_files(
+    reported: Reported, paper: PdfReader, tmp_path: Path
+) -> None:
+    for name in ("a.html", "a.pdf"):
         write(
             reported.snapshot, tmp_path / name, recordings=[reported.recording],
             settings=reported.settings,
         )  # fmt: skip
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == reported.page
-    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+    assert paper.stream is not None
+    paper.stream.seek(0)
+    assert (tmp_path / "a.pdf").read_bytes() == paper.stream.read()
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF-")
 
 
@@ -289,20 +297,77 @@ def test_foreign_names_are_text_and_nothing_else(reported: Reported) -> None:
     assert "&lt;script&gt;" in reported.page
 
 
-def test_paper_says_all_that_the_page_says(reported: Reported) -> None:
-    with drawing.look():
-        paper = pages(reported.report)
-    whole = "".join(text.get_text() for page in paper for text in page.texts)
+@pytest.fixture(scope="module")
+def paper(reported: Reported) -> PdfReader:
+    return PdfReader(paper_of(reported.report))
+
+
+def paper_of(report: Report) -> io.BytesIO:
+    """Write a report as PDF."""
+    file = io.BytesIO()
+    write_paper(report, file)
+    return file
+
+
+def places_of(page: PageObject) -> list[tuple[float, float]]:
+    """Return where the texts of a page begin, in points."""
+    places: list[tuple[float, float]] = []
+
+    def note(text: str, _matrix: object, place: list[float], _font: object, _size: float) -> None:
+        if text.strip():
+            places.append((place[4], place[5]))
+
+    page.extract_text(visitor_text=note)
+    return places
+
+
+def test_paper_says_all_that_the_page_says(reported: Reported, paper: PdfReader) -> None:
+    whole = "".join(page.extract_text() for page in paper.pages)
     letters = "".join(whole.split())
     page = "".join(Words(reported.page).text.split())
     for word in said(reported.report):
         assert "".join(word.split()) in page
         for piece in word.split():  # lines are broken between words, cells stand side by side
             assert piece in letters
-    assert f"{len(paper)} / {len(paper)}" in whole
-    for sheet in paper:
-        for text in sheet.texts:
-            assert 0 < text.get_position()[1] < 1
+    assert f"{len(paper.pages)} / {len(paper.pages)}" in whole
+
+
+def test_paper_has_a_title_an_outline_and_tags(reported: Reported, paper: PdfReader) -> None:
+    report = reported.report
+    assert paper.metadata is not None
+    assert paper.metadata.title == f"{report.title}: {report.subtitle}"
+    titles = [section.title for section in report.sections]
+    outline = [str(entry.title) for entry in paper.outline if isinstance(entry, Destination)]
+    assert outline == [f"{number}   {title}" for number, title in enumerate(titles, start=1)]
+    root: Any = paper.root_object
+    assert root["/Lang"] == "en"
+    assert root["/MarkInfo"]["/Marked"]
+    (document,) = root["/StructTreeRoot"]["/K"]
+    tags = [entry.get_object() for entry in document.get_object()["/K"]]
+    assert [str(tag["/T"]) for tag in tags if tag["/S"] == "/H1"] == [report.title]
+    assert [str(tag["/T"]) for tag in tags if tag["/S"] == "/H2"] == outline
+    plots = [part for each in report.sections for part in each.parts if isinstance(part, Plot)]
+    assert [str(tag["/Alt"]) for tag in tags if tag["/S"] == "/Figure"] == [p.alt for p in plots]
+
+
+def test_signatures_are_not_alone_on_their_page(reported: Reported) -> None:
+    """However much of the last page but one is filled."""
+    test, *_, settings, signed = reported.report.sections
+    for n_lines in range(4, 40, 9):
+        filling = Section("Filling", tuple(Paragraph(f"line {n}") for n in range(n_lines)))
+        report = replace(reported.report, sections=(test, filling, settings, signed))
+        *_, last = PdfReader(paper_of(report)).pages
+        text = last.extract_text()
+        assert "Signature" in text
+        assert "Settings of the estimate" in text
+
+
+def test_a_text_of_any_length_fits_on_pages(reported: Reported) -> None:
+    long = Table(("what", "text"), (("a", "x" * 9000), ("b", "word " * 3000)), left=frozenset({1}))
+    section = Section("Long", (long, Paragraph("y" * 9000), Facts((("name", "z " * 9000),))))
+    report = replace(reported.report, sections=(section, *reported.report.sections[-2:]))
+    text = "".join(page.extract_text() for page in PdfReader(paper_of(report)).pages)
+    assert text.count("…") == 4  # each is cut, and says so
 
 
 def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
@@ -359,13 +424,11 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
     assert (
         sum(len(plot.panels) for plot in plots) == 15 + 15 + 1
     )  # spectra, Allan deviations, the model test
-    with drawing.look():
-        for page in pages(report):
-            page.draw_without_rendering()
-            for text in page.texts:
-                box = text.get_window_extent()
-                assert page.bbox.x0 <= box.x0
-                assert box.x1 <= page.bbox.x1
+    for page in PdfReader(paper_of(report)).pages:
+        places = places_of(page)
+        assert places
+        right, top = float(page.mediabox.right), float(page.mediabox.top)
+        assert all(0 < x < right and 0 < y < top for x, y in places)
 
 
 def test_matplotlib_is_loaded_by_a_report_only() -> None:
@@ -374,4 +437,4 @@ def test_matplotlib_is_loaded_by_a_report_only() -> None:
         "print(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"matplotlib", "jinja2"} & set(done.stdout.split())
+    assert not {"matplotlib", "jinja2", "fpdf"} & set(done.stdout.split())

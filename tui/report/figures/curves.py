@@ -334,15 +334,14 @@ def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
 
 
 def _nothing(axes: Axes, curve: _Curves) -> None:
-    """Hatch where nothing can be said: no number, or all of its interval below zero."""
+    """Shade where nothing can be said: no number, or all of its interval below zero."""
     unknown = ~(np.isfinite(curve.noise.mean) & (curve.noise.high > 0))
     for start, stop in _runs(unknown):
         axes.axvspan(
             float(curve.edges[start]),
             float(curve.edges[stop]),
-            facecolor="none",
-            edgecolor=drawing.NOTHING,
-            hatch="////",
+            color=drawing.NOTHING,
+            alpha=0.4,
             lw=0,
             zorder=0.5,
             label="nothing can be said",
