@@ -323,12 +323,24 @@ class EstimateSettings:
     reject: Annotated[
         bool | None,
         Option(
-            "Also exclude segments with transients. Segments with gaps are always excluded;"
-            " clipped ones unless --no-reject is given.",
+            "Also exclude segments with transients. Clipped segments are excluded unless"
+            " --no-reject is given; for segments with gaps see --bridge.",
             check=_yes_or_no,
             flags=("--reject/--no-reject",),
         ),
     ] = None
+    bridge: Annotated[
+        float,
+        Option(
+            "Use segments with gaps of up to this share of their length, by a window that is zero"
+            " in them, where fewer than half of the segments have no gap; 0 excludes them always"
+            " (default 0.6). Not with --octaves or --reject.",
+            check=_share,
+            flags=("--bridge",),
+            metavar="SHARE",
+            read=_to_number,
+        ),
+    ] = 0.6
     octaves: Annotated[
         bool,
         Option(

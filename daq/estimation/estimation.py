@@ -2,8 +2,9 @@
 
 Theory of operation
 -------------------
-Segments lie on a fixed lattice of the common grid. One that touches a gap or a clipped block is
-left out, for every sensor, and so is one that something disturbed where that is asked for. Each
+Segments lie on a fixed lattice of the common grid. One that touches a clipped block is left out,
+for every sensor, and so is one that something disturbed where that is asked for. One that touches
+a gap is left out where half of the segments have none, and else bridged. Each
 new segment is transformed once, with what is known about the clocks by then. When what is known
 has become materially better for segments already taken (looked at whenever their number has grown
 by a quarter), they are taken again.
@@ -24,6 +25,7 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
+from daq.estimation.bridging import bridged, widened
 from daq.estimation.clipping import clipped_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
 from daq.estimation.equalisation import ROUNDS, SETTLED, Equalisation
@@ -333,11 +335,14 @@ class Estimation:
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         too_much = added(diagnostics, estimates.results)
+        gaps = bridged(self._passes, estimates.results)
         return Snapshot(
             frequency=frequency,
             csm=csm,
             results={
-                name: found if too_much is None else replace(found, low=found.low - too_much)
+                name: widened(
+                    found if too_much is None else replace(found, low=found.low - too_much), gaps
+                )
                 for name, found in estimates.results.items()
             },
             refused=estimates.refused,
@@ -359,6 +364,7 @@ class Estimation:
             octaves=tuple(map(Octave.of, bands)) if self.settings.octaves else (),
             diagnostics=diagnostics,
             no_segment=self._no_segment(),
+            bridged=gaps,
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, self._counting_rates())
                 if final
@@ -420,6 +426,7 @@ class Estimation:
         counts: Counter[Reason] = Counter()
         for each in self._passes:
             counts.update(each.left_out)
+            counts[Reason.GAP] -= each.n_bridged
         counts[Reason.TRANSIENT] = self.n_seen - self.n_segments - counts.total()
         return {reason: counts[reason] for reason in Reason}
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> SegmentCourse | None:
-    """Return the segments of all recordings; None where each octave has its own, or none is kept.
+    """Return the segments of all recordings, or None where not all segments are kept.
 
     Times count from the start of the first recording.
     """
@@ -25,7 +25,7 @@ def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> Seg
     every = max((each.single.every for each in passes if each.single is not None), default=1)
     origin = passes[0].aligned.start_utc_ns
     for run, each in enumerate(passes):
-        if each.single is None:
+        if each.single is None or each.n_bridged:
             return None
         some = slice(None, None, every // each.single.every)
         found, at = each.single.values()[some], each.kept_at[some]

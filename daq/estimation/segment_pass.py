@@ -13,6 +13,7 @@ import numpy as np
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.delay_estimation import DelayEstimator
 from daq.estimation.flatline import FlatlineDetector, stands_still
+from daq.estimation.gap_bridge import GapBridge
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
     from estimator.spectra.equaliser import Equaliser
+    from estimator.spectra.gap_window import Leakage
 
     FloatArray = NDArray[np.float64]
 
@@ -90,6 +92,9 @@ class Pass:
         self._kept_at: list[NDArray[np.int64]] = []
         self._all = CrossSpectra(self.welch, self.n_channels, threads=1, segments=self.single)
         self._selected: CrossSpectra | None = None
+        self._bridge: GapBridge | None = None
+        if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
+            self._bridge = GapBridge(self.welch, self.n_channels, most=wanted.bridge)
         self.n_seen = self._n_taken = 0
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()
@@ -102,7 +107,9 @@ class Pass:
     def spectra(self) -> CrossSpectra:
         """Spectra of the segments that count; none with octaves."""
         if self._undisturbed is None:
-            return self._all
+            if self._bridge is None or not self.n_bridged:
+                return self._all
+            return self._all + self._bridge.spectra
         if self._selected is None:
             self._selected = self._undisturbed.spectra()
         return self._selected
@@ -123,7 +130,21 @@ class Pass:
         """Segments that count; with octaves those of the highest."""
         if self.octaves is not None:
             return self.octaves.n_segments
-        return self._n_taken if self._undisturbed is None else self.spectra.n_segments
+        if self._undisturbed is not None:
+            return self.spectra.n_segments
+        return self._n_taken + self.n_bridged
+
+    @property
+    def n_bridged(self) -> int:
+        """Segments that count though they have gaps: none where half of all have none."""
+        if self._bridge is None or 2 * self._n_taken >= self.n_seen:
+            return 0
+        return self._bridge.spectra.n_segments
+
+    @property
+    def leakage(self) -> Leakage | None:
+        """What the windows of these segments bring in."""
+        return None if self._bridge is None else self._bridge.leakage
 
     def equalise(self, filters: Equaliser | None) -> None:
         """Begin again, with samples filtered."""
@@ -198,7 +219,12 @@ class Pass:
                 self._take(samples, starts, first * hop + reach)
             self._n_taken += len(starts)
             self.taken_at.append(self._positions(np.arange(first, first + count)))
-            self._measure(samples, starts, first * hop)
+            self._measure(samples, starts, first * hop + reach + starts)
+            if self._bridge is not None and not whole.all():
+                touched = np.flatnonzero(~whole) * hop
+                joined, taken = self._bridge.take(samples, usable, clipped, touched)
+                rows = np.arange(len(taken)) * length
+                self._measure(joined, rows, first * hop + reach + taken)
             self.n_seen += count
             if progress is not None:
                 progress(count)
@@ -314,8 +340,13 @@ class Pass:
         middle = self._middles(np.arange(len(taken)))
         return np.column_stack([middle / self.welch.sampling_rate, taken])
 
-    def _measure(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
-        """Measure what delays are left, for the clocks' next setting."""
+    def _measure(
+        self, samples: FloatArray, starts: NDArray[np.int64], begin: NDArray[np.int64]
+    ) -> None:
+        """Measure what delays are left, for the clocks' next setting.
+
+        Segments are at `starts` of the samples, and at `begin` of the grid.
+        """
         measurable = self.aligned.measurable if self._settings.clocks == "refined" else ()
         if not measurable:
             return
@@ -325,7 +356,7 @@ class Pass:
             window = get_window(self.welch.window, self.welch.segment_length)
             self._meter = DelayEstimator(self.welch.sampling_rate, window, columns)
         delays, std = self._meter.measure(samples, starts)
-        at = first + starts + self.reach + self.welch.segment_length / 2
+        at = begin + self.welch.segment_length / 2
         self.aligned.learn(
             np.asarray(at, dtype=np.float64),
             delays,

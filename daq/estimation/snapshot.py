@@ -305,6 +305,24 @@ class NoSegment:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Bridged:
+    """Segments that count though they have gaps.
+
+    Attributes
+    ----------
+    n_segments : int
+    lost : float
+        Mean part of a segment's energy that gaps take.
+    leakage : float64, shape (n_freqs, n_channels)
+        What their windows bring in from other frequencies, as a fraction of the noise.
+    """
+
+    n_segments: int
+    lost: float
+    leakage: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
     """The estimate at one moment, with everything a front end shows.
 
@@ -346,6 +364,8 @@ class Snapshot:
     quantisation_psd : float64, shape (n_freqs, n_channels), or None
         Noise of counting in whole numbers, in unit**2/Hz; NaN for channels that do not. Of a
         finished estimate.
+    bridged : Bridged or None
+        None where no segment with gaps counts.
     """
 
     frequency: FloatArray
@@ -369,6 +389,7 @@ class Snapshot:
     diagnostics: SnapshotDiagnostics = field(default_factory=SnapshotDiagnostics)
     no_segment: NoSegment | None = None
     quantisation_psd: FloatArray | None = None
+    bridged: Bridged | None = None
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -225,6 +225,7 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
         "elapsed": snapshot.elapsed,
         "dropped_segments": snapshot.n_dropped,
         "left_out": snapshot.left_out,
+        "bridged": snapshot.bridged,
         "octaves": snapshot.octaves,
         "flags": {flag.name: flag.value for flag in Flag},
         "start_utc_ns": snapshot.start_utc_ns,

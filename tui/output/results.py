@@ -16,7 +16,15 @@ from daq.timing.clock_model import ClockSource
 from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-from tui.output.formatting import clock_time, level, level_with_error, several, signed, utc
+from tui.output.formatting import (
+    clock_time,
+    level,
+    level_with_error,
+    percent,
+    several,
+    signed,
+    utc,
+)
 from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, REASONS, WITHOUT_ESTIMATE
 
 if TYPE_CHECKING:
@@ -92,6 +100,13 @@ def remarks(snapshot: Snapshot) -> list[str]:
         for sensor in snapshot.sensors
         if sensor.n_damaged
     ]
+    if snapshot.bridged is not None:
+        worst = float(np.nanmax(np.abs(snapshot.bridged.leakage[1:-1]), initial=0.0))
+        lines.append(
+            f"{several(snapshot.bridged.n_segments, 'segment')} with gaps used by windows that are"
+            f" zero in them ({percent(snapshot.bridged.lost)} of the signal); noise of other"
+            f" frequencies in them: at most {percent(worst)} of the noise, in the intervals"
+        )
     if snapshot.n_dropped:
         lines.append(f"{several(snapshot.n_dropped, 'segment')} excluded{left_out(snapshot)}")
     lines += [

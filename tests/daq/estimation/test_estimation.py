@@ -14,8 +14,10 @@ from daq.bench.units import canonical
 from daq.errors import CannotAlignError, WrongSettingError
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import NoResultError
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
+from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
@@ -132,6 +134,30 @@ def test_what_is_shown_live_at_the_end_is_the_estimate_from_the_file(
     assert seen == sorted(seen)
     assert seen[0] < seen[-1]
     same(ended, estimate([path], SETTINGS))
+
+
+def test_short_gaps_all_over_are_bridged_live_and_offline(tmp_path: Path) -> None:
+    """Three gaps of 50 ms in each segment; without a bridge no segment is left."""
+    sensors = huddle(n_samples=6000)
+    holes = {"a": 0, "b": 37, "c": 61}
+    for name, offset in holes.items():
+        sensors[name].gaps = tuple((n, n + 5) for n in range(20 + offset, 5900, 100))
+    path = write(tmp_path / "gaps.h5", sensors)
+    found = estimate([path], SETTINGS)
+    assert found.bridged is not None
+    assert found.bridged.n_segments > 0.8 * found.n_segments
+    assert found.left_out[Reason.GAP] == found.n_dropped < 20
+    whole = estimate([write(tmp_path / "whole.h5", huddle(n_samples=6000))], SETTINGS)
+    assert whole.bridged is None
+    inner = slice(2, -5)
+    ratio = found.results["three-sensor"].noise_psd / whole.results["three-sensor"].noise_psd
+    # The same noise but for a fifth of it, in some 60 averages of 45 bins and six channels.
+    assert np.median(ratio[inner]) == pytest.approx(1, abs=0.06)
+    with pytest.raises(NoResultError):
+        estimate([path], replace(SETTINGS, bridge=0.0))
+    with Estimation([path], SETTINGS) as live:
+        live.update()
+        same(live.finish(), found)
 
 
 def test_a_gap_drops_the_segments_it_touches_and_nothing_else(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ VALUES: dict[str, Any] = {
     "clocks": "arrivals",
     "equalise": "known",
     "reject": True,
+    "bridge": 0.25,
     "octaves": True,
     "dimension": 2,
     "gains": {"B": 1.02, "C.Z": 0.1 + 0.2},

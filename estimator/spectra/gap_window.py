@@ -1,0 +1,138 @@
+"""Segments with short gaps: a window that is zero in them, the same for all sensors.
+
+All channels of all sensors are multiplied by one function of time: 0 in every gap of any sensor, 1
+elsewhere, with cosine ramps between. Motion that all sensors measure alike remains common to them,
+whatever the window, so it leaves the noise as before. The noise keeps its PSD, divided by the
+energy of the window, where its spectrum is even. Where the noise is much lower than at other
+frequencies, the side lobes of such a window bring in noise from there: `Leakage` says how much.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from estimator.types import BoolArray, FloatArray
+
+RAMPS = 200
+"""Ramps are the segment's length over this."""
+SHORTEST_RAMP = 4
+ITERATIONS = 8
+"""Of the PSD without what is brought in."""
+LEAST = 0.02
+"""Share of the PSD that is taken for the noise of that frequency at least."""
+
+
+def gap_window(usable: BoolArray, segment_length: int) -> FloatArray:
+    """Return the window of a stretch of samples.
+
+    Parameters
+    ----------
+    usable : bool, shape (n_samples,)
+        False in gaps.
+    segment_length : int
+
+    Returns
+    -------
+    float64, shape (n_samples,)
+        0 to 1.
+    """
+    ramp = max(SHORTEST_RAMP, segment_length // RAMPS)
+    place = np.arange(len(usable))
+    last = np.maximum.accumulate(np.where(usable, -ramp - 1, place))
+    following = np.minimum.accumulate(np.where(usable, len(usable) + ramp, place)[::-1])[::-1]
+    distance = np.minimum(np.minimum(place - last, following - place), ramp + 1)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * distance / (ramp + 1)))
+
+
+def without_trend(segment: FloatArray, weight: FloatArray, detrend: str) -> FloatArray:
+    """Return a segment without its trend, zero where it has no weight.
+
+    Parameters
+    ----------
+    segment : float64, shape (n_samples, n_channels)
+        What has no weight is not looked at.
+    weight : float64, shape (n_samples,)
+    detrend : {"none", "constant", "linear"}
+    """
+    kept = np.where(weight[:, None] > 0, segment, 0.0)
+    if detrend != "none":
+        degree = 1 if detrend == "linear" else 0
+        line = np.linspace(-1.0, 1.0, len(segment))
+        basis = np.stack([line**power for power in range(degree + 1)], axis=1)
+        weighted = basis * weight[:, None]
+        kept = kept - basis @ np.linalg.solve(weighted.T @ basis, weighted.T @ kept)
+    return np.asarray(kept * weight[:, None])
+
+
+class Leakage:
+    """What the windows of segments with gaps bring in from other frequencies.
+
+    Parameters
+    ----------
+    window : float64, shape (length,)
+        Of whole segments.
+    """
+
+    def __init__(self, window: FloatArray) -> None:
+        self._window = window
+        self._whole = self._kernel(window)
+        self._sum = np.zeros_like(self._whole)
+        self.n_segments = 0
+        self._lost = 0.0
+
+    def add(self, weight: FloatArray) -> float:
+        """Add the window of one segment; return its energy as a part of a whole segment's."""
+        window = self._window * weight
+        self._sum += self._kernel(window)
+        self.n_segments += 1
+        energy = float(window @ window / (self._window @ self._window))
+        self._lost += 1 - energy
+        return energy
+
+    @property
+    def lost(self) -> float:
+        """Mean part of the windows' energy that gaps take."""
+        return self._lost / max(1, self.n_segments)
+
+    def bias(self, noise_psd: FloatArray) -> FloatArray:
+        """Return what is brought in, as a fraction of the noise.
+
+        Parameters
+        ----------
+        noise_psd : float64, shape (n_freqs, n_channels)
+            At all frequencies of a segment; what is not known is taken from its neighbours.
+
+        Returns
+        -------
+        float64, shape (n_freqs, n_channels)
+            Of the PSD as it was estimated. Negative where noise is lost to other frequencies; 0
+            without segments.
+        """
+        if not self.n_segments:
+            return np.zeros_like(noise_psd)
+        length = len(self._window)
+        two = np.arange(length + 1) / 2  # of zero-padded segments
+        whole = np.fft.irfft(self._whole, 2 * length)
+        with_gaps = np.fft.irfft(self._sum / self.n_segments, 2 * length)
+        found = np.empty_like(noise_psd)
+        for column, psd in enumerate(np.abs(noise_psd).T):
+            known = np.flatnonzero(np.isfinite(psd) & (psd > 0))
+            if not len(known):
+                found[:, column] = 0.0
+                continue
+            seen = np.interp(two, known, psd[known])
+            true = seen
+            for _ in range(ITERATIONS):
+                lags = np.fft.irfft(true, 2 * length)
+                brought_in = np.fft.rfft(lags * (with_gaps - whole)).real
+                true = np.maximum(seen - brought_in, LEAST * seen)
+            found[:, column] = (brought_in / seen)[::2][: len(psd)]
+        return found
+
+    def _kernel(self, window: FloatArray) -> FloatArray:
+        """Power of the window by frequency, whose autocorrelation is 1 at lag 0."""
+        power = np.abs(np.fft.rfft(window, 2 * len(window))) ** 2
+        return np.asarray(power / np.fft.irfft(power, 2 * len(window))[0])
