@@ -101,11 +101,11 @@ def remarks(snapshot: Snapshot) -> list[str]:
         if sensor.n_damaged
     ]
     if snapshot.bridged is not None:
-        worst = float(np.nanmax(np.abs(snapshot.bridged.leakage[1:-1]), initial=0.0))
+        usual = float(np.nanmean(np.abs(snapshot.bridged.leakage[1:-1])))
         lines.append(
             f"{several(snapshot.bridged.n_segments, 'segment')} with gaps used by windows that are"
             f" zero in them ({percent(snapshot.bridged.lost)} of the signal); noise of other"
-            f" frequencies in them: at most {percent(worst)} of the noise, in the intervals"
+            f" frequencies in them: {percent(usual)} of the noise on average, in the intervals"
         )
     if snapshot.n_dropped:
         lines.append(f"{several(snapshot.n_dropped, 'segment')} excluded{left_out(snapshot)}")
