@@ -16,6 +16,7 @@ from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Channel, Sensor
 from daq.bench.table import check_name
+from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
 from daq.formats.sources import open_sources
@@ -157,7 +158,7 @@ def _ordered(found: dict[str, ForeignSensor], bench: Bench) -> dict[str, Foreign
 
 def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses | None) -> Sensor:
     """Return a sensor as the recording's bench names it."""
-    units = foreign.units or ("counts",) * len(foreign.channels)
+    units = [canonical(unit) for unit in foreign.units] or ["counts"] * len(foreign.channels)
     channels = [
         Channel(name=name, sensitivity=1.0, unit=unit)
         for name, unit in zip(foreign.channels, units, strict=True)
@@ -189,7 +190,7 @@ def _described(foreign: ForeignSensor, bench: Bench | None, responses: Responses
 
 def _refuse_scaling_twice(foreign: ForeignSensor, channels: Sequence[Channel]) -> None:
     for unit, channel in zip(foreign.units, channels, strict=False):
-        if unit == channel.unit and channel.sensitivity != 1:
+        if canonical(unit) == channel.unit and channel.sensitivity != 1:
             raise ImportFormatError(
                 f"{foreign.source}: {foreign.name}.{channel.name} is in {unit} already, and the "
                 f"bench file's sensitivity, {channel.sensitivity:g} counts per {unit}, would scale "

@@ -231,6 +231,10 @@ def import_(
     counts (n_samples, n_channels) under its name
 
     [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
+
+    [b].wav[/b]      a file is a sensor, its channels are numbered
+
+    Also SAC, GSE2, GCF, SEG-2, SEG-Y (extra: formats), UFF 58 and TDMS (extra: vibration).
     """
     from tui.commands.import_ import import_recording, selected
 

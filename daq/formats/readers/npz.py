@@ -62,9 +62,8 @@ def _refuse_bombs(path: Path) -> None:
     """
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
-            size, packed = member.file_size, member.compress_size
-            if size > _LARGE and size > _INFLATION * packed:
-                raise ValueError(f"{member.filename}: {packed} bytes that become {size}")
+            size = member.file_size
+            _refuse_bomb(member.filename, size, member.compress_size)
             with archive.open(member) as file:
                 if not member.filename.endswith(".npy"):
                     continue
@@ -81,8 +80,13 @@ def _refuse_bombs(path: Path) -> None:
                     )
 
 
+def _refuse_bomb(name: str, size: int, packed: int) -> None:
+    if size > _LARGE and size > _INFLATION * packed:
+        raise ValueError(f"{name}: {packed} bytes that become {size}")
+
+
 def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
-    """Read the sensors of a MATLAB file (version 4 to 7); as `read_npz`.
+    """Read the sensors of a MATLAB file; as `read_npz`. Version 7.3 is read by h5py.
 
     Raises
     ------
@@ -93,14 +97,40 @@ def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
 
     try:
         found = loadmat(path)
-    except NotImplementedError as error:
-        raise ImportFormatError(
-            f"{path}: a MATLAB file of version 7.3; save it with -v7 to import it"
-        ) from error
+    except NotImplementedError:
+        arrays = _mat73(path)
     except Exception as error:  # of any kind, on damaged files
         raise ImportFormatError(f"{path}: expected a MATLAB file; {error}") from error
-    arrays = {name: np.asarray(array) for name, array in found.items() if name[:2] != "__"}
+    else:
+        arrays = {name: np.asarray(array) for name, array in found.items() if name[:2] != "__"}
     return _sensors(path, {name: _upright(array) for name, array in arrays.items()}, sampling_rate)
+
+
+def _mat73(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of numbers and the texts of version 7.3, which is HDF5."""
+    import h5py  # noqa: PLC0415 - seldom needed
+
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for name in file:
+                link = file.get(name, getlink=True)
+                if name[0] == "#" or not isinstance(link, h5py.HardLink):  # no other file
+                    continue
+                found = file[name]
+                if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+                    continue
+                _refuse_bomb(name, found.size * found.dtype.itemsize, found.id.get_storage_size())
+                kind = found.attrs.get("MATLAB_class", b"")
+                if found.dtype.kind in "iuf" and "MATLAB_empty" not in found.attrs:
+                    array = np.asarray(found).T  # MATLAB counts the first index fastest
+                    text = kind in {b"char", "char"}
+                    arrays[name] = np.array("".join(map(chr, array.ravel()))) if text else array
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise ImportFormatError(
+            f"{path}: expected a MATLAB file of version 7.3; {error}"
+        ) from error
+    return arrays
 
 
 def _upright(array: NDArray[Any]) -> NDArray[Any]:

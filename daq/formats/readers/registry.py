@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeAlias
 from daq.formats.readers.delimited.reader import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
+from daq.formats.readers.tdms import tdms_parts
+from daq.formats.readers.vibration import read_uff, read_wav
 from daq.formats.readers.waveforms import waveform_parts
 from daq.formats.traces import FilePart, traces_of
 
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
 
     WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
 
+_UNIVERSAL = frozenset({".uff", ".unv", ".uf58", ".58"})
 _BY_SUFFIX: dict[str, WholeFile] = {
+    ".wav": read_wav,
     ".npz": read_npz,
     ".mat": read_mat,
     ".csv": read_delimited,
@@ -41,6 +45,10 @@ def parts_of(path: Path, sampling_rate: float | None = None) -> Iterator[Part]:
     whole = _BY_SUFFIX.get(path.suffix.lower())
     if whole is not None:
         yield FilePart(path, partial(_load, whole, sampling_rate))
+    elif path.suffix.lower() in _UNIVERSAL:
+        yield FilePart(path, read_uff)
+    elif path.suffix.lower() == ".tdms":
+        yield from tdms_parts(path, sampling_rate)
     elif is_miniseed(path):
         yield from miniseed_parts(path)
     else:

@@ -1,0 +1,116 @@
+"""Time responses of universal files (UFF 58), read by pyuff, and WAV files, read by scipy.
+
+In a universal file a node is a sensor, named by its entity if there is one; its channels are the
+directions X, Y, Z. In a WAV file the file is a sensor, its channels are numbered. Neither has a
+date. 24-bit samples of WAV files are in the upper bits of 32, as scipy returns them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import ImportFormatError
+from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, finite_stretches
+from daq.formats.traces import Trace
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_TIME_RESPONSE = 1
+_EVEN = 1
+_DIRECTIONS = {0: "S", 1: "X", 2: "Y", 3: "Z", 4: "RX", 5: "RY", 6: "RZ"}
+_UINT8_ZERO = 128
+
+
+def _pyuff() -> Any:  # noqa: ANN401 - it has no types
+    try:
+        import pyuff  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise ImportFormatError(
+            "universal files are read by pyuff, which is not installed; run: pip install"
+            " 'huddle-bench[vibration]'"
+        ) from error
+    return pyuff
+
+
+def read_uff(path: Path) -> list[Trace]:
+    """Read the time responses of a universal file.
+
+    Raises
+    ------
+    ImportFormatError
+        pyuff is not installed or cannot read the file, or it holds no time response.
+    """
+    pyuff = _pyuff()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            file = pyuff.UFF(str(path))
+            numbers = [n for n, kind in enumerate(file.get_set_types()) if int(kind) == 58]
+            sets = [file.read_sets(number) for number in numbers]
+            traces = [_trace(each) for each in sets if int(each["func_type"]) == _TIME_RESPONSE]
+    except Exception as error:
+        raise ImportFormatError(f"{path}: pyuff cannot read it: {error}") from error
+    if not traces:
+        raise ImportFormatError(
+            f"{path}: {len(numbers)} functions, none of them a time response; expected data set 58"
+            " with function type 1"
+        )
+    return traces
+
+
+def _trace(function: dict[str, Any]) -> Trace:
+    interval = float(function.get("abscissa_inc") or 0)
+    if int(function.get("abscissa_spacing", _EVEN)) != _EVEN or interval <= 0:
+        raise ValueError(f"an interval of {interval} s; expected evenly spaced samples")
+    entity = str(function.get("rsp_ent_name") or "").strip()
+    node, direction = str(function["rsp_node"]), int(function["rsp_dir"])
+    name = f"{entity}.{node}" if entity and entity != "NONE" else node
+    axis = _DIRECTIONS.get(abs(direction), str(direction))
+    unit = str(function.get("ordinate_axis_units_lab") or "").strip()
+    return Trace(
+        sensor=name,
+        channel=f"-{axis}" if direction < 0 else axis,
+        start_ns=round(float(function.get("abscissa_min") or 0) * NS_PER_S),
+        sampling_rate=_rate(interval),
+        samples=np.asarray(function["data"]),
+        unit="" if unit == "NONE" else unit,
+    )
+
+
+def _rate(interval: float) -> float:
+    """Return the rate of an interval that is written with six digits."""
+    nearest = round(1 / interval)
+    if nearest and f"{1 / nearest:.5e}" == f"{interval:.5e}":
+        return float(nearest)
+    return 1 / interval
+
+
+def read_wav(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
+    """Read a WAV file; it has its own ``sampling_rate``.
+
+    Raises
+    ------
+    ImportFormatError
+        It is none.
+    """
+    from scipy.io import wavfile  # noqa: PLC0415 - takes long
+
+    del sampling_rate
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about chunks that hold no samples
+            rate, samples = wavfile.read(path)
+    except Exception as error:  # of any kind, on damaged files
+        raise ImportFormatError(f"{path}: expected a WAV file; {error}") from error
+    samples = samples[:, np.newaxis] if samples.ndim == 1 else samples
+    if samples.dtype == np.uint8:
+        samples = samples.astype(np.int16) - _UINT8_ZERO
+    stretches = finite_stretches(samples, start_utc_ns=0, sampling_rate=float(rate))
+    if not stretches:
+        raise ImportFormatError(f"{path}: no samples in it")
+    channels = tuple(str(number) for number in range(1, samples.shape[1] + 1))
+    return (ForeignSensor(path.stem, channels, float(rate), stretches, str(path)),)

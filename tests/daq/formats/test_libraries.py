@@ -1,0 +1,258 @@
+"""Formats that other libraries keep: files that those libraries wrote, or have for their tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import nptdms
+import numpy as np
+import pytest
+import pyuff
+import scipy.io
+from scipy.io import wavfile
+
+from daq.errors import ImportFormatError
+from daq.formats.importer import import_files
+from daq.formats.readers.waveforms import load_obspy
+from daq.formats.sources import open_sources
+from daq.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.formats.foreign_sensor import ForeignSensor
+
+START = "2026-11-21T03:00:00.25"
+START_NS = 1_795_230_000_250_000_000
+obspy = load_obspy()
+OBSPY_IO = Path(obspy.__file__).parent / "io"
+
+
+def counts(n: int, columns: int = 1, seed: int = 4) -> NDArray[np.int32]:
+    return np.random.default_rng(seed).integers(-30_000, 30_000, (n, columns), dtype=np.int32)
+
+
+def opened(path: Path) -> dict[str, ForeignSensor]:
+    found = open_sources([path])
+    assert found.problems == ()
+    return found.sensors
+
+
+def whole(sensor: ForeignSensor) -> NDArray[Any]:
+    (stretch,) = sensor.stretches
+    return stretch.counts[0 : stretch.n_samples]
+
+
+@pytest.mark.parametrize(("name", "code"), [("SAC", "HHZ"), ("GSE2", "HHZ"), ("GCF", "HHZ")])
+def test_seismological_formats_of_obspy(tmp_path: Path, name: str, code: str) -> None:
+    path = tmp_path / f"a.{name.lower()}"
+    start = "2026-11-21T03:00:00" if name == "GCF" else START
+    header = {"station": "ABC", "channel": code, "sampling_rate": 100.0}
+    samples = counts(2000)[:, 0]
+    trace = obspy.Trace(samples, {**header, "starttime": obspy.UTCDateTime(start)})
+    trace.write(str(path), format=name)
+    (sensor,) = opened(path).values()
+    assert sensor.sampling_rate == 100.0
+    np.testing.assert_array_equal(whole(sensor)[:, 0], samples)
+    assert sensor.stretches[0].start_utc_ns == obspy.UTCDateTime(start).ns
+    assert "ABC" in sensor.name
+
+
+@pytest.mark.filterwarnings("ignore")  # ObsPy's, about its own files
+@pytest.mark.parametrize(
+    ("path", "n_sensors"),
+    [
+        ("gcf/tests/data/20160603_1910n.gcf", 1),
+        ("gse2/tests/data/loc_RJOB20050831023349.z", 1),
+        ("sac/tests/data/test.sac", 1),
+        ("seg2/tests/data/20180307_031245000.0.seg2", 1),
+        ("segy/tests/data/00001034.sgy_first_trace", 1),
+    ],
+)
+def test_files_that_obspy_provides(path: str, n_sensors: int) -> None:
+    file = OBSPY_IO / path
+    expected = obspy.read(str(file))
+    sensors = opened(file)
+    assert len(sensors) == n_sensors
+    for sensor, trace in zip(sensors.values(), expected, strict=False):
+        np.testing.assert_array_equal(whole(sensor)[:, 0], trace.data)
+        assert sensor.sampling_rate == trace.stats.sampling_rate
+        assert sensor.stretches[0].start_utc_ns == trace.stats.starttime.ns
+
+
+@pytest.mark.filterwarnings("ignore")  # ObsPy's, about headers that it makes
+def test_segy_traces_are_sensors(tmp_path: Path) -> None:
+    samples = counts(500, 3).astype(np.float32)
+    stream = obspy.Stream([obspy.Trace(np.ascontiguousarray(c)) for c in samples.T])
+    for trace in stream:
+        trace.stats.sampling_rate = 500.0
+        trace.stats.starttime = obspy.UTCDateTime("2026-11-21T03:00:00")
+    stream.write(str(tmp_path / "a.sgy"), format="SEGY", data_encoding=5)
+    sensors = opened(tmp_path / "a.sgy")
+    assert [(s.name, s.channels, s.sampling_rate) for s in sensors.values()] == [
+        (str(number), ("1",), 500.0) for number in (1, 2, 3)
+    ]
+    np.testing.assert_array_equal(np.hstack([whole(s) for s in sensors.values()]), samples)
+
+
+def prepared_58(**given: object) -> dict[str, object]:
+    """Complete a function as the documentation of pyuff does."""
+    others = {
+        **dict.fromkeys(("orddenom_spec_data_type", "z_axis_spec_data_type"), 0),
+        "binary": 1,
+        "ordinate_spec_data_type": 12,
+        "abscissa_spec_data_type": 17,
+    }
+    return dict(pyuff.prepare_58(**others, **given))
+
+
+@pytest.mark.filterwarnings("ignore")  # pyuff leaves a damaged file open
+def test_time_responses_of_a_universal_file(tmp_path: Path) -> None:
+    samples = counts(1000, 4) / 1000
+    path = tmp_path / "a.uff"
+    responses = [(7, 1), (7, -3), (12, 1), (12, 3)]
+    for (node, direction), column in zip(responses, samples.T, strict=True):
+        pyuff.UFF(str(path)).write_sets(
+            prepared_58(
+                func_type=1,
+                rsp_node=node,
+                rsp_dir=direction,
+                ref_node=1,
+                ref_dir=3,
+                data=column,
+                x=np.arange(1000) / 512,
+                abscissa_inc=1 / 512,
+                abscissa_spacing=1,
+                ordinate_axis_units_lab="m/s^2",
+            ),
+            "add",
+        )
+    others = {"rsp_dir": 1, "ref_node": 1, "ref_dir": 3, "abscissa_inc": 1.0, "abscissa_spacing": 1}
+    spectrum = prepared_58(
+        func_type=9, rsp_node=7, data=samples[:, 0], x=np.arange(1000.0), **others
+    )
+    pyuff.UFF(str(path)).write_sets(spectrum, "add")
+    sensors = opened(path)
+    assert {name: s.channels for name, s in sensors.items()} == {"7": ("X", "-Z"), "12": ("X", "Z")}
+    np.testing.assert_allclose(
+        np.hstack([whole(s) for s in sensors.values()]), samples, rtol=1e-6, atol=1e-9
+    )
+    import_files([path], tmp_path / "a.h5")
+    with Recording.open(tmp_path / "a.h5") as recording:
+        assert recording.sensors[0].sampling_rate == 512.0
+        assert recording.sensors[0].channels[0].unit == "m/s²"
+    (tmp_path / "b.uff").write_text("    -1\n    58\n")
+    with pytest.raises(ImportFormatError, match=r"b\.uff"):
+        open_sources([tmp_path / "b.uff"])
+
+
+def test_groups_of_tdms(tmp_path: Path) -> None:
+    samples = counts(300_000, 3)
+    properties = {
+        "wf_start_time": np.datetime64(START, "us"),
+        "wf_increment": 1e-3,
+        "unit_string": "g",
+    }
+    path = tmp_path / "a.tdms"
+    with nptdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment(
+            [
+                nptdms.ChannelObject(sensor, channel, samples[:, column], properties)
+                for column, (sensor, channel) in enumerate([("A", "x"), ("A", "y"), ("B", "x")])
+            ]
+        )
+    sensors = opened(path)
+    assert {name: (s.channels, s.units) for name, s in sensors.items()} == {
+        "A": (("x", "y"), ("g", "g")),
+        "B": (("x",), ("g",)),
+    }
+    for sensor in sensors.values():  # of several parts
+        assert (sensor.sampling_rate, sensor.stretches[0].start_utc_ns) == (1000.0, START_NS)
+    np.testing.assert_array_equal(np.hstack([whole(s) for s in sensors.values()]), samples)
+    with nptdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment([nptdms.ChannelObject("A", "x", samples[:, 0])])
+    with pytest.raises(ImportFormatError, match=r"no wf_increment.*--sampling-rate"):
+        open_sources([path])
+    assert open_sources([path], sampling_rate=50.0).sensors["A"].sampling_rate == 50.0
+    path.write_bytes(b"TDSm")
+    with pytest.raises(ImportFormatError, match=r"a\.tdms: "):
+        open_sources([path])
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "int32", "float32"])
+def test_wav(tmp_path: Path, dtype: str) -> None:
+    samples = counts(800, 3)
+    written = (samples % 256 if dtype == "uint8" else samples).astype(dtype)
+    wavfile.write(tmp_path / "A.wav", 8000, written)
+    (sensor,) = opened(tmp_path / "A.wav").values()
+    assert (sensor.name, sensor.channels, sensor.sampling_rate) == ("A", ("1", "2", "3"), 8000.0)
+    zero = 128 if dtype == "uint8" else 0
+    np.testing.assert_array_equal(whole(sensor), written.astype(np.float64) - zero)
+    (tmp_path / "A.wav").write_bytes(b"RIFF")
+    with pytest.raises(ImportFormatError, match="expected a WAV file"):
+        open_sources([tmp_path / "A.wav"])
+
+
+def write_mat73(path: Path, **arrays: object) -> None:
+    """Write as MATLAB does with -v7.3: HDF5 after a header, the first index fastest."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in arrays.items():
+            kind = "char" if isinstance(value, str) else "double"
+            array = np.asarray(value).T
+            if isinstance(value, str):
+                array = np.array([[ord(letter)] for letter in value], np.uint16)
+            file[name] = np.atleast_2d(array)
+            file[name].attrs["MATLAB_class"] = np.bytes_(kind)
+    header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(124) + b"\0\2IM"
+    with path.open("r+b") as raw:
+        raw.write(header)
+
+
+def test_matlab_of_version_7_3(tmp_path: Path) -> None:
+    samples = counts(900, 2).astype(np.float64)
+    path = tmp_path / "a.mat"
+    write_mat73(path, sampling_rate=200.0, start_time=START, A=samples, B=samples[:, :1])
+    sensors = opened(path)
+    np.testing.assert_array_equal(whole(sensors["A"]), samples)
+    np.testing.assert_array_equal(whole(sensors["B"]), samples[:, :1])
+    assert sensors["A"].stretches[0].start_utc_ns == START_NS
+    assert sensors["B"].sampling_rate == 200.0
+
+
+def test_matlab_of_version_7_3_follows_no_link_and_inflates_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    write_mat73(path, sampling_rate=200.0, A=np.zeros((10, 1)))
+    with h5py.File(path, "r+") as file:
+        file["B"] = h5py.ExternalLink("other.h5", "/A")
+    assert list(opened(path)) == ["A"]
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("C", (1 << 40,), "f8", chunks=(1 << 16,), compression="gzip")
+    with pytest.raises(ImportFormatError, match=r"C: 0 bytes that become 8796093022208"):
+        open_sources([path])
+
+
+def test_a_file_that_scipy_provides_says_what_it_lacks() -> None:
+    path = Path(scipy.io.__file__).parent / "matlab/tests/data/testhdf5_7.4_GLNX86.mat"
+    if not path.exists():
+        pytest.skip("scipy was installed without its tests")
+    with pytest.raises(ImportFormatError, match="expected a positive sampling_rate"):
+        open_sources([path])
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [
+        ("a.tdms", "nptdms", "vibration"),
+        ("a.uff", "pyuff", "vibration"),
+        ("a.sac", "obspy", "formats"),
+    ],
+)
+def test_the_extra_of_a_missing_library_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
+) -> None:
+    (tmp_path / name).write_bytes(b"anything")
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    with pytest.raises(ImportFormatError, match=rf"not installed; run: pip install.*\[{extra}\]"):
+        open_sources([tmp_path / name])
