@@ -138,8 +138,11 @@ def estimate(
         (``"known"``), by the averages (``"estimated"``), where it matters (``"auto"``, default),
         or none (``"off"``).
     reject : bool
-        Whether to exclude segments with transients also. Segments with gaps are always excluded,
-        clipped ones unless this is False.
+        Whether to exclude segments with transients also. Clipped segments are excluded unless this
+        is False.
+    bridge : float
+        Share of a segment that gaps may take, where fewer than half of the segments have none
+        (default 0.6).
     octaves : bool
         Whether each octave has its own segment length: `segment` in the top octave, doubled in each
         octave below.

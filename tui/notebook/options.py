@@ -34,6 +34,7 @@ class EstimateOptions(TypedDict, total=False):
     clocks: str
     equalise: str
     reject: bool
+    bridge: float
     octaves: bool
     dimension: int | str
     gains: Mapping[str, float]
