@@ -99,8 +99,8 @@ def not_judged(found: TestVerdict) -> list[str]:
         parts += [f"above {last:.3g} Hz"] if last < high else []
         if parts:
             lines.append(
-                f"{name} is not judged {listed(parts)}, where there is no estimate: it goes from "
-                f"{low:.3g} to {high:.3g} Hz."
+                f"Not judged: {name} {listed(parts)}, where there is no estimate (the limit goes "
+                f"from {low:.3g} to {high:.3g} Hz)."
             )
     return lines
 

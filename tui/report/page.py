@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import re
+from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -13,6 +15,8 @@ from tui.report.figures import drawing
 from tui.report.figures.curves import WIDTH
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from tui.report.parts import Plot, Report
 
 _LIGHT = {
@@ -42,6 +46,9 @@ _DARK = {
 }
 
 
+_REFERENCE = re.compile(r'(?:url\(#|href="#)([^")]+)')
+
+
 def page(report: Report) -> str:
     """Return a report as HTML, with all text escaped and plots inline as SVG."""
     environment = Environment(
@@ -59,12 +66,12 @@ def page(report: Report) -> str:
         dark=_DARK,
         footer=_css_string(report.subtitle),
         kind_of=lambda part: type(part).__name__,
-        picture_of=_picture,
+        picture_of=partial(_picture, count(1)),
     )
 
 
-def _picture(plot: Plot) -> Markup:
-    """Return a plot as SVG whose colours are those of the page."""
+def _picture(numbers: Iterator[int], plot: Plot) -> Markup:
+    """Return a plot as SVG whose colours are those of the page, with names of its own."""
     with drawing.look():
         text = io.StringIO()
         # no date: the same recording gives the same page
@@ -72,10 +79,11 @@ def _picture(plot: Plot) -> Markup:
         drawing.alone(plot, WIDTH).savefig(text, format="svg", metadata=nothing)
     svg = text.getvalue()
     svg = svg[svg.index("<svg") :]
-    used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', svg))
+    used, prefix = set(_REFERENCE.findall(svg)), f"p{next(numbers)}-"
     svg = re.sub(
-        r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", svg
-    )  # of several plots in one page, names that nobody uses would be the same
+        r' id="([^"]*)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", svg
+    )  # names in one page differ
+    svg = _REFERENCE.sub(lambda m: m[0].replace(f"#{m[1]}", f"#{prefix}{m[1]}"), svg)
     for name, colour in _LIGHT.items():
         svg = svg.replace(colour, f"var(--{name})")
     box = re.search(r'viewBox="[^"]*"', svg)

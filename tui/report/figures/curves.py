@@ -116,7 +116,7 @@ class _NoisePanel:
                 at, _decibels(mask), color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit"
             )
         for (label, (at, psd)), dashes in zip(
-            curve.models.items(), cycle(drawing.DASHES), strict=False
+            curve.models.items(), cycle(drawing.MODEL_DASHES), strict=False
         ):
             axes.plot(
                 at, _decibels(psd), color=drawing.MODEL, lw=0.7, dashes=dashes, label=_shown(label)

@@ -27,6 +27,8 @@ LINES = ("#0b62a9", "#d1661f", "#2f8f4e", "#8c4fb0", "#b3272c", "#7d6a57", "#c45
 
 DASHES = ((4, 1.2), (1.2, 1.2), (6, 1.2, 1.2, 1.2), (6, 1.2, 1.2, 1.2, 1.2, 1.2))
 """Of lines that are told apart without colour."""
+MODEL_DASHES = ((7, 2), (6, 1.5, 1, 1.5), (2.5, 1.2), (6, 1.5, 1, 1.5, 1, 1.5))
+"""Of noise models; none is dotted, as the band and the quantisation are."""
 
 LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.19
 """Room left of a row of axes, between them, above, for titles, below, and for a row of the key."""
