@@ -15,7 +15,7 @@ from cronsim import CronSim
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daq.bench.unattended import Schedule, ScheduledRun
+    from daq.bench.tables.unattended import Schedule, ScheduledRun
 
 
 def due_times(run: ScheduledRun, after: datetime) -> Iterator[datetime]:

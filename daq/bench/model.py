@@ -22,9 +22,9 @@ from pydantic import (
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks import NOISE_MODELS, Mask, check_points
-from daq.bench.table import Duration, Name, Number, PositiveNumber, Table
+from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
+from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Storage
 from daq.bench.toml_text import to_toml
-from daq.bench.unattended import History, Hooks, Metrics, Schedule, Storage
 from daq.bench.units import DensityUnit
 
 if TYPE_CHECKING:

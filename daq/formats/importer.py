@@ -15,7 +15,7 @@ import numpy as np
 from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Channel, Sensor
-from daq.bench.table import check_name
+from daq.bench.tables.fields import check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns

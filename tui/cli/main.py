@@ -133,6 +133,7 @@ _PANELS = {
         acquisition.serve,
         service.status,
         service.runs,
+        service.history,
         service.pin,
         service.verify,
     ),

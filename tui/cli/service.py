@@ -1,4 +1,4 @@
-"""``status``, ``runs``, ``pin``, ``verify``."""
+"""``status``, ``runs``, ``history``, ``pin``, ``verify``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -13,6 +13,14 @@ from tui.cli.options import BenchArgument, CsvOption, JsonOption
 PlaceArgument: TypeAlias = Annotated[
     Path, typer.Argument(metavar="BENCH", help="Bench file, or a folder of recordings.")
 ]
+
+
+def _band(text: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r}: expected LOW:HIGH in Hz, as in 1:10") from None
+    return low, high
 
 
 @examples("huddle status lab.toml", "huddle status lab.toml --json -")
@@ -45,6 +53,68 @@ def runs(
     from tui.commands.runs import list_runs
 
     list_runs(source, last=last, json=json, csv=csv)
+
+
+@examples(
+    "huddle history lab.toml",
+    "huddle history lab.toml --band 1:10 --out noise.png",
+    "huddle history lab/recordings office/recordings --csv -   (sensors by serial number)",
+)
+def history(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="BENCH", help="Bench files, or folders of recordings."),
+    ],
+    *,
+    band: Annotated[
+        str | None,
+        typer.Option(
+            "--band", metavar="LOW:HIGH", help="Band in Hz, one that runs have kept (default: all)."
+        ),
+    ] = None,
+    scatter: Annotated[
+        float,
+        typer.Option(
+            "--scatter",
+            min=0.0,
+            metavar="DB",
+            help="Standard deviation from run to run that is no change, in dB.",
+        ),
+    ] = 0.1,
+    false_alarms: Annotated[
+        float,
+        typer.Option(
+            "--false-alarms",
+            min=1e-9,
+            max=0.5,
+            metavar="SHARE",
+            help="Probability of any false alarm in the whole history.",
+        ),
+    ] = 0.01,
+    json: JsonOption = None,
+    csv: CsvOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Picture: .png, .svg or .pdf."),
+    ] = None,
+) -> None:
+    """Show the noise of every channel from run to run, and whether it has changed.
+
+    Serial numbers tie the history of a sensor together over benches and
+    ports. The test allows for the uncertainty of each run; its false-alarm
+    rate holds for the whole history.
+    """
+    from tui.commands.history import show_history
+
+    show_history(
+        sources,
+        band=None if band is None else _band(band),
+        scatter=scatter,
+        false_alarms=false_alarms,
+        json=json,
+        csv=csv,
+        out=out,
+    )
 
 
 @examples(

@@ -10,8 +10,8 @@ from daq.errors import HuddleError, RecordingError
 from daq.recording.repair import verify
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
-from tui.service.places import NoServiceError, Place
-from tui.service.run_state import Run, RunState, utc_text
+from tui.service.records.places import NoServiceError, Place
+from tui.service.records.run_state import Run, RunState, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

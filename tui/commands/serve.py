@@ -21,16 +21,16 @@ from tui.output.console import for_people, write_json, write_whole
 from tui.output.extras import require
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.service.clock import SystemTime
-from tui.service.finish import options_table
 from tui.service.hooks import Teller
-from tui.service.locks import Lock
 from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier
-from tui.service.places import file_name, service_lock
+from tui.service.processes.finish import options_table
+from tui.service.processes.locks import Lock
+from tui.service.processes.steps import ProcessSteps
+from tui.service.records.places import file_name, service_lock
+from tui.service.records.storage import tidy
+from tui.service.records.store import RunStore, StoreError
 from tui.service.service import Service
-from tui.service.steps import ProcessSteps
-from tui.service.storage import tidy
-from tui.service.store import RunStore, StoreError
 from tui.service.supervision import signs_of_life
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from tui.service.clock import Clock
-    from tui.service.run_state import Run
+    from tui.service.records.run_state import Run
 
 _LOGGER = logging.getLogger(__name__)
 SHOWN = 5

@@ -11,8 +11,8 @@ from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from tui.output.console import for_people, write_json
 from tui.output.exit_codes import ExitCode
+from tui.service.records.store import RunStore
 from tui.service.status import service_status
-from tui.service.store import RunStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 from tui.output.console import finite
 from tui.output.json_values import plain
-from tui.service.run_state import Run, RunState
-from tui.service.store import StoreError
+from tui.service.records.run_state import Run, RunState
+from tui.service.records.store import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from daq.bench.unattended import Hooks
+    from daq.bench.tables.unattended import Hooks
     from tui.service.clock import Clock
-    from tui.service.store import RunStore
+    from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
 _MOST_OUTPUT = 400

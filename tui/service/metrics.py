@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from tui.output.extras import load
-from tui.service.run_state import Run, RunState
+from tui.service.records.run_state import Run, RunState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daq.bench.unattended import Metrics
+    from daq.bench.tables.unattended import Metrics
     from tui.service.hooks import Teller
     from tui.service.service import Service
 

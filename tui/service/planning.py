@@ -12,14 +12,14 @@ from itertools import islice, takewhile
 from typing import TYPE_CHECKING
 
 from daq.acquisition.schedule import all_due, due_times
-from tui.service.run_state import Run
+from tui.service.records.run_state import Run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
     from datetime import datetime
 
     from daq.bench.model import Bench
-    from daq.bench.unattended import ScheduledRun
+    from daq.bench.tables.unattended import ScheduledRun
 
 GRACE = timedelta(minutes=1)
 """A run that would start later than this is missed."""

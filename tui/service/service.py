@@ -17,11 +17,11 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
-from tui.service.finish import Request
 from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
-from tui.service.run_state import Run, RunState
-from tui.service.store import StoreError
+from tui.service.processes.finish import Request
+from tui.service.records.run_state import Run, RunState
+from tui.service.records.store import StoreError
 from tui.service.window import Window, free_space
 
 if TYPE_CHECKING:
@@ -31,14 +31,16 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from tui.service.clock import Clock
-    from tui.service.steps import Steps
-    from tui.service.store import RunStore
+    from tui.service.processes.steps import Steps
+    from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
 LONGEST_SLEEP = 30.0
 """Seconds between two readings of the clock, which may be set."""
-MAX_ATTEMPTS = 3
+MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
+RETRY = 2.0
+"""Seconds until an estimate without an outcome is tried again, doubled each time."""
 _LEVELS = {RunState.FAILED: logging.ERROR, RunState.MISSED: logging.WARNING}
 BUSY = "the run before was still recording"
 OFF = "the computer was off, asleep or without the service"
@@ -292,6 +294,7 @@ class Service:
             outcome = await self._steps.finish(request)
         except (HuddleError, OSError) as error:
             _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
+            await self._clock.sleep(RETRY * 2**run.attempts, self.stop)
             return run.because(str(error))
         for note in outcome.notes:
             run = run.because(note)

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.control import ask
-from tui.service.locks import is_held
-from tui.service.places import service_lock
-from tui.service.run_state import UNFINISHED, RunState, utc_text
+from tui.service.processes.locks import is_held
+from tui.service.records.places import service_lock
+from tui.service.records.run_state import UNFINISHED, RunState, utc_text
 
 if TYPE_CHECKING:
     from datetime import datetime
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.run_state import Run
+    from tui.service.records.run_state import Run
 
 _TIME_ERROR = 5
 """Answer of ``adjtimex`` where nothing keeps the clock right."""

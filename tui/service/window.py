@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
-from tui.service.run_state import Run, RunState
+from tui.service.records.run_state import Run, RunState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from tui.service.clock import Clock
-    from tui.service.steps import Recorder, Steps
+    from tui.service.processes.steps import Recorder, Steps
 
 _LOGGER = logging.getLogger(__name__)
 LOOK = 2.0

@@ -8,7 +8,7 @@ from itertools import islice
 import pytest
 
 from daq.acquisition.schedule import all_due, due_times
-from daq.bench.unattended import Schedule, ScheduledRun
+from daq.bench.tables.unattended import Schedule, ScheduledRun
 
 START = datetime(2026, 11, 21, 12, 0, 30, tzinfo=UTC)
 

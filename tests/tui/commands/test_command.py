@@ -40,6 +40,7 @@ COMMANDS = (
     "serve",
     "status",
     "runs",
+    "history",
     "pin",
     "verify",
     "repair",

@@ -17,10 +17,10 @@ from tests.torture.damaged_files import make_recording
 from tests.tui.service.bench_files import START
 from tui.cli.main import app
 from tui.output.csv_text import csv_text
-from tui.service.locks import Lock
-from tui.service.places import Place, service_lock
-from tui.service.run_state import Run, RunState
-from tui.service.store import RunStore, StoreError
+from tui.service.processes.locks import Lock
+from tui.service.records.places import Place, service_lock
+from tui.service.records.run_state import Run, RunState
+from tui.service.records.store import RunStore, StoreError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,18 +15,18 @@ import pytest
 
 from daq.acquisition.schedule import utc_now
 from daq.bench.loading import dump
-from daq.bench.unattended import Schedule, ScheduledRun
+from daq.bench.tables.unattended import Schedule, ScheduledRun
 from daq.drivers.bench_file import load, parse
 from daq.errors import BenchFileError, RecordingError
 from daq.recording.reader import Recording
 from tests.waiting import limit
 from tui.commands.serve import AlreadyServedError, accepted, serve
 from tui.service.clock import SystemTime
-from tui.service.locks import Lock
-from tui.service.places import service_lock
-from tui.service.run_state import RunState
-from tui.service.steps import ProcessSteps
-from tui.service.store import RunStore
+from tui.service.processes.locks import Lock
+from tui.service.processes.steps import ProcessSteps
+from tui.service.records.places import service_lock
+from tui.service.records.run_state import RunState
+from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:

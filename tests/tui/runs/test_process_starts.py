@@ -19,8 +19,8 @@ from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from daq.recording.reader import Recording
 from tui.runs.recorder_process import RecorderProcess
-from tui.service.finish import Outcome, Request
-from tui.service.steps import ProcessSteps
+from tui.service.processes.finish import Outcome, Request
+from tui.service.processes.steps import ProcessSteps
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
         str(Path("sim_devices", "server", "launch.py")),
         str(Path("tui", "runs", "recorder_process.py")),
         str(Path("tui", "service", "hooks.py")),
-        str(Path("tui", "service", "steps.py")),
+        str(Path("tui", "service", "processes", "steps.py")),
     }
     hooks = str(Path("tui", "service", "hooks.py"))  # runs what the bench file says
     assert all("python_command(" in sources[name] for name in starts - {hooks})

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.loading import parse
 from daq.errors import HuddleError
 from tui.service.clock import SystemTime
-from tui.service.finish import Outcome, Request
+from tui.service.processes.finish import Outcome, Request
+from tui.service.records.store import RunStore
 from tui.service.service import Service
-from tui.service.store import RunStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.run_state import Run
-    from tui.service.steps import Recorder
+    from tui.service.processes.steps import Recorder
+    from tui.service.records.run_state import Run
 
 START = datetime(2026, 11, 21, 12, 0, 30, tzinfo=UTC)
 SENSORS = """

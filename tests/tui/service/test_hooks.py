@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.bench.unattended import Hooks
+from daq.bench.tables.unattended import Hooks
 from tests.tui.service.bench_files import HOURLY, START, Place, VirtualClock
 from tui.service.hooks import Teller, events_of, run_hook
-from tui.service.run_state import BandNoise, Run, RunState
-from tui.service.store import RunStore
+from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.store import RunStore
 
 if TYPE_CHECKING:
     from pathlib import Path

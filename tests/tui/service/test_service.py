@@ -11,11 +11,11 @@ import pytest
 
 from daq.errors import BenchFileError, FileFault
 from tests.tui.service.bench_files import HOURLY, START, Place, bench_of
-from tui.service.finish import Outcome
 from tui.service.planning import MAX_MISSED
-from tui.service.run_state import NEXT, Run, RunState, WrongStateError
-from tui.service.steps import FinishFailedError
-from tui.service.store import RunStore, StoreError
+from tui.service.processes.finish import Outcome
+from tui.service.processes.steps import FinishFailedError
+from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
+from tui.service.records.store import RunStore, StoreError
 from tui.service.window import STALL, STOPPED
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:
     await place.serve(1.5 * HOUR)
     run = place.store.runs()[0]
     assert run.state is RunState.FAILED
-    assert "3 estimates ended without an outcome" in run.reason
+    assert "5 estimates ended without an outcome" in run.reason
     assert "killed (signal 9)" in run.reason
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.bench.unattended import Metrics
+from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
 from tui.output.logs.journal import JournalHandler
 from tui.output.logs.lines import fields_of

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from daq.recording.storage.locking import WriterLock
 from tests.tui.service.bench_files import START, bench_of
-from tui.service.run_state import Run, RunState
-from tui.service.storage import KEPT, tidy
-from tui.service.store import RunStore
+from tui.service.records.run_state import Run, RunState
+from tui.service.records.storage import KEPT, tidy
+from tui.service.records.store import RunStore
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.storage.names import PRIVATE
-from tui.service.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
+from tui.service.records.run_state import UNFINISHED, BandNoise, Run, RunState, from_text, utc_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

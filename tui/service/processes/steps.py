@@ -22,8 +22,8 @@ from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from tui.runs.child_log import ChildLog
 from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
-from tui.service.finish import Outcome, Request
-from tui.service.locks import Lock, is_held, kill_holder
+from tui.service.processes.finish import Outcome, Request
+from tui.service.processes.locks import Lock, is_held, kill_holder
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -157,7 +157,7 @@ class ProcessSteps:
         lock = await _taken(mark)  # one of an earlier service may still run
         try:
             process = await asyncio.create_subprocess_exec(
-                *python_command("tui.service.finish", request.text()),
+                *python_command("tui.service.processes.finish", request.text()),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.PIPE,
@@ -230,7 +230,8 @@ class _OwnRecorder:
         try:
             self._process.check()
         except RecorderFailedError as error:
-            self._code_error = str(error).replace("\n", "; ")
+            # What to do about a killed recorder is the service's own business.
+            self._code_error = str(error).partition("; acknowledged")[0].replace("\n", "; ")
         self._process.close()
 
 
@@ -291,7 +292,7 @@ class RecorderStopper:
         import subprocess  # noqa: PLC0415 - seldom needed
 
         self._process = subprocess.Popen(
-            python_command("tui.service.until_cov", json.dumps([str(out), target_cov])),
+            python_command("tui.service.processes.until_cov", json.dumps([str(out), target_cov])),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

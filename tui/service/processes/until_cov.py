@@ -1,7 +1,7 @@
 """Stops the recorder of a recording when its noise has the wanted precision.
 
 A process of its own: an estimate that fails or takes long costs the recording nothing but its early
-end. ``python -m tui.service.until_cov '["FILE", COV]'``
+end. ``python -m tui.service.processes.until_cov '["FILE", COV]'``
 """
 
 from __future__ import annotations

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError
-from tui.service.store import NAME, RunStore
+from tui.service.records.store import NAME, RunStore
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.run_state import Run
+    from tui.service.records.run_state import Run
 
 
 class NoServiceError(HuddleError):

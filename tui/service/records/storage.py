@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from daq.acquisition.retention import remove_run
 from daq.errors import HuddleError, RecordingError
 from daq.recording.storage.locking import is_being_written
-from tui.service.run_state import RunState
+from tui.service.records.run_state import RunState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from tui.service.run_state import Run
-    from tui.service.store import RunStore
+    from tui.service.records.run_state import Run
+    from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
 KEPT = 3

@@ -11,7 +11,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 from cronsim import CronSim, CronSimError
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from daq.bench.table import Duration, Name, PositiveNumber, Table
+from daq.bench.tables.fields import Duration, Name, PositiveNumber, Table
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]*)", re.ASCII)

@@ -3,7 +3,8 @@
 A process of its own, so that neither memory nor a crash of a library concerns the service. It can
 be killed at any moment and started again: it changes nothing that it has changed before.
 
-``python -m tui.service.finish REQUEST`` takes a `Request` as JSON and prints an `Outcome` as JSON.
+``python -m tui.service.processes.finish REQUEST`` takes a `Request` as JSON, and prints an
+`Outcome` as JSON.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from tui.output.json_document import document
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
-from tui.service.run_state import BandNoise
+from tui.service.records.run_state import BandNoise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

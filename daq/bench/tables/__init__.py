@@ -1,0 +1,1 @@
+"""Tables of the bench file that stand for themselves, and what all tables are made of."""

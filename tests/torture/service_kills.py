@@ -1,0 +1,235 @@
+"""A service under fire: SIGKILL to it, its recorders and estimates, and a clock that is set.
+
+``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS]`` runs a simulated
+bench at 20 times real time by a schedule of ten minutes, until so many kills (default 300; one in
+INTERVAL seconds, default 4) or seconds have passed, with so many steps of the clock. Cables are
+pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and
+descriptors of the service went. The clock begins an hour before clocks change in Berlin.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from importlib import resources
+from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.acquisition.schedule import due_times
+from daq.bench.loading import dump
+from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
+from daq.drivers.bench_file import load, parse
+from daq.errors import HuddleError
+from daq.recording.repair import verify
+from daq.recording.storage.journal import journal_path
+from tests.torture.service_program import FastClock
+from tui.service.records.run_state import RunState
+from tui.service.records.store import RunStore
+from tui.simulation.devices import simulated
+
+if TYPE_CHECKING:
+    from daq.bench.model import Bench
+
+RATE = 20.0
+BEGIN = datetime(2026, 10, 24, 23, 55, tzinfo=UTC)  # an hour and five minutes before clocks change
+ENTRY = ScheduledRun(
+    name="ten", cron="*/10 * * * *", time_zone="Europe/Berlin", duration=240.0, when_busy="queue"
+)
+KINDS = {"service": "service_program", "recorder": "tui record", "estimate": "processes.finish"}
+
+
+def with_pulled_cables(bench: Bench) -> Bench:
+    """Return the bench with sensors that are lost for a while, again and again."""
+    faults = [
+        {"kind": kind, "sensors": [sensor], "at": at, "every": every, "duration": duration}
+        for kind, sensor, at, every, duration in (
+            ("disconnect", "A", 500.0, 1300.0, 20.0),
+            ("silent", "B", 900.0, 1700.0, 15.0),
+        )
+    ]
+    return bench.model_copy(update={"simulation": bench.simulation | {"faults": faults}})
+
+
+def processes(folder: Path) -> dict[str, list[int]]:
+    """Return the processes of a service by kind: those that name its folder."""
+    found: dict[str, list[int]] = {kind: [] for kind in KINDS}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        with suppress(OSError):
+            command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            for kind, word in KINDS.items():
+                if word in command and str(folder) in command:
+                    found[kind].append(int(entry.name))
+    return found
+
+
+class Soak:
+    """One service, started again whenever it has been killed."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder = folder
+        self.bench = folder / "bench.toml"
+        self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=RATE)
+        self.rng = np.random.default_rng(seed)
+        self.kills: Counter[str] = Counter()
+        self.usage: list[tuple[float, float, float]] = []
+        self._log = (folder / "service.log").open("ab")
+        self._service: subprocess.Popen[bytes] | None = None
+        self._since = 0.0
+
+    def keep_alive(self) -> None:
+        """Start the service if it does not run."""
+        if self._service is None or self._service.poll() is not None:
+            command = [sys.executable, "-m", "tests.torture.service_program"]
+            self._service = subprocess.Popen(
+                [*command, str(self.bench), str(self.folder / "clock")], stderr=self._log
+            )
+            self._since = time.monotonic()
+
+    def kill(self) -> None:
+        """Kill one of the processes, of a kind that is drawn by lot."""
+        found = {kind: pids for kind, pids in processes(self.folder).items() if pids}
+        if not found:
+            return
+        kind = str(self.rng.choice(sorted(found)))
+        with suppress(ProcessLookupError):
+            os.kill(found[kind][0], signal.SIGKILL)
+            self.kills[kind] += 1
+        if kind == "service" and self._service is not None:
+            self._service.wait()
+
+    def measure(self) -> None:
+        """Note memory (MB) and descriptors of the service, once it has warmed up."""
+        pid = self._service.pid if self._service is not None else 0
+        with suppress(OSError, AttributeError):
+            status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+            memory = int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1e3  # type: ignore[index]
+            n_open = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+            last = self.usage[-1][0] if self.usage else 0.0
+            if min(time.monotonic() - self._since - 50.0, time.monotonic() - last) > 10.0:
+                self.usage.append((time.monotonic(), memory, n_open))
+
+    def finish(self) -> None:
+        """Let what is unfinished end, then stop the service."""
+        store = RunStore(load(self.bench).recording_directory)
+        deadline = time.monotonic() + 180
+        while time.monotonic() < deadline:
+            self.keep_alive()
+            with suppress(HuddleError):
+                if not any(run.state in {"recording", "estimating"} for run in store.runs()):
+                    break
+            time.sleep(0.5)
+        if self._service is not None:
+            self._service.terminate()
+            self._service.wait()
+        self._log.close()
+
+
+def faults(bench_path: Path, until: datetime) -> list[str]:
+    """Return what is wrong with the runs and recordings of a service."""
+    bench = load(bench_path)
+    store = RunStore(bench.recording_directory)
+    runs = store.runs()
+    found = [
+        f"{run.name}: left {run.state}"
+        for run in runs
+        if not run.is_over and run.state is not RunState.DUE
+    ]
+    known = {run.due.timestamp() for run in runs}
+    due = takewhile(lambda at: at < until, due_times(ENTRY, BEGIN + timedelta(minutes=2)))
+    found += [f"{at:%d %H:%M %Z}: no row" for at in due if at.timestamp() not in known]
+    kept = {part for run in runs if run.removed is None for part in run.parts}
+    for part in sorted(kept):
+        path = bench.recording_directory / part
+        try:
+            report = verify(path)
+        except HuddleError as error:
+            found.append(str(error))
+            continue
+        if not (report.intact and report.closed) or journal_path(path).exists():
+            found.append(f"{part}: not intact and closed")
+    there = {path.name for path in bench.recording_directory.glob("*.h5")}
+    return found + [f"{part}: of no run" for part in sorted(there - kept)]
+
+
+def slope(usage: list[tuple[float, float, float]], column: int) -> str:
+    """Return the trend per hour with its standard error, of values ten seconds apart."""
+    if len(usage) < 10:
+        return "too short"
+    values = np.array(usage)
+    t, y = (values[:, 0] - values[0, 0]) / 3600, values[:, column]
+    (gradient, _), covariance = np.polyfit(t, y, 1, cov=True)
+    return f"{gradient:+.2f} ± {np.sqrt(covariance[0, 0]):.2f} an hour, mean {y.mean():.1f}"
+
+
+def main() -> int:
+    """Do it."""
+    n_kills = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 3600.0
+    interval = float(sys.argv[3]) if len(sys.argv) > 3 else 4.0
+    n_steps = int(sys.argv[4]) if len(sys.argv) > 4 else 0
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory(prefix="huddle-soak-") as name:
+        folder = Path(name)
+        with simulated(with_pulled_cables(parse(text)), speed=RATE) as reachable:
+            changes = {
+                "schedule": Schedule(runs=(ENTRY,)),
+                "storage": Storage(keep_runs=40, min_free=10**7),
+            }
+            bench = reachable.model_copy(update=changes)
+            (folder / "bench.toml").write_text(dump(bench), encoding="utf-8")
+            soak = Soak(folder, seed=1)
+            begin = time.monotonic()
+            next_kill = begin + 5.0
+            steps = [begin + seconds * (k + 1) / (n_steps + 1) for k in range(n_steps)]
+            while time.monotonic() < begin + seconds and (
+                not n_kills or sum(soak.kills.values()) < n_kills
+            ):
+                soak.keep_alive()
+                soak.measure()
+                if n_kills and time.monotonic() > next_kill:
+                    soak.kill()
+                    next_kill = time.monotonic() + float(soak.rng.exponential(interval))
+                if steps and time.monotonic() > steps[0]:
+                    steps.pop(0)
+                    soak.clock.set_by(float(soak.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
+                time.sleep(0.1)
+            until = soak.clock.now() - timedelta(minutes=2)
+            soak.finish()
+        runs = RunStore(load(folder / "bench.toml").recording_directory).runs()
+        wrong = faults(folder / "bench.toml", until)
+        print(f"{time.monotonic() - begin:.0f} s, kills {dict(soak.kills)}, {n_steps} clock steps")
+        print("runs", dict(Counter(str(run.state) for run in runs)))
+        print("of several parts", sum(len(run.parts) > 1 for run in runs))
+        print("reasons", Counter(re.sub(r"\d+", "N", run.reason)[:100] for run in runs))
+        print("memory in MB", slope(soak.usage, 1), "; descriptors", slope(soak.usage, 2))
+        print(
+            "log",
+            Counter(
+                re.findall(
+                    r" (WARNING|ERROR|CRITICAL) ",
+                    (folder / "service.log").read_text(encoding="utf-8"),
+                )
+            ),
+        )
+        print("faults", wrong or "none", flush=True)
+        (Path(tempfile.gettempdir()) / f"huddle-service-{os.getpid()}.log").write_bytes(
+            (folder / "service.log").read_bytes()
+        )
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Whether changes of noise are found, false alarms are as rare as stated, and what is shown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.results.change_test import DECIBEL, changes, evidence
+from tests.tui.service.bench_files import START
+from tui.cli.main import app
+from tui.service.history.series import history
+from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.store import RunStore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.results.change_test import FloatArray
+
+
+def test_false_alarms_are_as_rare_as_stated() -> None:
+    """200 histories of 40 runs of unequal precision: looks after each run, one rate for all."""
+    rng = np.random.default_rng(14)
+    rate, n = 0.05, 200
+    n_alarms = 0
+    for _ in range(n):
+        deviations = rng.uniform(0.02, 0.3, 40)
+        n_alarms += bool(changes(rng.normal(0.0, deviations), deviations, false_alarms=rate))
+    # Four standard deviations of the count above its bound.
+    assert n_alarms <= rate * n + 4 * math.sqrt(rate * n)
+
+
+def test_the_evidence_is_a_martingale() -> None:
+    """Its mean stays 1 where nothing changes; small widths of change keep its variance small."""
+    rng = np.random.default_rng(15)
+    values = [evidence(rng.normal(size=6), np.full(6, 1.0))[-1] for _ in range(1500)]
+    assert np.mean(values) == pytest.approx(1.0, abs=4 * np.std(values) / math.sqrt(1500))
+
+
+@pytest.mark.parametrize(("shift_db", "within"), [(1.0, 8), (-3.0, 3)])
+def test_a_change_is_found_soon_and_where_it_is(shift_db: float, within: int) -> None:
+    rng = np.random.default_rng(16)
+    deviations = np.full(100, 0.3 * DECIBEL)
+    levels = rng.normal(0.0, deviations)
+    levels[60:] += shift_db * DECIBEL
+    (change,) = changes(levels, deviations, false_alarms=0.01)
+    assert change.found < 60 + within
+    assert abs(change.first - 60) <= 1
+    assert change.shift / DECIBEL == pytest.approx(shift_db, abs=4 * change.deviation / DECIBEL)
+
+
+def test_a_second_change_is_found_after_the_first() -> None:
+    levels: FloatArray = np.zeros(90)
+    levels[30:] += 2 * DECIBEL
+    levels[60:] -= 4 * DECIBEL
+    found = changes(levels, np.full(90, 0.3 * DECIBEL), false_alarms=0.01)
+    assert [change.first for change in found] == [30, 60]
+    assert found[1].shift == pytest.approx(-4 * DECIBEL)
+
+
+def run_with(
+    day: int, db: float, *, bench: str = "lab", sensor: str = "a", low: float = 0.95
+) -> Run:
+    psd = 1e-12 * 10 ** (db / 10)
+    noise = BandNoise(
+        *(sensor, "M", "S1", "x", "m/s²", "three-sensor", 1.0, 10.0, psd, low * psd, psd / 0.95)
+    )
+    run = Run(bench, "night", START + timedelta(days=day), 60.0).to(RunState.RECORDING)
+    return run.to(RunState.ESTIMATING).to(RunState.DONE, noise=(noise,))
+
+
+def test_serial_numbers_tie_benches_together_and_intervals_at_zero_are_left_out() -> None:
+    runs = [run_with(day, 0.0) for day in range(20)]
+    runs += [run_with(day, 2.0, bench="office", sensor="b") for day in range(20, 40)]
+    runs += [run_with(50, 0.0, low=-1.0)]
+    (series,) = history(runs)
+    assert len(series.noise) == 41
+    assert len(series.usable) == 40
+    (change,) = series.changes
+    assert series.run_of(change.first).due == START + timedelta(days=20)
+    assert history(runs, band=(10.0, 20.0)) == []
+
+
+def huddle(*arguments: str, code: int = 0) -> str:
+    result = CliRunner().invoke(app, arguments, terminal_width=200)
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def test_the_command_says_shows_and_draws_it(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    store = RunStore(folder)
+    for day in range(24):
+        store.save(run_with(day, 0.0 if day < 12 else 3.0))
+    text = huddle("history", str(folder))
+    assert "a.x (S1), 1 to 10 Hz: +3.00 ±" in text
+    assert "dB since 2026-12-03 12:00, decided by the run of 2026-12-0" in text
+    assert "false alarm in 0.01 of all histories" in text
+    picture = tmp_path / "noise.svg"
+    found = json.loads(huddle("history", str(folder), "--json", "-", "--out", str(picture)))
+    assert found["series"][0]["changes"][0]["shift_db"] == pytest.approx(3.0)
+    assert len(found["series"][0]["runs"]) == 24
+    drawn = picture.read_text(encoding="utf-8")
+    assert "a S1, 1 to 10 Hz" in drawn
+    rows = list(csv.DictReader(io.StringIO(huddle("history", str(folder), "--csv", "-"))))
+    assert len(rows) == 24
+    assert rows[0]["serial_number"] == "S1"
+    assert float(rows[0]["psd"]) == 1e-12
+    refused = CliRunner().invoke(app, ["history", str(folder), "--band", "2:3"])
+    assert refused.exit_code == 2
+    assert "kept are 1:10" in " ".join(refused.stderr.split())

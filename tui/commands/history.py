@@ -1,0 +1,144 @@
+"""``huddle history``: the noise of each channel over months."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+from rich.table import Table
+
+from daq.results.band_summary import decibels
+from daq.results.change_test import DECIBEL, NORMAL_95
+from tui.output.console import check_places, for_people, write_json, write_text
+from tui.output.csv_text import csv_text
+from tui.output.extras import require
+from tui.service.history.series import Series, bands_of, history
+from tui.service.records.places import Place
+from tui.service.records.run_state import utc_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+PICTURES = (".png", ".svg", ".pdf")
+_COLUMNS = (
+    *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
+    *("low_hz", "high_hz", "psd", "low", "high"),
+)
+
+
+def show_history(
+    sources: Sequence[Path],
+    *,
+    band: tuple[float, float] | None,
+    scatter: float,
+    false_alarms: float,
+    json: str | None,
+    csv: str | None,
+    out: Path | None,
+) -> None:
+    """Show the noise of each channel over all runs, and where it has changed.
+
+    Raises
+    ------
+    NoServiceError, StoreError
+        If there is no database of runs, or it cannot be read.
+    typer.BadParameter
+        If there is no noise of the band.
+    """
+    check_places(json, csv, None if out is None else str(out))
+    if out is not None:
+        require("matplotlib")
+        if out.suffix.lower() not in PICTURES:
+            raise typer.BadParameter(f"{out}: expected a name that ends in {', '.join(PICTURES)}")
+    runs = [run for source in sources for run in Place.of(source).runs()]
+    found = history(runs, band=band, scatter=scatter, false_alarms=false_alarms)
+    if band is not None and not found:
+        kept = ", ".join(f"{low:g}:{high:g}" for low, high in bands_of(runs)) or "none"
+        raise typer.BadParameter(
+            f"band {band[0]:g}:{band[1]:g}: no run has its noise; kept are {kept} (Hz). [history]"
+            " bands in the bench file adds bands"
+        )
+    screen = for_people(json, csv)
+    screen.print(_table(found))
+    n_changed = 0
+    for series in found:
+        for line in change_lines(series):
+            n_changed += 1
+            screen.print(line, style="yellow")
+        left_out = len(series.noise) - len(series.usable)
+        if left_out:
+            screen.print(f"{series.name}: {left_out} runs not tested: their interval reaches zero")
+    if found:
+        screen.print(
+            f"{'No change' if not n_changed else 'Changes'} beyond uncertainty and"
+            f" {scatter:g} dB of scatter from run to run. The test gives a false alarm in"
+            f" {false_alarms:.2g} of all histories without a change, however long they become.",
+            soft_wrap=True,
+        )
+    write_json(
+        json,
+        {
+            "false_alarms": false_alarms,
+            "scatter_db": scatter,
+            "series": [series.document() for series in found],
+        },
+    )
+    if csv is not None:
+        write_text(csv, csv_text(_COLUMNS, _rows(found)))
+    if out is not None:
+        from tui.service.history.figure import write_figure  # noqa: PLC0415 - matplotlib
+
+        write_figure(found, out)
+
+
+def _table(found: Sequence[Series]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of"):
+        table.add_column(name)
+    for name in ("runs", "first (dB)", "last (dB)"):
+        table.add_column(name, justify="right")
+    table.add_column("changed")
+    for series in found:
+        last = series.last
+        table.add_row(
+            *(last.serial_number or "-", last.sensor, last.channel),
+            *(f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit, str(len(series.noise))),
+            *(level(series.noise[0].psd, *_ends(series, 0)), level(last.psd, *_ends(series, -1))),
+            f"{len(series.changes)} ×" if series.changes else "no",
+        )
+    return table
+
+
+def _ends(series: Series, position: int) -> tuple[float, float]:
+    noise = series.noise[position]
+    return noise.low, noise.high
+
+
+def level(psd: float, low: float, high: float) -> str:
+    """Return a PSD in dB with half the width of its interval."""
+    if not psd > 0:
+        return "below 0"
+    if not 0 < low <= high:
+        return f"below {decibels(high):.2f}"
+    return f"{decibels(psd):.2f} ±{(decibels(high) - decibels(low)) / 2:.2f}".replace("-", "−")
+
+
+def change_lines(series: Series) -> Iterator[str]:
+    """Yield a sentence for each change of a channel."""
+    for change in series.changes:
+        first, found = series.run_of(change.first), series.run_of(change.found)
+        shift, width = change.shift / DECIBEL, NORMAL_95 * change.deviation / DECIBEL
+        serial = f" ({series.last.serial_number})" if series.last.serial_number else ""
+        yield (
+            f"{series.name}{serial}, {series.last.low_hz:.3g} to {series.last.high_hz:.3g} Hz:"
+            f" {shift:+.2f} ±{width:.2f} dB since {first.due:%Y-%m-%d %H:%M}, decided by the run of"
+            f" {found.due:%Y-%m-%d %H:%M}"
+        )
+
+
+def _rows(found: Sequence[Series]) -> Iterator[list[object]]:
+    for series in found:
+        for run, noise in zip(series.runs, series.noise, strict=True):
+            own = {"bench": run.bench, "due": utc_text(run.due)}
+            yield [own[name] if name in own else getattr(noise, name) for name in _COLUMNS]

@@ -1,0 +1,1 @@
+"""The noise of each channel over months, and whether it has changed."""

@@ -1,0 +1,157 @@
+"""The noise of each channel from run to run, tied together by serial numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from daq.results.change_test import DECIBEL, NORMAL_95, Change, changes
+from tui.service.records.run_state import BandNoise, Run, utc_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+SCATTER = 0.1
+"""Standard deviation in dB from run to run that is no change."""
+FALSE_ALARMS = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One channel of one sensor in one band.
+
+    Attributes
+    ----------
+    noise : tuple of BandNoise
+        By time; the last says what the channel is called now.
+    runs : tuple of Run
+        The run of each.
+    changes : tuple of Change
+        By positions in `usable`.
+    usable : tuple of int
+        Positions of the noise that has an interval above zero: only these are tested.
+    """
+
+    noise: tuple[BandNoise, ...]
+    runs: tuple[Run, ...]
+    changes: tuple[Change, ...]
+    usable: tuple[int, ...]
+
+    @property
+    def last(self) -> BandNoise:
+        """The latest noise."""
+        return self.noise[-1]
+
+    @property
+    def name(self) -> str:
+        """Sensor and channel."""
+        return f"{self.last.sensor}.{self.last.channel}"
+
+    def run_of(self, position: int) -> Run:
+        """Return the run at a position in `usable`."""
+        return self.runs[self.usable[position]]
+
+    def document(self) -> dict[str, Any]:
+        """Return the series as JSON (docs/service.md)."""
+        last = self.last
+        return {
+            "sensor": last.sensor,
+            "channel": last.channel,
+            "model": last.model,
+            "serial_number": last.serial_number,
+            "unit": last.unit,
+            "method": last.method,
+            "low_hz": last.low_hz,
+            "high_hz": last.high_hz,
+            "runs": [
+                {
+                    "bench": run.bench,
+                    "due": utc_text(run.due),
+                    **{name: getattr(noise, name) for name in ("psd", "low", "high")},
+                }
+                for run, noise in zip(self.runs, self.noise, strict=True)
+            ],
+            "changes": [
+                {
+                    "since": utc_text(self.run_of(change.first).due),
+                    "found": utc_text(self.run_of(change.found).due),
+                    "shift_db": change.shift / DECIBEL,
+                    "shift_low_db": (change.shift - NORMAL_95 * change.deviation) / DECIBEL,
+                    "shift_high_db": (change.shift + NORMAL_95 * change.deviation) / DECIBEL,
+                    "before_psd": math.exp(change.before),
+                    "after_psd": math.exp(change.after),
+                }
+                for change in self.changes
+            ],
+        }
+
+
+def history(
+    runs: Iterable[Run],
+    *,
+    band: tuple[float, float] | None = None,
+    scatter: float = SCATTER,
+    false_alarms: float = FALSE_ALARMS,
+) -> list[Series]:
+    """Return the history of every channel, and where its noise has changed.
+
+    Parameters
+    ----------
+    runs : iterable of Run
+        Of any benches.
+    band : (float, float), optional
+        In Hz; all bands that were kept, if not given.
+    scatter : float
+        Standard deviation in dB from run to run that is no change.
+    false_alarms : float
+        Probability that a history without any change, of all these channels together, ever has an
+        alarm.
+    """
+    collected: dict[tuple[object, ...], list[tuple[Run, BandNoise]]] = {}
+    for run in sorted(runs, key=lambda run: run.due):
+        for noise in run.noise:
+            if band is None or _same_band(noise, band):
+                collected.setdefault(_key(run, noise), []).append((run, noise))
+    return [
+        _series(found, scatter * DECIBEL, false_alarms / len(collected))
+        for _, found in sorted(collected.items(), key=lambda item: str(item[0]))
+    ]
+
+
+def bands_of(runs: Iterable[Run]) -> list[tuple[float, float]]:
+    """Return the bands of which there is noise, in Hz."""
+    return sorted({_rounded(noise) for run in runs for noise in run.noise})
+
+
+def _key(run: Run, noise: BandNoise) -> tuple[object, ...]:
+    sensor = noise.serial_number or f"{run.bench}/{noise.sensor}"
+    return (sensor, noise.channel, noise.unit, noise.method, _rounded(noise))
+
+
+def _rounded(noise: BandNoise) -> tuple[float, float]:
+    return float(f"{noise.low_hz:.3g}"), float(f"{noise.high_hz:.3g}")
+
+
+def _same_band(noise: BandNoise, band: tuple[float, float]) -> bool:
+    return all(
+        math.isclose(own, wanted, rel_tol=0.01)
+        for own, wanted in zip((noise.low_hz, noise.high_hz), band, strict=True)
+    )
+
+
+def _series(found: Sequence[tuple[Run, BandNoise]], scatter: float, false_alarms: float) -> Series:
+    runs, noise = zip(*found, strict=True)
+    usable = tuple(n for n, each in enumerate(noise) if 0 < each.low <= each.psd <= each.high)
+    levels = [math.log(noise[n].psd) for n in usable]
+    # A standard deviation of zero would be beyond any measurement.
+    deviations = [max(1e-6, math.hypot(_deviation(noise[n]), scatter)) for n in usable]
+    return Series(
+        noise, runs, tuple(changes(levels, deviations, false_alarms=false_alarms)), usable
+    )
+
+
+def _deviation(noise: BandNoise) -> float:
+    """Return the standard deviation of the logarithm: of the wider side of the interval."""
+    wider = max(noise.high / noise.psd, noise.psd / noise.low)
+    return math.log(wider) / NORMAL_95

@@ -1,0 +1,1 @@
+"""What the service starts, and the locks by which it finds that again."""
