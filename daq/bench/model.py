@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -41,6 +42,7 @@ def _pair_to_complex(value: object) -> object:
     raise ValueError("expected a number or [real, imaginary], in rad/s")
 
 
+Day: TypeAlias = dt.date
 ComplexNumber = Annotated[complex, BeforeValidator(_pair_to_complex)]
 
 
@@ -82,6 +84,26 @@ class PolesZeros(Table):
         return value / np.abs(shape(np.array(2j * np.pi * self.frequency)))
 
 
+class Certificate(Table):
+    """Calibration of a channel by a laboratory."""
+
+    value: Number = Field(description="sensitivity in counts per unit, not zero")
+    expanded_uncertainty: PositiveNumber = Field(description="its expanded uncertainty")
+    """In counts per unit."""
+    k: PositiveNumber = 2.0
+    """Coverage factor of the expanded uncertainty."""
+    date: Day | None = None
+    number: str = ""
+    """Of the certificate."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_zero(cls, table: object) -> object:
+        if isinstance(table, Mapping) and table.get("value") == 0:
+            raise ValueError("value: expected counts per unit, not zero")
+        return table
+
+
 class Channel(Table):
     """One digitised input."""
 
@@ -90,6 +112,8 @@ class Channel(Table):
     unit: str = "m/s²"
     direction: str | None = None
     response: PolesZeros | None = None
+    certificate: Certificate | None = None
+    """A sensor with one for each channel is the reference of ``huddle calibrate``."""
     auxiliary: bool = False
     """Recorded but not part of the huddle test (temperature, …)."""
 

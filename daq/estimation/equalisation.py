@@ -193,16 +193,17 @@ class Equalisation:
             whole = found if plain is None else plain
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.abs(response) ** -2.0
-            unseen = np.concatenate([_unseen(band) for band in bands])[:, None]
-            unseen = unseen * np.maximum(whole.left, 0.0) * (self.filters is not None)
-        return EdgeLeakage(
-            left=found.left * scale,
-            whole=np.maximum(whole.left, found.left) * scale,
-            unseen=unseen * scale,
-            share=found.share,
-            whole_share=np.maximum(whole.share, found.share),
-            sources=self.sources,
-        )
+        share = np.concatenate([_unseen(band) for band in bands])[:, None]
+        unseen = share * np.maximum(whole.left, 0.0) * (self.filters is not None)
+        with np.errstate(divide="ignore", invalid="ignore"):  # responses vanish at 0 Hz
+            return EdgeLeakage(
+                left=found.left * scale,
+                whole=np.maximum(whole.left, found.left) * scale,
+                unseen=np.where(np.isfinite(scale), unseen * scale, 0.0),
+                share=found.share,
+                whole_share=np.maximum(whole.share, found.share),
+                sources=self.sources,
+            )
 
     def _leaks(self, bands: Sequence[Band], filters: ComplexArray | None = None) -> _Leaks | None:
         """Return what leaks, or would leak without the filters of this response."""

@@ -139,6 +139,7 @@ _PANELS = {
     ),
     "Recordings": (
         recordings.estimate,
+        recordings.calibrate,
         recordings.report,
         recordings.plot,
         recordings.import_,

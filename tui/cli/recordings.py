@@ -1,4 +1,4 @@
-"""``estimate``, ``report``, ``plot``, ``import``, ``simulate``, ``repair``."""
+"""``estimate``, ``calibrate``, ``report``, ``plot``, ``import``, ``simulate``, ``repair``."""
 
 # ruff: noqa: PLC0415 - what a subcommand needs is imported when it runs
 
@@ -64,6 +64,58 @@ def estimate(
         noise_parameters=noise_parameters,
         json=json,
         csv=csv,
+        **wanted,
+    )
+
+
+@examples(
+    "huddle calibrate night.h5",
+    "huddle calibrate night.h5 --reference A --band 0.5:20 --confidence 0.99 --json -",
+)
+@with_estimate_options
+def calibrate(
+    files: FilesArgument,
+    *,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            "--reference",
+            metavar="SENSOR",
+            help="Sensor to compare with (default: the one with certificates in the bench file, "
+            "otherwise the first).",
+        ),
+    ] = None,
+    confidence: Annotated[
+        float,
+        typer.Option(
+            "--confidence",
+            metavar="P",
+            help="Level of confidence of expanded uncertainties.",
+        ),
+    ] = 0.95,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Calibrate sensors against one of them by their common motion.
+
+    Sensitivity, cross-axis response, angles, delay and skew of every
+    channel, each with its uncertainty, and an uncertainty budget by the GUM.
+    Results are absolute if the bench file has a certificate for each channel
+    of the reference.
+
+    Options not given come from the bench file inside the recording.
+    """
+    from tui.commands.calibrate import calibrate_recordings
+
+    calibrate_recordings(
+        files,
+        reference=reference,
+        confidence=confidence,
+        start=start,
+        end=end,
+        json=json,
         **wanted,
     )
 

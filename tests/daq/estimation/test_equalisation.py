@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-RATE, N = 50.0, 20_000
+RATE, N = 50.0, 14_000
 NOISE = 2 * 100.0**2 / RATE  # one-sided PSD of white noise of 100 counts
 CORNER = 2 * np.pi * 4.0
 LOW_PASS = PolesZeros(
@@ -87,7 +87,7 @@ def test_what_leaks_is_predicted_and_widens_intervals(biased: Snapshot) -> None:
     seen = excess(biased, 1, 8)
     assert seen[1] > 5  # of |H'|² SNR / (3 T²)
     assert seen[1] == pytest.approx(predicted, rel=0.2)
-    # 28 frequencies of 198 averages, three channels: 1.6 % of scatter
+    # 28 frequencies of 137 averages, three channels: 2 % of scatter
     assert abs(seen[[0, 2]]).max() < 0.08
     low = biased.results["three-sensor"].low[inside, 3:6]
     assert (low < 1.2 * NOISE).all()
@@ -106,7 +106,7 @@ def test_equalised_by_measured_responses_the_noise_is_the_true_one(tmp_path: Pat
     with Estimation([path], replace(OFF, equalise="auto")) as live:
         for number, block in enumerate(arriving):
             writer.append(block)
-            if number % 600 == 599:
+            if number % 800 == 799:
                 writer.commit()
                 live.update()
         writer.close()
@@ -154,7 +154,7 @@ def test_equal_sensors_are_left_alone(tmp_path: Path) -> None:
 
 def test_segments_around_a_gap_are_left_out_as_far_as_filters_reach(tmp_path: Path) -> None:
     sensors = recorded(known=True)
-    sensors["c"].gaps = ((9_990, 10_010),)
+    sensors["c"].gaps = ((6_990, 7_010),)
     snapshot = estimate([write(tmp_path / "r.h5", sensors)], replace(OFF, equalise="known"))
     assert 2 <= snapshot.n_dropped <= 7  # 4 s, and filters of as much to either side at most
     assert abs(excess(snapshot, 1, 8, known=True)).max() < 0.08

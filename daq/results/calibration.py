@@ -1,0 +1,501 @@
+"""Calibration results: every sensor against the reference, and uncertainty budgets by the GUM."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.errors import WrongSettingError
+from daq.results.band_summary import band_of, channel_means, correlation_of, judged_method
+from daq.results.clock_effect import effect
+from estimator.diagnostics.advice import ModelMisfit
+from estimator.errors import InsufficientDataError
+from estimator.responses.calibration import calibrate_sensor, response_curve
+from estimator.responses.edge_leakage import channel_responses, slope_factor
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.bench.model import Bench, Certificate, Channel
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from estimator.responses.calibration import ResponseCurve, SensorCalibration
+    from estimator.types import ComplexArray, FloatArray
+
+CONFIDENCE = 0.95
+BANDS_PER_OCTAVE = 1
+_RECTANGULAR = math.sqrt(3.0)
+_MANY = 1e6  # degrees of freedom: those of a stated uncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """One line of a budget.
+
+    Attributes
+    ----------
+    source : str
+        "estimate", "variation", "clocks", "leakage", "quantisation", "certificate",
+        "sensitivity" or "incoherence".
+    kind : str
+        "A" (from the scatter of these data) or "B" (from elsewhere).
+    distribution : str
+        "normal" or "rectangular".
+    relative : float
+        Standard uncertainty over the value.
+    dof : float
+        Degrees of freedom.
+    """
+
+    source: str
+    kind: str
+    distribution: str
+    relative: float
+    dof: float = _MANY
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """The uncertainty of one value of one channel in one band.
+
+    Attributes
+    ----------
+    sensor, channel : str
+    quantity : str
+        "sensitivity" (in counts per unit, if absolute; else relative to that of the bench file) or
+        "noise" (PSD).
+    low, high : float
+        Band, Hz.
+    value : float
+    components : tuple of Component
+    confidence : float
+    is_absolute : bool
+        Whether the value rests on a certificate.
+    """
+
+    sensor: str
+    channel: str
+    quantity: str
+    low: float
+    high: float
+    value: float
+    components: tuple[Component, ...]
+    confidence: float
+    is_absolute: bool = False
+
+    @property
+    def combined(self) -> float:
+        """Combined standard uncertainty, as a fraction of the value."""
+        return math.sqrt(sum(each.relative**2 for each in self.components))
+
+    @property
+    def dof(self) -> float:
+        """Effective degrees of freedom (Welch and Satterthwaite)."""
+        total = sum(each.relative**4 / each.dof for each in self.components)
+        return self.combined**4 / total if total > 0 else _MANY
+
+    @property
+    def k(self) -> float:
+        """Coverage factor of the confidence level."""
+        return student_quantile(0.5 + self.confidence / 2, self.dof)
+
+    @property
+    def expanded(self) -> float:
+        """Expanded uncertainty, in the unit of the value."""
+        return abs(self.value) * self.k * self.combined
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Sensors calibrated against one of them.
+
+    Attributes
+    ----------
+    reference : int
+        From 0.
+    certificates : tuple of Certificate
+        Of its channels; empty where it has none, and all is relative to it.
+    sensors : tuple of SensorCalibration
+        Over the whole band.
+    curves : tuple of ResponseCurve
+        The same, in thirds of an octave.
+    budgets : tuple of Budget
+        Of the sensitivities in the whole band and in octaves, and of the noise in the whole band.
+    confidence : float
+    refused : mapping of int to str
+        Why a sensor is not calibrated.
+    """
+
+    reference: int
+    certificates: tuple[Certificate, ...]
+    sensors: tuple[SensorCalibration, ...]
+    curves: tuple[ResponseCurve, ...]
+    budgets: tuple[Budget, ...]
+    confidence: float
+    refused: dict[int, str] = field(default_factory=dict)
+
+    def whole_band(self, quantity: str) -> tuple[Budget, ...]:
+        """Return the budgets of a quantity in the widest band."""
+        found = [each for each in self.budgets if each.quantity == quantity]
+        widest = {(each.sensor, each.channel): each for each in reversed(found)}
+        return tuple(each for each in found if widest[each.sensor, each.channel] is each)
+
+
+def student_quantile(probability: float, dof: float) -> float:
+    """Return a quantile of Student's distribution, by its expansion about the normal one.
+
+    To 0.2 % from 5 degrees of freedom on (Abramowitz and Stegun 26.7.5).
+    """
+    z, v = NormalDist().inv_cdf(probability), max(dof, 2.0)
+    terms = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+    )
+    return sum(term / v**power for power, term in enumerate(terms))
+
+
+def calibrate(
+    snapshot: Snapshot,
+    settings: Settings,
+    bench: Bench | None,
+    *,
+    reference: str | None = None,
+    confidence: float = CONFIDENCE,
+) -> Calibration:
+    """Calibrate all sensors against one.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A finished estimate.
+    settings : Settings
+    bench : Bench or None
+        With the certificates of the reference, if it has any.
+    reference : str, optional
+        Name of the sensor; by default the first with certificates, or else the first of all.
+    confidence : float
+        Level of the expanded uncertainties.
+
+    Raises
+    ------
+    WrongSettingError
+        If the reference is unknown, or the level not between 0 and 1.
+    InsufficientDataError
+        If no sensor can be compared with the reference.
+    """
+    if not 0 < confidence < 1:
+        raise WrongSettingError(f"confidence {confidence:g}: expected a fraction such as 0.95")
+    names = snapshot.sensor_names
+    certified = [_certificates(snapshot, bench, name) for name in names]
+    if reference is not None and reference not in names:
+        raise WrongSettingError(f"reference {reference!r}: expected one of {', '.join(names)}")
+    chosen = next((n for n, each in enumerate(certified) if each), 0)
+    chosen = chosen if reference is None else names.index(reference)
+    certificates = certified[chosen]
+    work = _Work(
+        snapshot,
+        settings,
+        bench,
+        reference=chosen,
+        certificates=certificates,
+        confidence=confidence,
+    )
+    sensors: list[SensorCalibration] = []
+    curves: list[ResponseCurve] = []
+    budgets: list[Budget] = []
+    refused: dict[int, str] = {}
+    for sensor in range(len(names)):
+        if sensor == chosen:
+            continue
+        try:
+            sensors.append(work.sensor(sensor, work.band))
+            curves.append(work.curve(sensor))
+        except InsufficientDataError as error:
+            refused[sensor] = str(error)
+            continue
+        budgets += work.sensitivities(sensors[-1])
+        for low, high in work.octaves():
+            try:
+                budgets += work.sensitivities(work.sensor(sensor, (low, high)))
+            except InsufficientDataError:  # not coherent there
+                continue
+    if not sensors:
+        raise InsufficientDataError(
+            f"no sensor can be compared with {names[chosen]}: " + "; ".join(refused.values())
+        )
+    budgets += work.noise(budgets)
+    return Calibration(
+        reference=chosen,
+        certificates=certificates,
+        sensors=tuple(sensors),
+        curves=tuple(curves),
+        budgets=tuple(budgets),
+        confidence=confidence,
+        refused=refused,
+    )
+
+
+def _certificates(snapshot: Snapshot, bench: Bench | None, name: str) -> tuple[Certificate, ...]:
+    """Return the certificates of a sensor, in the order of its channels; empty if one has none."""
+    channels = [
+        _channel(bench, name, each.channel) for each in snapshot.channels if each.sensor == name
+    ]
+    found = tuple(
+        each.certificate for each in channels if each is not None and each.certificate is not None
+    )
+    return found if len(found) == len(channels) else ()
+
+
+def _channel(bench: Bench | None, sensor: str, channel: str) -> Channel | None:
+    return next(
+        (
+            found
+            for each in (() if bench is None else bench.sensors)
+            if each.name == sensor
+            for found in each.channels
+            if found.name == channel
+        ),
+        None,
+    )
+
+
+class _Work:
+    """What all sensors are calibrated with."""
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        settings: Settings,
+        bench: Bench | None,
+        *,
+        reference: int,
+        certificates: Sequence[Certificate],
+        confidence: float,
+    ) -> None:
+        self.snapshot, self._settings, self._bench = snapshot, settings, bench
+        self._reference, self._confidence = reference, confidence
+        self._certificates = certificates
+        self.band = band_of(settings, snapshot)
+        self._correlation = correlation_of(settings)
+        self._first = np.cumsum([0, *snapshot.dims])
+        scale = np.ones(len(snapshot.channels))
+        self._from_certificate = 0.0
+        for number, certificate in enumerate(certificates):
+            column = int(self._first[reference]) + number
+            label = snapshot.channels[column]
+            channel = _channel(bench, label.sensor, label.channel)
+            if channel is not None:  # motion by the certificate, not by the bench file
+                scale[column] = channel.sensitivity / certificate.value
+            # conservative: as if the certificates of all its channels erred together
+            relative = certificate.expanded_uncertainty / certificate.k / abs(certificate.value)
+            self._from_certificate = max(self._from_certificate, relative)
+        self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
+        n = snapshot.n_effective
+        self._averages = min([n, *(octave.n_effective for octave in snapshot.octaves)])
+        self._bending = self._curvature()
+
+    def sensor(self, sensor: int, band: tuple[float, float]) -> SensorCalibration:
+        return calibrate_sensor(
+            self._csm,
+            self.snapshot.frequency,
+            dims=self.snapshot.dims,
+            sensor=sensor,
+            reference=self._reference,
+            n_effective=self._averages,
+            band=band,
+            correlation=self._correlation,
+        )
+
+    def curve(self, sensor: int) -> ResponseCurve:
+        return response_curve(
+            self._csm,
+            self.snapshot.frequency,
+            self._edges(3),
+            dims=self.snapshot.dims,
+            sensor=sensor,
+            reference=self._reference,
+            n_effective=self._averages,
+            correlation=self._correlation,
+        )
+
+    def octaves(self) -> list[tuple[float, float]]:
+        edges = self._edges(BANDS_PER_OCTAVE)
+        return (
+            list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+            if len(edges) > 2
+            else []
+        )
+
+    def _edges(self, per_octave: int) -> FloatArray:
+        low, high = self.band
+        count = max(1, round(per_octave * math.log2(high / low)))
+        return np.asarray(np.geomspace(low, high * (1 + 1e-9), count + 1))
+
+    def _curvature(self) -> ComplexArray:
+        """Return how a window's width changes relative responses, shape as their ratios.
+
+        ``factor D'' / (2 D)``: what averages over the width of a line differ by from its middle.
+        """
+        f = self.snapshot.frequency
+        window = get_window(self._settings.window, 512)
+        factor = slope_factor(window, 512 / self._settings.segment)
+        ratio = channel_responses(self._csm, f, dims=self.snapshot.dims).ratio
+        bending = np.full(ratio.shape, np.nan, dtype=np.complex128)
+        width = np.gradient(f)[1:-1, None, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            second = (ratio[2:] - 2 * ratio[1:-1] + ratio[:-2]) / width**2
+            bending[1:-1] = factor / 2 * second / ratio[1:-1]
+        return bending
+
+    def sensitivities(self, found: SensorCalibration) -> list[Budget]:
+        """Return a budget for each channel of a sensor."""
+        labels, f = self.snapshot.channels, self.snapshot.frequency
+        inside = (f >= found.low) & (f <= found.high)
+        omega_squared = float(np.mean((2 * np.pi * f[inside]) ** 2))
+        residual = self.snapshot.diagnostics.synchronisation.residual
+        names = self.snapshot.sensor_names
+        jitter = math.hypot(
+            *(_known(residual.get(names[each], 0.0)) for each in (found.sensor, found.reference))
+        )
+        budgets = []
+        for number in range(self.snapshot.dims[found.sensor]):
+            column = int(self._first[found.sensor]) + number
+            label = labels[column]
+            channel = _channel(self._bench, label.sensor, label.channel)
+            gain = float(found.gain.value[number])
+            scatter = float(found.gain.error[number]) / gain
+            bent = self._bending[inside, column, found.reference]
+            bent = bent[np.isfinite(bent)]
+            components = [
+                Component("estimate", "A", "normal", scatter, found.dof),
+                Component(
+                    "variation",
+                    "A",
+                    "normal",
+                    scatter * math.sqrt(max(found.excess**2 - 1, 0.0)),
+                    float(max(found.n_frequencies - 1, 1)),
+                ),
+                Component(
+                    "clocks", "B", "rectangular", omega_squared * jitter**2 / 2 / _RECTANGULAR
+                ),
+                Component(
+                    "leakage",
+                    "B",
+                    "rectangular",
+                    float(abs(np.mean(bent.real))) / _RECTANGULAR if bent.size else 0.0,
+                ),
+                Component("quantisation", "B", "rectangular", self._counting(column, inside)),
+            ]
+            absolute = bool(self._certificates) and channel is not None
+            if self._certificates:
+                components.append(Component("certificate", "B", "normal", self._from_certificate))
+            budgets.append(
+                Budget(
+                    sensor=label.sensor,
+                    channel=label.channel,
+                    quantity="sensitivity",
+                    low=found.low,
+                    high=found.high,
+                    value=gain * (channel.sensitivity if absolute and channel else 1.0),
+                    components=tuple(components),
+                    confidence=self._confidence,
+                    is_absolute=absolute,
+                )
+            )
+        return budgets
+
+    def _counting(self, column: int, inside: np.ndarray) -> float:
+        """Return the relative uncertainty of a gain by the noise of whole counts."""
+        psd = self.snapshot.quantisation_psd
+        if psd is None:
+            return 0.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = psd[inside, column] / self.snapshot.data_psd[inside, column]
+        share = share[np.isfinite(share)]
+        if not share.size:
+            return 0.0
+        return float(np.sqrt(share.mean() / (2 * max(self._averages, 1.0) * share.size)))
+
+    def noise(self, sensitivities: Sequence[Budget]) -> list[Budget]:
+        """Return a budget for the noise of each channel over the whole band."""
+        snapshot = self.snapshot
+        method = judged_method(snapshot, self._settings)
+        found = snapshot.results.get(method)
+        if found is None:
+            return []
+        low, high = self.band
+        inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+        gains: dict[tuple[str, str], float] = {}
+        for each in reversed(sensitivities):
+            gains[each.sensor, each.channel] = each.combined
+        misfit = max(
+            (
+                each.error
+                for each in snapshot.diagnostics.advice
+                if isinstance(each, ModelMisfit)
+                and (each.band is None or (each.band[0] <= high and each.band[1] >= low))
+            ),
+            default=0.0,
+        )
+        clocks = effect(snapshot, self._settings)
+        edges = snapshot.diagnostics.edge_leakage
+        budgets = []
+        for column, (label, mean) in enumerate(
+            zip(
+                snapshot.channels,
+                channel_means(found, snapshot, self._settings, self.band),
+                strict=True,
+            )
+        ):
+            value = float(mean.mean[0])
+            if not value > 0:
+                continue
+            leaks = 0.0 if edges is None else float(np.mean(edges.most[inside, column])) / value
+            counting = 0.0
+            if snapshot.quantisation_psd is not None:
+                psd = snapshot.quantisation_psd[inside, column]
+                counting = _known(float(np.mean(psd))) / value
+            own = gains.get((label.sensor, label.channel), self._from_certificate)
+            budgets.append(
+                Budget(
+                    sensor=label.sensor,
+                    channel=label.channel,
+                    quantity="noise",
+                    low=low,
+                    high=high,
+                    value=value,
+                    components=(
+                        Component(
+                            "estimate",
+                            "A",
+                            "normal",
+                            float(mean.spread[0]) / value,
+                            2 * max(self._averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
+                        ),
+                        Component("sensitivity", "B", "normal", 2 * own),
+                        Component(
+                            "clocks",
+                            "B",
+                            "rectangular",
+                            _known(float(clocks[column])) / _RECTANGULAR,
+                        ),
+                        Component("leakage", "B", "rectangular", leaks / _RECTANGULAR),
+                        Component("incoherence", "B", "rectangular", misfit / _RECTANGULAR),
+                        Component("quantisation", "B", "rectangular", counting / _RECTANGULAR),
+                    ),
+                    confidence=self._confidence,
+                    is_absolute=bool(self._certificates),
+                )
+            )
+        return budgets
+
+
+def _known(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

@@ -1,0 +1,386 @@
+"""Relative calibration of sensors by their common motion, with the covariance of every number.
+
+Theory of operation
+-------------------
+``G = S_jk S_rk^-1`` is the response of sensor j relative to the reference r at each frequency, with
+all other sensors k as instruments: the noise of none of the sensors biases it. Its error has the
+covariance ``Sigma (x) P^-1 / n``, with Sigma the cross-spectra of ``x_j - G x_r`` and
+``P = S_rk S_kk^-1 S_kr`` the motion in the reference as the others tell it. Over a band G is taken
+as a constant real matrix M with one delay for each channel. Gains, angles and cross-axis
+sensitivities follow from M, and their errors from its covariance. Scatter over the frequencies of
+the band beyond these errors is kept apart: the response varies, or not all motion is common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.diagnostics.relative_response import own_channels, relative_response
+from estimator.errors import InsufficientDataError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from estimator.types import BoolArray, ComplexArray, FloatArray
+
+_STEPS = 3  # of delays and matrix in turn
+_STEP = 1e-6  # of numerical derivatives, relative to the largest element
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Value:
+    """Numbers with their standard errors.
+
+    Attributes
+    ----------
+    value, error : float64, of one shape
+    """
+
+    value: FloatArray
+    error: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorCalibration:
+    """One sensor as seen by the reference, over a band.
+
+    Attributes
+    ----------
+    sensor, reference : int
+        From 0.
+    low, high : float
+        Band, Hz.
+    matrix : Value, shape (d, d)
+        Channels of the sensor in terms of those of the reference, without delay.
+    gain : Value, shape (d,)
+        Length of its rows: relative sensitivity.
+    cross_axis : Value, shape (d, d)
+        Rows over their elements on the diagonal: 1 there.
+    rotation_deg : Value, shape (3,) or (1,)
+        Rotation vector of a triaxial sensor, about its three axes; of two channels the angle from
+        the first channel of the reference towards the second. Empty for one channel.
+    angle_deg : Value, shape (d,)
+        Between each channel and that of the reference; not below 0.
+    orthogonality_deg : Value, shape (d (d - 1) / 2,)
+        Angle between channels 12, 13, 23, less 90°.
+    delay : Value, shape (d,)
+        Seconds by which each channel lags the reference.
+    skew : Value, shape (d,)
+        Delay of each channel less that of the first.
+    excess : float
+        Scatter over frequencies, over what errors explain: 1 if the model holds.
+    dof : float
+        Degrees of freedom of the errors.
+    n_frequencies : int
+    """
+
+    sensor: int
+    reference: int
+    low: float
+    high: float
+    matrix: Value
+    gain: Value
+    cross_axis: Value
+    rotation_deg: Value
+    angle_deg: Value
+    orthogonality_deg: Value
+    delay: Value
+    skew: Value
+    excess: float
+    dof: float
+    n_frequencies: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResponseCurve:
+    """One sensor as seen by the reference, as a function of frequency.
+
+    Attributes
+    ----------
+    sensor, reference : int
+    frequency : float64, shape (n_bands,)
+        Mean frequency of each band, Hz.
+    matrix : complex128, shape (n_bands, d, d)
+        Channels of the sensor in terms of those of the reference; NaN where it is not known.
+    error : float64, shape (n_bands, d, d)
+        Standard error of the real, and of the imaginary part.
+    """
+
+    sensor: int
+    reference: int
+    frequency: FloatArray
+    matrix: ComplexArray
+    error: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Relative response at each usable frequency."""
+
+    frequency: FloatArray
+    response: ComplexArray
+    weight: ComplexArray
+    """``n P / s``: inverse of the covariance of a row of mean noise s; (n_freqs, d, d)."""
+    noise: ComplexArray
+    """Sigma / s, (n_freqs, d, d)."""
+    delay: float
+
+
+def _pair(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    sensor: int,
+    reference: int,
+    n_effective: float,
+    band: tuple[float, float],
+) -> _Pair:
+    start = relative_response(csm, frequency, dims=dims, first=reference, second=sensor, band=band)
+    inside = (frequency >= start.low) & (frequency <= start.high) & (frequency > 0)
+    inside &= np.isfinite(csm).all(axis=(1, 2))
+    own = [np.array(own_channels(dims, each)) for each in (sensor, reference)]
+    rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
+    part, f = csm[inside], frequency[inside]
+    S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
+    S_kk = part[:, rest[:, None], rest]
+    by = np.linalg.solve(S_kk, S_rk.conj().swapaxes(1, 2))  # S_kk^-1 S_kr
+    power = S_rk @ by
+    power = (power + power.conj().swapaxes(1, 2)) / 2
+    response = np.linalg.solve(power.swapaxes(1, 2), (S_jk @ by).swapaxes(1, 2)).swapaxes(1, 2)
+    d = len(own[0])
+    rows = np.zeros((len(f), d, csm.shape[1]), dtype=np.complex128)
+    rows[:, np.arange(d), own[0]] = 1.0
+    rows[:, :, own[1]] = -response
+    sigma = rows @ part @ rows.conj().swapaxes(1, 2)
+    level = np.einsum("fcc->f", sigma).real / d
+    usable = (level > 0) & np.isfinite(response).all(axis=(1, 2))
+    if usable.sum() < 4:
+        raise InsufficientDataError(
+            f"sensors {reference} and {sensor}: {usable.sum()} frequencies from {band[0]:g} to "
+            f"{band[1]:g} Hz at which they can be compared; expected 4 or more"
+        )
+    scale = level[usable, None, None]
+    return _Pair(
+        f[usable],
+        response[usable],
+        n_effective * power[usable] / scale,
+        sigma[usable] / scale,
+        start.delay,
+    )
+
+
+def calibrate_sensor(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    sensor: int,
+    reference: int,
+    n_effective: float,
+    band: tuple[float, float],
+    correlation: FloatArray,
+) -> SensorCalibration:
+    """Calibrate one sensor against another over a band.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor; three sensors or more.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    dims : tuple of int
+    sensor, reference : int
+        From 0, with as many channels.
+    n_effective : float
+        Independent averages.
+    band : (float, float)
+        Hz.
+    correlation : float64, shape (n_lags,)
+        Of neighbouring frequencies, as of `estimator.self_noise.band_means.bin_correlation`.
+
+    Raises
+    ------
+    InsufficientDataError
+        As of `estimator.diagnostics.relative_response.relative_response`.
+    """
+    pair = _pair(
+        csm,
+        frequency,
+        dims=dims,
+        sensor=sensor,
+        reference=reference,
+        n_effective=n_effective,
+        band=band,
+    )
+    f, d = pair.frequency, pair.response.shape[1]
+    inflation = 1 + 2 * float(np.sum(correlation[1 : len(f)]))
+    omega = 2 * np.pi * f
+    delay = np.full(d, pair.delay)
+    matrix = np.zeros((d, d))
+    information = pair.weight.sum(axis=0).real
+    for _ in range(_STEPS):
+        aligned = pair.response * np.exp(1j * omega[:, None] * delay)[:, :, None]
+        total = np.einsum("fca,fab->cb", aligned, pair.weight).real
+        matrix = np.linalg.solve(information.T, total.T).T
+        met = np.einsum("fca,fab,cb->fc", aligned, pair.weight, matrix).imag
+        energy = np.einsum("ca,fab,cb->fc", matrix, pair.weight, matrix).real
+        delay = delay - (omega @ met) / (omega**2 @ energy)
+    residual = aligned - matrix
+    own = np.einsum("fcc->fc", pair.noise).real
+    square = np.einsum("fca,fab,fcb->fc", residual, pair.weight, residual.conj()).real / own
+    excess = float(np.sqrt(max(np.mean(square) / d, 0.0)))
+    inverse = np.linalg.inv(information)
+    middle = np.einsum("fcg,fab->cagb", pair.noise, pair.weight)
+    covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
+    covariance = covariance * inflation / 2
+    delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
+    covariance = covariance.reshape(d * d, d * d)
+
+    def derived(function: Callable[[FloatArray], FloatArray]) -> Value:
+        return _propagated(function, matrix, covariance)
+
+    to_first = np.eye(d)
+    to_first[:, 0] -= 1.0
+    return SensorCalibration(
+        sensor=sensor,
+        reference=reference,
+        low=float(f[0]),
+        high=float(f[-1]),
+        matrix=Value(matrix, np.sqrt(np.diag(covariance)).reshape(d, d)),
+        gain=derived(lambda m: np.linalg.norm(m, axis=1)),
+        cross_axis=derived(lambda m: m / np.diag(m)[:, None]),
+        rotation_deg=derived(_rotation_vector),
+        angle_deg=derived(_axis_angles),
+        orthogonality_deg=derived(_orthogonality),
+        delay=Value(delay, np.sqrt(np.diag(delay_cov))),
+        skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
+        excess=excess,
+        dof=2 * max(n_effective - d, 1.0) * len(f) / inflation,
+        n_frequencies=len(f),
+    )
+
+
+def _delay_covariance(pair: _Pair, matrix: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the covariance of delays, shape (d, d), but for half the correlation of bins."""
+    crossed = np.einsum("ca,fab,gb->fcg", matrix, pair.weight, matrix)
+    energy = omega**2 @ np.einsum("fcc->fc", crossed).real
+    total = np.einsum("f,fcg,fcg->cg", omega**2, pair.noise, crossed).real
+    return np.asarray(total / energy[:, None] / energy[None, :])
+
+
+def _propagated(
+    function: Callable[[FloatArray], FloatArray], matrix: FloatArray, covariance: FloatArray
+) -> Value:
+    """Return a function of the matrix with its standard error, to first order."""
+    value = np.asarray(function(matrix), dtype=np.float64)
+    step = _STEP * float(np.abs(matrix).max())
+    slopes = np.empty((value.size, matrix.size))
+    for column in range(matrix.size):
+        shift = np.zeros(matrix.size)
+        shift[column] = step
+        moved = shift.reshape(matrix.shape)
+        slopes[:, column] = np.ravel(function(matrix + moved) - function(matrix - moved)) / 2 / step
+    variance = np.einsum("vi,ij,vj->v", slopes, covariance, slopes)
+    return Value(value, np.sqrt(np.maximum(variance, 0.0)).reshape(value.shape))
+
+
+def _directions(matrix: FloatArray) -> FloatArray:
+    return np.asarray(matrix / np.linalg.norm(matrix, axis=1)[:, None])
+
+
+def _rotation_vector(matrix: FloatArray) -> FloatArray:
+    """Return the rotation from the reference to the sensor about each axis, degrees.
+
+    Of the orthogonal matrix nearest to the directions of the channels. It is not a rotation where
+    the polarity of a channel is reversed: NaN.
+    """
+    d = len(matrix)
+    if d == 1:
+        return np.empty(0)
+    u, _, v = np.linalg.svd(_directions(matrix))
+    nearest = u @ v
+    if np.linalg.det(nearest) < 0:
+        return np.full(3 if d > 2 else 1, np.nan)
+    if d == 2:
+        return np.asarray(np.rad2deg([np.arctan2(nearest[0, 1], nearest[0, 0])]))
+    axis = np.array(
+        [
+            nearest[1, 2] - nearest[2, 1],
+            nearest[2, 0] - nearest[0, 2],
+            nearest[0, 1] - nearest[1, 0],
+        ]
+    )
+    sine = float(np.linalg.norm(axis)) / 2
+    angle = float(np.arctan2(sine, (np.trace(nearest) - 1) / 2))
+    return np.asarray(np.rad2deg(axis / 2 * (angle / sine if sine > 0 else 1.0)))
+
+
+def _axis_angles(matrix: FloatArray) -> FloatArray:
+    """Return the angle between each channel and that of the reference, degrees."""
+    across = matrix - np.diag(np.diag(matrix))
+    return np.asarray(np.rad2deg(np.arctan2(np.linalg.norm(across, axis=1), np.diag(matrix))))
+
+
+def _orthogonality(matrix: FloatArray) -> FloatArray:
+    directions = _directions(matrix)
+    pairs = np.triu_indices(len(matrix), 1)
+    cosine = np.einsum("ia,ia->i", directions[pairs[0]], directions[pairs[1]])
+    return np.asarray(-np.rad2deg(np.arcsin(np.clip(cosine, -1.0, 1.0))))
+
+
+def response_curve(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    edges: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    sensor: int,
+    reference: int,
+    n_effective: float,
+    correlation: FloatArray,
+) -> ResponseCurve:
+    """Return the relative response in narrow bands.
+
+    Parameters
+    ----------
+    csm, frequency, dims, sensor, reference, n_effective, correlation
+        As `calibrate_sensor` takes them.
+    edges : float64, shape (n_bands + 1,)
+        Hz, rising.
+    """
+    pair = _pair(
+        csm,
+        frequency,
+        dims=dims,
+        sensor=sensor,
+        reference=reference,
+        n_effective=n_effective,
+        band=(float(edges[0]), float(edges[-1])),
+    )
+    d, n_bands = pair.response.shape[1], len(edges) - 1
+    matrix = np.full((n_bands, d, d), np.nan, dtype=np.complex128)
+    error = np.full((n_bands, d, d), np.nan)
+    number = np.searchsorted(edges, pair.frequency, side="right") - 1
+    centre = np.sqrt(edges[1:] * edges[:-1])
+    for band in range(n_bands):
+        inside: BoolArray = number == band
+        if not inside.any():
+            continue
+        weight = pair.weight[inside]
+        information = weight.sum(axis=0)
+        total = np.einsum("fca,fab->cb", pair.response[inside], weight)
+        matrix[band] = np.linalg.solve(information.T, total.T).T
+        inverse = np.linalg.inv(information)
+        own = np.einsum("fcc->fc", pair.noise[inside]).real
+        middle = np.einsum("fc,fab->cab", own, weight)
+        variance = np.einsum("ia,cab,bi->ci", inverse, middle, inverse).real
+        n_lags = int(inside.sum())
+        inflation = 1 + 2 * float(np.sum(correlation[1:n_lags]))
+        error[band] = np.sqrt(np.maximum(variance, 0.0) * inflation / 2)
+        centre[band] = float(pair.frequency[inside].mean())
+    return ResponseCurve(sensor, reference, centre, matrix, error)

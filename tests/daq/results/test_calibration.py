@@ -1,0 +1,179 @@
+"""Budgets by the GUM, and calibration of a whole recording by the command."""
+
+from __future__ import annotations
+
+import json
+from datetime import date
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.bench.model import Bench, Certificate, Channel
+from daq.bench.model import Sensor as BenchSensor
+from daq.errors import WrongSettingError
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.results.calibration import Budget, Component, calibrate, student_quantile
+from tests.daq.alignment.recordings import Sensor, write
+from tui.cli.main import app
+from tui.output.calibration import with_error
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+
+GAINS = {"a": 1.0, "b": 1.03, "c": 0.98}
+SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(8)
+    motion = 1e4 * rng.standard_normal((10_000, 3))
+    sensors = {
+        name: Sensor(
+            np.round(gain * motion + 100 * rng.standard_normal((10_000, 3))).astype(np.int32),
+            rate=50.0,
+            clock="one",
+        )
+        for name, gain in GAINS.items()
+    }
+    return write(tmp_path_factory.mktemp("calibration") / "r.h5", sensors)
+
+
+@pytest.fixture(scope="module")
+def snapshot(recording: Path) -> Snapshot:
+    return estimate([recording], SETTINGS)
+
+
+def bench(value: float, expanded: float) -> Bench:
+    """Return a bench whose sensor b has certificates."""
+    return Bench(
+        name="laboratory",
+        sampling_rate=50.0,
+        sensors=tuple(
+            BenchSensor(
+                name=name,
+                driver="text",
+                port=name,
+                sampling_rate=50.0,
+                channels=tuple(
+                    Channel(
+                        name=f"c{number}",
+                        sensitivity=1.0,
+                        certificate=Certificate(
+                            value=value, expanded_uncertainty=expanded, date=date(2026, 5, 1)
+                        )
+                        if name == "b"
+                        else None,
+                    )
+                    for number in range(3)
+                ),
+            )
+            for name in GAINS
+        ),
+    )
+
+
+def test_relative_sensitivities_with_their_budget(snapshot: Snapshot) -> None:
+    found = calibrate(snapshot, SETTINGS, None)
+    assert found.reference == 0
+    budgets = found.whole_band("sensitivity")
+    assert len(budgets) == 6
+    for each in budgets:
+        assert abs(each.value - GAINS[each.sensor]) < 2 * each.expanded
+        assert each.expanded < 1e-3
+        assert each.components[0].kind == "A"
+        assert not each.is_absolute
+    octaves = {(each.low, each.high) for each in found.budgets if each.quantity == "sensitivity"}
+    assert len(octaves) > 3
+    noise = found.whole_band("noise")
+    assert len(noise) == 9
+    for each in noise:  # white noise of 100 counts and of rounding, at 50 Hz
+        assert abs(each.value - 2 * 100.0**2 / 50) < 2 * each.expanded
+
+
+def test_a_certificate_makes_results_absolute(snapshot: Snapshot) -> None:
+    found = calibrate(snapshot, SETTINGS, bench(1.03, 0.0206))
+    assert found.reference == 1
+    budgets = {(each.sensor, each.channel): each for each in found.whole_band("sensitivity")}
+    each = budgets["a", "c0"]
+    assert each.is_absolute
+    assert each.value == pytest.approx(1.0, abs=2e-3)
+    (certificate,) = (part for part in each.components if part.source == "certificate")
+    assert certificate.relative == pytest.approx(0.01)
+    assert each.combined == pytest.approx(0.01, rel=0.01)
+    assert each.expanded == pytest.approx(0.0196, rel=0.01)
+
+
+def test_a_higher_level_of_confidence_widens_what_is_stated(snapshot: Snapshot) -> None:
+    usual, cautious = (
+        calibrate(snapshot, SETTINGS, None, confidence=level).budgets[0] for level in (0.95, 0.99)
+    )
+    assert cautious.k / usual.k == pytest.approx(2.576 / 1.960, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"reference": "d"}, "expected one of a, b, c"),
+        ({"confidence": 1.0}, "expected a fraction such as 0.95"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    snapshot: Snapshot, options: dict[str, object], expected: str
+) -> None:
+    with pytest.raises(WrongSettingError, match=expected):
+        calibrate(snapshot, SETTINGS, None, **options)  # type: ignore[arg-type]
+
+
+def test_a_budget_adds_squares_and_weighs_degrees_of_freedom() -> None:
+    # GUM, G.4: 3 % with 4 degrees of freedom, 4 % certain
+    parts = (
+        Component("estimate", "A", "normal", 0.03, 4.0),
+        Component("certificate", "B", "normal", 0.04),
+    )
+    budget = Budget("a", "x", "sensitivity", 1.0, 2.0, 200.0, parts, 0.95)
+    assert budget.combined == pytest.approx(0.05)
+    assert budget.dof == pytest.approx(0.05**4 / (0.03**4 / 4), rel=1e-3)
+    assert budget.k == pytest.approx(2.042, abs=0.005)  # of 30.9 degrees: tables
+    assert budget.expanded == pytest.approx(200 * 0.05 * budget.k)
+
+
+@pytest.mark.parametrize(("dof", "expected"), [(5, 2.571), (10, 2.228), (30, 2.042), (1e9, 1.960)])
+def test_coverage_factors_are_those_of_the_tables(dof: float, expected: float) -> None:
+    assert student_quantile(0.975, dof) == pytest.approx(expected, rel=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("value", "expanded", "text"),
+    [
+        (1.00786, 0.00043, "1.00786 ± 0.00043"),
+        (-3.4e-4, 0.012, "−0.000 ± 0.012"),
+        (123456.0, 789.0, "123460 ± 790"),
+        (float("nan"), 1.0, "?"),
+    ],
+)
+def test_values_are_rounded_to_their_uncertainty(value: float, expanded: float, text: str) -> None:
+    assert with_error(value, expanded) == text
+
+
+def test_the_command_says_it_all(recording: Path) -> None:
+    result = CliRunner().invoke(
+        app, ["calibrate", str(recording), "--segment", "2s", "--band", "1:20", "--json", "-"]
+    )
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["reference"] == "a"
+    assert [each["sensor"] for each in found["sensors"]] == ["b", "c"]
+    gain = found["sensors"][0]["gain"]
+    assert gain["value"] == pytest.approx([1.03] * 3, abs=5 * max(gain["standard_error"]))
+    assert {part["source"] for part in found["budgets"][0]["components"]} >= {"estimate", "clocks"}
+    shown = CliRunner().invoke(
+        app, ["calibrate", str(recording), "--segment", "2s", "--band", "1:20"]
+    )
+    assert "Calibration against a (relative to it)" in shown.stdout
+    assert "Budget of the noise PSD" in shown.stdout

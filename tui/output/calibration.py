@@ -1,0 +1,307 @@
+"""Calibration results as tables, remarks and JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.results.band_summary import decibels
+from daq.results.calibration import student_quantile
+from tui.output.formatting import signed, span
+from tui.output.json_values import plain
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.calibration import Budget, Calibration, Component
+    from estimator.responses.calibration import SensorCalibration, Value
+
+Rows = tuple[tuple[str, ...], ...]
+_VARIES = 1.5
+"""Scatter over frequencies, over what errors explain, from which on a remark says so."""
+LEGEND = (
+    "Relative standard uncertainties; A: from the scatter of these data, B: from elsewhere. "
+    "estimate: finite averages. variation: scatter over the frequencies beyond that, by "
+    "incoherence or by responses that vary. clocks: what is left between them. leakage: width and "
+    "edges of segments. quantisation: whole counts. certificate: of the reference. sensitivity: "
+    "twice that of the channel. incoherence: what the model test leaves."
+)
+
+
+def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
+    """Return a number with its expanded uncertainty, both to the same place."""
+    if not math.isfinite(value):
+        return "?"
+    if not math.isfinite(expanded) or expanded <= 0:
+        return signed(value, ".6g")
+    place = max(0, digits - 1 - math.floor(math.log10(expanded)))
+    step = 10.0 ** (digits - 1 - math.floor(math.log10(expanded)))
+    if place == 0:  # integers, rounded to the digits that mean something
+        value, expanded = round(value * step) / step, math.ceil(expanded * step) / step
+    return f"{signed(value, f'.{place}f')} ± {expanded:.{place}f}"
+
+
+def share(relative: float) -> str:
+    """Return a relative uncertainty in per cent."""
+    return f"{100 * relative:.2g} %" if relative > 0 else "0"
+
+
+def title(found: Calibration, snapshot: Snapshot) -> str:
+    """Return what was calibrated against what."""
+    name = snapshot.sensor_names[found.reference]
+    first = found.sensors[0]
+    basis = "absolute, by its certificate" if found.certificates else "relative to it"
+    return f"Calibration against {name} ({basis}), {span(first.low, first.high)}"
+
+
+def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+    """Return sensitivities, delays and skews of all channels."""
+    k = _k(found)
+    header = ("sensor", "channel", "sensitivity", "k", "delay (µs)", "skew (µs)", "angle (°)")
+    rows = []
+    budgets = {(each.sensor, each.channel): each for each in found.whole_band("sensitivity")}
+    for each in found.sensors:
+        name = snapshot.sensor_names[each.sensor]
+        for number, channel in enumerate(_channels(snapshot, each.sensor)):
+            budget = budgets[name, channel]
+            rows.append(
+                (
+                    name,
+                    channel,
+                    with_error(budget.value, budget.expanded)
+                    + (" counts/unit" * budget.is_absolute),
+                    f"{budget.k:.2f}",
+                    _element(each.delay, number, k, 1e6),
+                    _element(each.skew, number, k, 1e6) if number else "0",
+                    _element(each.angle_deg, number, k),
+                )
+            )
+    return header, tuple(rows)
+
+
+def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+    """Return rotations and deviations from right angles."""
+    k = _k(found)
+    reference = _channels(snapshot, found.reference)
+    most = max(each.rotation_deg.value.size for each in found.sensors)
+    if most == 3:
+        about = tuple(f"about {channel} (°)" for channel in reference)
+    else:
+        about = (f"{' to '.join(reference)} (°)",) * bool(most)
+    pairs = max((each.orthogonality_deg.value.size for each in found.sensors), default=0)
+    which = ("12", "13", "23")[:pairs]
+    header = ("sensor", *about, *(f"{pair[0]}–{pair[1]} less 90°" for pair in which))
+    rows = [
+        (
+            snapshot.sensor_names[each.sensor],
+            *(_element(each.rotation_deg, n, k) for n in range(most)),
+            *(_element(each.orthogonality_deg, n, k) for n in range(pairs)),
+        )
+        for each in found.sensors
+    ]
+    return header, tuple(rows) if most or pairs else ()
+
+
+def matrix_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
+    """Return the relative response of every channel, cross-axis included."""
+    k = _k(found)
+    reference = _channels(snapshot, found.reference)
+    name = snapshot.sensor_names[found.reference]
+    rows = [
+        (
+            snapshot.sensor_names[each.sensor],
+            channel,
+            *(
+                with_error(
+                    float(each.matrix.value[row, column]), k * float(each.matrix.error[row, column])
+                )
+                for column in range(len(reference))
+            ),
+        )
+        for each in found.sensors
+        for row, channel in enumerate(_channels(snapshot, each.sensor))
+    ]
+    return ("sensor", "channel", *(f"to {name}.{each}" for each in reference)), tuple(rows)
+
+
+def budget_table(budgets: Sequence[Budget]) -> tuple[tuple[str, ...], Rows]:
+    """Return budgets as a table: a row for each channel, a column for each source."""
+    sources = list(dict.fromkeys(each.source for budget in budgets for each in budget.components))
+    types = {each.source: each.kind for budget in budgets for each in budget.components}
+    header = (
+        "sensor",
+        "channel",
+        *(f"{source} ({types[source]})" for source in sources),
+        "combined",
+        "k",
+        "expanded",
+    )
+    rows = []
+    for budget in budgets:
+        by_source: dict[str, Component] = {each.source: each for each in budget.components}
+        rows.append(
+            (
+                budget.sensor,
+                budget.channel,
+                *(
+                    share(by_source[source].relative) if source in by_source else ""
+                    for source in sources
+                ),
+                share(budget.combined),
+                f"{budget.k:.2f}",
+                share(budget.k * budget.combined),
+            )
+        )
+    return header, tuple(rows)
+
+
+def noise_rows(found: Calibration, unit: str) -> tuple[tuple[str, ...], Rows]:
+    """Return the noise of every channel with its expanded uncertainty."""
+    rows = []
+    for each in found.whole_band("noise"):
+        low, high = each.value - each.expanded, each.value + each.expanded
+        down = f"−{decibels(each.value) - decibels(low):.2f}" if low > 0 else "−∞"
+        rows.append(
+            (
+                each.sensor,
+                each.channel,
+                f"{signed(decibels(each.value), '.2f')}",
+                f"+{decibels(high) - decibels(each.value):.2f} {down}",
+            )
+        )
+    return ("sensor", "channel", f"noise (dB re 1 ({unit})²/Hz)", "expanded (dB)"), tuple(rows)
+
+
+def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
+    """Return what there is to know about a calibration."""
+    name = snapshot.sensor_names[found.reference]
+    level = (
+        f"Expanded uncertainties at a level of {100 * found.confidence:g} %, coverage factor k by "
+        "the effective degrees of freedom. Angles, delays and cross-axis values: scatter of the "
+        f"estimate only, k = {_k(found):.2f}."
+    )
+    lines = [level]
+    if found.certificates:
+        dates = {each.date.isoformat() for each in found.certificates if each.date is not None}
+        lines.append(
+            f"Sensitivities rest on the certificate of {name}"
+            + (f" of {', '.join(sorted(dates))}." if dates else ", whose date is not given.")
+        )
+    else:
+        lines.append(
+            f"No certificate of {name} in the bench file: sensitivities are those of the bench file"
+            f" times the values shown, if those of {name} are right."
+        )
+    lines += [
+        f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
+        f"{each.excess:.2g} times the errors, or not all motion is common. The budget includes it."
+        for each in found.sensors
+        if each.excess > _VARIES
+    ]
+    return lines + [
+        f"{snapshot.sensor_names[sensor]} is not calibrated: {why}"
+        for sensor, why in found.refused.items()
+    ]
+
+
+def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, Any]:
+    """Return a calibration as JSON (docs/json.md)."""
+    names = snapshot.sensor_names
+    curves = {each.sensor: each for each in found.curves}
+    document = {
+        "reference": names[found.reference],
+        "is_absolute": bool(found.certificates),
+        "certificates": [
+            {
+                "value": each.value,
+                "expanded_uncertainty": each.expanded_uncertainty,
+                "k": each.k,
+                "date": None if each.date is None else each.date.isoformat(),
+                "number": each.number,
+            }
+            for each in found.certificates
+        ],
+        "confidence": found.confidence,
+        "refused": {names[sensor]: why for sensor, why in found.refused.items()},
+        "sensors": [
+            {
+                "sensor": names[each.sensor],
+                "channels": _channels(snapshot, each.sensor),
+                "band_hz": [each.low, each.high],
+                "excess": each.excess,
+                "dof": each.dof,
+                **{
+                    key: {"value": value.value.tolist(), "standard_error": value.error.tolist()}
+                    for key, value in _values(each).items()
+                },
+                "curve": {
+                    "frequency_hz": curves[each.sensor].frequency.tolist(),
+                    "real": curves[each.sensor].matrix.real.tolist(),
+                    "imag": curves[each.sensor].matrix.imag.tolist(),
+                    "standard_error": curves[each.sensor].error.tolist(),
+                },
+            }
+            for each in found.sensors
+        ],
+        "budgets": [
+            {
+                "sensor": each.sensor,
+                "channel": each.channel,
+                "quantity": each.quantity,
+                "is_absolute": each.is_absolute,
+                "band_hz": [each.low, each.high],
+                "value": each.value,
+                "components": [
+                    {
+                        "source": part.source,
+                        "type": part.kind,
+                        "distribution": part.distribution,
+                        "relative_standard_uncertainty": part.relative,
+                        "degrees_of_freedom": part.dof,
+                    }
+                    for part in each.components
+                ],
+                "combined_relative": each.combined,
+                "effective_degrees_of_freedom": each.dof,
+                "k": each.k,
+                "expanded_uncertainty": each.expanded,
+            }
+            for each in found.budgets
+        ],
+    }
+    return {key: plain(value) for key, value in document.items()}
+
+
+def _values(each: SensorCalibration) -> dict[str, Value]:
+    return {
+        "matrix": each.matrix,
+        "gain": each.gain,
+        "cross_axis": each.cross_axis,
+        "rotation_deg": each.rotation_deg,
+        "angle_deg": each.angle_deg,
+        "orthogonality_deg": each.orthogonality_deg,
+        "delay": each.delay,
+        "skew": each.skew,
+    }
+
+
+def _k(found: Calibration) -> float:
+    dof = min(each.dof for each in found.sensors)
+    return student_quantile(0.5 + found.confidence / 2, dof)
+
+
+def _element(value: Value, number: int, k: float, scale: float = 1.0) -> str:
+    if number >= value.value.size:
+        return ""
+    return with_error(
+        scale * float(np.ravel(value.value)[number]),
+        scale * k * float(np.ravel(value.error)[number]),
+    )
+
+
+def _channels(snapshot: Snapshot, sensor: int) -> list[str]:
+    name = snapshot.sensor_names[sensor]
+    return [label.channel for label in snapshot.channels if label.sensor == name]
