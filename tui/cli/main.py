@@ -143,6 +143,7 @@ _PANELS = {
         recordings.report,
         recordings.plot,
         recordings.import_,
+        recordings.export,
         recordings.repair,
     ),
     "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),

@@ -310,6 +310,50 @@ def import_(
     )
 
 
+@examples(
+    "huddle export night.h5 --format mseed",
+    "huddle export night.h5 --format netcdf --method all --out noise.nc",
+    "huddle export monday.h5 tuesday.h5 --format uff58",
+)
+@with_logging
+@with_estimate_options
+def export(
+    files: FilesArgument,
+    *,
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="Samples: mseed. Curves: csv, parquet, netcdf, mat, npz, uff58.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="File (default: beside the recording)."),
+    ] = None,
+    start: StartOption = None,
+    end: EndOption = None,
+    json: JsonOption = None,
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
+    """Write samples or noise curves for other programs.
+
+    [b]mseed[/b]        all samples as miniSEED, and the responses as StationXML beside it
+
+    [b]csv parquet[/b]  a row for each method, channel and frequency
+
+    [b]netcdf[/b]       labelled arrays, for xarray
+
+    [b]mat npz[/b]      an array (n_frequencies, n_channels) of each curve
+
+    [b]uff58[/b]        a function of type 9 (PSD) for each curve
+    """
+    from tui.commands.export import export_recordings
+
+    export_recordings(files, kind=kind, out=out, start=start, end=end, json=json, **wanted)
+
+
 @examples("huddle simulate lab.toml --duration 3h --out model.h5")
 @with_logging
 def simulate(

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _EXTRA = {
+    "pyarrow": "parquet",
+    "pyuff": "vibration",
+    "h5netcdf": "notebook",
     "xarray": "notebook",
     "pandas": "notebook",
     "matplotlib": "report",

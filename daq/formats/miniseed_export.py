@@ -1,0 +1,309 @@
+"""Recordings as miniSEED with StationXML, both written by ObsPy.
+
+Counts are written as they are: Steim 2 for integers, as floats otherwise. Every stretch between
+gaps states its time; where a clock runs off the nominal rate, every block does. Sensors whose names
+are no codes of the FDSN get some: the network ``XX``, a station, and channels by rate and unit.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import RecordingError
+from daq.formats.foreign_sensor import NS_PER_S
+from daq.formats.readers.waveforms import load_obspy
+from daq.protocols.block import BlockFlag
+from daq.timing.arrival_times import ArrivalTimes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Channel
+    from daq.recording.reader import Recording
+    from daq.recording.sensor_record import SensorRecord
+
+_ROWS_AT_ONCE = 1 << 18
+_NOMINAL_NS = 1000
+"""By how much times may miss the nominal rate: they are written to the microsecond."""
+_STEIM2_LIMIT = 1 << 29
+_BANDS = ((1000.0, "F"), (250.0, "C"), (80.0, "H"), (10.0, "B"), (1.0, "M"), (0.0, "L"))
+"""Band codes of broadband channels, by the least rate in Hz (SEED manual, appendix A)."""
+_INSTRUMENTS = {"m/s²": "N", "g": "N", "mg": "N", "µg": "N", "Gal": "N"}
+_SI = {"m/s²": "M/S**2", "m/s": "M/S", "m": "M"}
+_NAMES = re.compile(r"^([A-Z0-9]{1,2})\.([A-Z0-9]{1,5})(?:\.([A-Z0-9-]{1,2}))?$")
+_CODE = re.compile(r"^[A-Z0-9]{3}$")
+
+
+@dataclass(frozen=True, slots=True)
+class Codes:
+    """Network, station, location and channel of the FDSN."""
+
+    network: str
+    station: str
+    location: str
+    channel: str
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What was written: codes by "sensor.channel", and the numbers of samples and gaps."""
+
+    codes: Mapping[str, Codes]
+    n_samples: int
+    n_gaps: int
+
+
+def codes_of(sensors: Sequence[SensorRecord]) -> dict[tuple[str, str], Codes]:
+    """Return codes for each sensor and channel, all different."""
+    found: dict[tuple[str, str], Codes] = {}
+    stations: set[str] = set()
+    for sensor in sensors:
+        named = _NAMES.match(sensor.name)
+        if named:
+            network, station, location = named[1], named[2], named[3] or ""
+        else:
+            network, location = "XX", ""
+            station = _unused(re.sub("[^A-Z0-9]", "", sensor.name.upper())[:5] or "S", stations, 5)
+        stations.add(station)
+        taken: set[str] = set()
+        for channel in sensor.channels:
+            code = channel.name
+            if not _CODE.match(code):
+                band = next(code for least, code in _BANDS if sensor.sampling_rate >= least)
+                last = re.sub("[^A-Z0-9]", "", channel.name.upper())[-1:] or "1"
+                code = band + _INSTRUMENTS.get(channel.unit, "H") + last
+            taken.add(code := _unused(code, taken, 3))
+            found[sensor.name, channel.name] = Codes(network, station, location, code)
+    return found
+
+
+def _unused(code: str, taken: set[str], length: int) -> str:
+    """Return a code, or one that ends with another letter or number if it is taken."""
+    for last in ("", *"123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ", *map(str, range(10, 1000))):
+        other = code[: length - len(last)] + last if last else code
+        if other not in taken:
+            return other
+    raise RecordingError(f"{code}: no code is left; export fewer channels at once")
+
+
+def export_miniseed(recording: Recording, out: Path, station_xml: Path) -> Exported:
+    """Write all samples of a recording, and the responses of its channels.
+
+    Raises
+    ------
+    ImportFormatError
+        ObsPy is not installed.
+    RecordingError
+        Samples are damaged, or do not fit miniSEED.
+    """
+    obspy = load_obspy()
+    codes = codes_of(recording.sensors)
+    n_samples = n_gaps = 0
+    spans: dict[str, tuple[int, int]] = {}
+    with out.open("wb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for sensor in recording.sensors:
+            runs = list(_runs(recording, sensor))
+            n_gaps += max(0, len({run.stretch for run in runs}) - 1)
+            for run in runs:
+                for first in range(run.first_row, run.end_row, _ROWS_AT_ONCE):
+                    end = min(first + _ROWS_AT_ONCE, run.end_row)
+                    start = run.start_ns + round(
+                        (first - run.first_row) * NS_PER_S / sensor.sampling_rate
+                    )
+                    n_samples += _write_rows(
+                        obspy, file, sensor, codes, rows=(first, end), start_ns=start
+                    )
+            if runs:
+                last = runs[-1]
+                length = round((last.end_row - last.first_row) * NS_PER_S / sensor.sampling_rate)
+                spans[sensor.name] = runs[0].start_ns, last.start_ns + length
+        inventory = _inventory(obspy, recording, codes, spans)
+        inventory.write(str(station_xml), format="STATIONXML")
+    return Exported({".".join(key): each for key, each in codes.items()}, n_samples, n_gaps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Contiguous rows with one start time; runs of the same stretch continue each other."""
+
+    first_row: int
+    end_row: int
+    start_ns: int
+    stretch: int
+
+
+def _runs(recording: Recording, sensor: SensorRecord) -> Iterator[_Run]:
+    blocks = sensor.blocks[:]
+    blocks = blocks[blocks["n_samples"] > 0]
+    if not len(blocks):
+        return
+    first = blocks["first_sample"].astype(np.int64)
+    length = blocks["n_samples"].astype(np.int64)
+    rows = blocks["first_row"].astype(np.int64)
+    times = _times(recording, sensor, blocks)
+    begins = np.concatenate([[True], first[1:] != (first + length)[:-1]])
+    if (blocks["flags"] & int(BlockFlag.DEVICE_UTC)).all():
+        begins |= (blocks["flags"] & int(BlockFlag.CLOCK_RESTART)) != 0
+    starts = np.flatnonzero(begins).tolist()
+    for stretch, (begin, end) in enumerate(zip(starts, [*starts[1:], len(blocks)], strict=True)):
+        mine = slice(begin, end)
+        nominal = times[begin] + (rows[mine] - rows[begin]) * (NS_PER_S / sensor.sampling_rate)
+        last_row = int(rows[end - 1] + length[end - 1])
+        if np.max(np.abs(times[mine] - nominal)) <= _NOMINAL_NS:
+            yield _Run(int(rows[begin]), last_row, int(times[begin]), stretch)
+        else:
+            edges = [*rows[mine].tolist(), last_row]
+            for number, at in enumerate(times[mine].tolist()):
+                yield _Run(edges[number], edges[number + 1], int(at), stretch)
+
+
+def _times(
+    recording: Recording, sensor: SensorRecord, blocks: NDArray[np.void]
+) -> NDArray[np.int64]:
+    """Return UTC of the first sample of each block: as stated, or by the clock of the sensor."""
+    if (blocks["flags"] & int(BlockFlag.DEVICE_UTC)).all():
+        return blocks["device_counter"].astype(np.int64)
+    created = recording.created_at
+    if sensor.polled:
+        instants = [
+            int(sensor.instants_ns(int(row), int(row) + 1)[0]) for row in blocks["first_row"]
+        ]
+        return np.array(instants, np.int64) - created.monotonic_ns + created.utc_ns
+    arrivals = ArrivalTimes(sensor.sampling_rate, created.monotonic_ns, created.utc_ns)
+    arrivals.add(blocks)
+    clock = arrivals.solve(sensor.name)
+    seconds = clock.at(blocks["first_sample"].astype(np.float64))
+    return created.utc_ns + np.rint(seconds * NS_PER_S).astype(np.int64)
+
+
+def _write_rows(
+    obspy: Any,  # noqa: ANN401 - ObsPy has no types
+    file: BinaryIO,
+    sensor: SensorRecord,
+    codes: Mapping[tuple[str, str], Codes],
+    *,
+    rows: tuple[int, int],
+    start_ns: int,
+) -> int:
+    counts, damaged = sensor.intact_counts(*rows)
+    if damaged:
+        raise RecordingError(
+            f"sensor {sensor.name!r}: rows {damaged[0][0] + rows[0]} to {damaged[0][1] + rows[0]}"
+            " are damaged; expected sound samples: see huddle repair --check"
+        )
+    for number, channel in enumerate(sensor.channels):
+        known = codes[sensor.name, channel.name]
+        samples, encoding = _encodable(counts[:, number], f"{sensor.name}.{channel.name}")
+        trace = obspy.Trace(
+            samples,
+            {
+                "network": known.network,
+                "station": known.station,
+                "location": known.location,
+                "channel": known.channel,
+                "sampling_rate": sensor.sampling_rate,
+                "starttime": obspy.UTCDateTime(ns=start_ns),
+            },
+        )
+        trace.write(file, format="MSEED", encoding=encoding, reclen=4096)
+    return len(counts)
+
+
+def _encodable(samples: NDArray[Any], name: str) -> tuple[NDArray[Any], str]:
+    """Return samples in a type of miniSEED, and its encoding."""
+    if samples.dtype.kind == "f":
+        single = samples.dtype.itemsize <= 4
+        return np.ascontiguousarray(samples, np.float32 if single else np.float64), (
+            "FLOAT32" if single else "FLOAT64"
+        )
+    found = samples.astype(np.int32)
+    if not np.array_equal(found, samples):
+        if float(np.abs(samples.astype(np.float64)).max()) >= 2**53:
+            raise RecordingError(f"{name}: counts beyond 2^53; no encoding of miniSEED holds them")
+        return samples.astype(np.float64), "FLOAT64"
+    steps = np.abs(np.diff(found.astype(np.int64), prepend=0))
+    steep = len(steps) > 0 and int(steps.max()) >= _STEIM2_LIMIT
+    return found, "INT32" if steep else "STEIM2"
+
+
+def _inventory(
+    obspy: Any,  # noqa: ANN401 - ObsPy has no types
+    recording: Recording,
+    codes: Mapping[tuple[str, str], Codes],
+    spans: Mapping[str, tuple[int, int]],
+) -> Any:  # noqa: ANN401
+    from obspy.core import inventory as parts  # noqa: PLC0415 - an extra
+
+    networks: dict[str, dict[str, list[Any]]] = {}
+    for sensor in recording.sensors:
+        begin, end = spans.get(sensor.name, (0, 0))
+        for channel in sensor.channels:
+            known = codes[sensor.name, channel.name]
+            equipment = parts.Equipment(
+                model=sensor.model or None, serial_number=sensor.serial_number or None
+            )
+            networks.setdefault(known.network, {}).setdefault(known.station, []).append(
+                parts.Channel(
+                    known.channel,
+                    known.location,
+                    *(0.0, 0.0, 0.0, 0.0),
+                    sample_rate=sensor.sampling_rate,
+                    start_date=obspy.UTCDateTime(ns=begin),
+                    end_date=obspy.UTCDateTime(ns=end),
+                    sensor=equipment,
+                    description=f"{sensor.name}.{channel.name}; coordinates are not recorded",
+                    response=_response(parts, channel),
+                )
+            )
+    return parts.Inventory(
+        networks=[
+            parts.Network(
+                code,
+                stations=[
+                    parts.Station(name, 0.0, 0.0, 0.0, channels=channels)
+                    for name, channels in stations.items()
+                ],
+            )
+            for code, stations in networks.items()
+        ],
+        source="huddle export",
+    )
+
+
+def _response(parts: Any, channel: Channel) -> Any:  # noqa: ANN401 - ObsPy has no types
+    """Return the response of a channel; None if its samples are no motion."""
+    if channel.unit not in _SI:
+        return None
+    shape = channel.response
+    gain, frequency, factor = channel.sensitivity, 1.0, 1.0
+    if shape is not None:
+        frequency = shape.frequency
+        at = float(np.abs(shape.at(np.array([frequency])))[0])
+        bare = shape.model_copy(update={"normalization": 1.0})
+        plain = float(np.abs(bare.at(np.array([frequency])))[0])
+        if not (np.isfinite(at) and at > 0 and np.isfinite(plain) and plain > 0):
+            raise RecordingError(
+                f"channel {channel.name!r}: its response is {at:g} at {frequency:g} Hz; expected a"
+                " frequency of its sensitivity within the pass band"
+            )
+        gain, factor = channel.sensitivity * at, 1 / plain
+    return parts.Response.from_paz(
+        zeros=[] if shape is None else list(shape.zeros),
+        poles=[] if shape is None else list(shape.poles),
+        stage_gain=gain,
+        stage_gain_frequency=frequency,
+        normalization_frequency=frequency,
+        normalization_factor=factor,
+        input_units=_SI[channel.unit],
+        output_units="COUNTS",
+    )

@@ -1,0 +1,222 @@
+"""``huddle export``: what was written is read by programs that are not ours."""
+
+from __future__ import annotations
+
+import csv
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import pyuff
+import xarray as xr
+from scipy.io import loadmat
+from typer.testing import CliRunner
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.importer import import_files
+from daq.formats.readers.waveforms import load_obspy
+from daq.recording.reader import Recording
+from tests.daq.formats.test_sources import START, STEP, counts, write_records
+from tui.cli.main import app
+from tui.output.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from typer.testing import Result
+
+    from daq.estimation.snapshot import Snapshot
+
+BENCH = """
+name = "lab"
+sampling_rate = 100.0
+""" + "".join(
+    f"""
+[[sensors]]
+name = "{name}"
+driver = "epson"
+port = "/dev/null"
+channels = [{{name = "X", sensitivity = 400.0}}, {{name = "Y", sensitivity = 500.0}}]
+"""
+    for name in ("front left", "rear", "B3")
+)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["export", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three sensors with two channels on one motion, in m/s²."""
+    from daq.bench.loading import parse  # noqa: PLC0415 - of this fixture
+
+    folder = tmp_path_factory.mktemp("export")
+    rng = np.random.default_rng(8)
+    motion = 1e4 * rng.normal(size=(8000, 2))
+    arrays = {
+        name: np.round(motion + 100 * rng.normal(size=motion.shape)).astype(np.int32)
+        for name in ("front left", "rear", "B3")
+    }
+    source = folder / "a.npz"
+    np.savez(source, sampling_rate=100.0, start_time="2026-11-21T03:00:00.000007", **arrays)  # type: ignore[arg-type]  # arrays
+    import_files([source], folder / "a.h5", bench=parse(BENCH))
+    return folder / "a.h5"
+
+
+@pytest.fixture(scope="module")
+def snapshot(recording: Path) -> Snapshot:
+    with Recording.open(recording) as opened:
+        assert opened.bench is not None
+        return estimate([opened], Settings.of(opened.bench))
+
+
+def test_miniseed_and_back_in_obspy(tmp_path: Path) -> None:
+    obspy = load_obspy()
+    x = counts(5000, 1)
+    for first, end in ((0, 2000), (2017, 5000)):
+        start = START + 123_000 + first * STEP
+        write_records(tmp_path / "a", x[first:end], start=start)
+        write_records(tmp_path / "a", x[first:end] + 1, channel="HHN", start=start)
+    import_files([tmp_path / "a"], tmp_path / "a.h5")
+    assert run(tmp_path / "a.h5", "--format", "mseed").exit_code == ExitCode.DONE
+    ours = obspy.read(str(tmp_path / "a.mseed"), format="MSEED")
+    theirs = obspy.read(str(tmp_path / "a"), format="MSEED")
+    for stream in (ours, theirs):
+        stream.merge(method=-1).sort()
+    assert [trace.id for trace in ours] == [trace.id for trace in theirs]
+    assert len(ours) == 4
+    for our, their in zip(ours, theirs, strict=True):
+        assert (our.stats.starttime, our.stats.endtime) == (
+            their.stats.starttime,
+            their.stats.endtime,
+        )
+        np.testing.assert_array_equal(our.data, their.data)
+    gaps = [(*gap[:6], round(gap[6], 6)) for gap in ours.get_gaps()]
+    assert gaps == [(*gap[:6], round(gap[6], 6)) for gap in theirs.get_gaps()]
+    inventory = obspy.read_inventory(str(tmp_path / "a.xml"), format="STATIONXML")
+    assert sorted(inventory.get_contents()["channels"]) == sorted({trace.id for trace in ours})
+
+
+def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_path: Path) -> None:
+    obspy = load_obspy()
+    out = tmp_path / "b.mseed"
+    found = run(recording, "--format", "mseed", "-o", out, "--json", "-")
+    document = json.loads(found.stdout)
+    assert document["codes"]["front left.X"] == {
+        "network": "XX",
+        "station": "FRONT",
+        "location": "",
+        "channel": "HNX",
+    }
+    stream = obspy.read(str(out), format="MSEED")
+    assert sorted(trace.id for trace in stream) == sorted(
+        f"XX.{station}..HN{axis}" for station in ("FRONT", "REAR", "B3") for axis in "XY"
+    )
+    assert {trace.stats.starttime.ns for trace in stream} == {START + 7000}
+    inventory = obspy.read_inventory(document["stationxml"], format="STATIONXML")
+    response = inventory.get_response("XX.REAR..HNY", stream[0].stats.starttime)
+    assert response.instrument_sensitivity.value == 500.0
+    stream.select(station="REAR", channel="HNY").remove_sensitivity(inventory)
+    with Recording.open(recording) as opened:
+        samples = opened.sensor("rear").counts()[:, 1] / 500.0
+    (trace,) = stream.select(station="REAR", channel="HNY")
+    np.testing.assert_allclose(trace.data, samples, rtol=1e-12)
+    assert run(recording, "--format", "mseed", "--start", "1s").exit_code == ExitCode.USAGE
+    assert run(recording, "--format", "sac").exit_code == ExitCode.USAGE
+
+
+def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recording: Path) -> None:
+    obspy = load_obspy()
+    sources = sorted(usgs_recording.glob("TST5_*_BH0.mseed"))
+    resp = usgs_recording / "T-compact_Q330HR_BH_40"
+    import_files(sources, tmp_path / "a.h5", response=resp)
+    assert run(tmp_path / "a.h5", "--format", "mseed").exit_code == ExitCode.DONE
+    ours = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1)
+    theirs = obspy.Stream()
+    for source in sources:
+        theirs += obspy.read(str(source), format="MSEED")
+    for their in theirs.merge(method=-1):
+        (our,) = ours.select(id=their.id)
+        assert our.stats.starttime == their.stats.starttime
+        np.testing.assert_array_equal(our.data, their.data)
+    frequency = np.geomspace(0.005, 8.0, 60)
+    our_xml = obspy.read_inventory(str(tmp_path / "a.xml"), format="STATIONXML")
+    exported = our_xml.get_response(ours[0].id, ours[0].stats.starttime)
+    original = obspy.read_inventory(str(resp), format="RESP")[0][0][0].response
+    curves = [
+        np.abs(each.get_evalresp_response_for_frequencies(frequency, output="VEL"))
+        for each in (exported, original)
+    ]
+    assert np.max(np.abs(20 * np.log10(curves[0] / curves[1]))) < 0.01
+
+
+def test_tidy_csv(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    out = tmp_path / "a.csv"
+    assert run(recording, "--format", "csv", "-o", out).exit_code == ExitCode.DONE
+    with out.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["sensor"] == "rear"]
+    (method,) = snapshot.results
+    assert {row["method"] for row in rows} == {method}
+    assert {row["unit"] for row in rows} == {"m/s²"}
+    found = [float(row["noise_psd"]) for row in rows if row["channel"] == "Y" and row["noise_psd"]]
+    column = [(label.sensor, label.channel) for label in snapshot.channels].index(("rear", "Y"))
+    expected = snapshot.results[method].noise_psd[:, column]
+    np.testing.assert_array_equal(found, expected[np.isfinite(expected)])
+
+
+def test_netcdf(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    assert run(recording, "--format", "netcdf", "-o", tmp_path / "a.nc").exit_code == ExitCode.DONE
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as found:
+        (method,) = snapshot.results
+        rear = found["noise_psd"].sel(estimate=method, sensor="rear", channel="X")
+        np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
+        assert found["noise_psd"].attrs["units"] == "(m/s²)²/Hz"
+
+
+def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    for kind in ("mat", "npz"):
+        out = tmp_path / f"a.{kind}"
+        assert run(recording, "--format", kind, "-o", out).exit_code == ExitCode.DONE
+    (method,) = snapshot.results
+    matlab = loadmat(tmp_path / "a.mat")
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as numpy:
+        assert numpy["sensors"].tolist() == [label.sensor for label in snapshot.channels]
+        for name, expected in (
+            ("data_psd", snapshot.data_psd),
+            (f"{method.replace('-', '_')}_noise_low", snapshot.results[method].low),
+        ):
+            np.testing.assert_array_equal(numpy[name], expected)
+            np.testing.assert_array_equal(matlab[name], expected)
+    assert [cell[0].item() for cell in matlab["units"]] == ["(m/s²)²/Hz"] * 6
+
+
+def test_universal_file(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    out = tmp_path / "a.uff"
+    assert run(recording, "--format", "uff58", "-o", out).exit_code == ExitCode.DONE
+    sets = pyuff.UFF(str(out)).read_sets()
+    assert {each["func_type"] for each in sets} == {9}
+    (method,) = snapshot.results
+    (found,) = [each for each in sets if each["id1"].strip() == f"rear.Y {method} noise_psd"]
+    assert (found["rsp_node"], found["rsp_dir"], found["rsp_ent_name"].strip()) == (2, 2, "rear")
+    np.testing.assert_array_equal(found["data"], snapshot.results[method].noise_psd[:, 3])
+    np.testing.assert_allclose(found["x"], snapshot.frequency, rtol=1e-5)
+
+
+def test_parquet(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is large, and an extra")
+    out = tmp_path / "a.parquet"
+    assert run(recording, "--format", "parquet", "-o", out).exit_code == ExitCode.DONE
+    table = parquet.read_table(out).to_pydict()
+    (method,) = snapshot.results
+    found = [
+        value
+        for value, sensor, channel in zip(
+            table["noise_psd"], table["sensor"], table["channel"], strict=True
+        )
+        if (sensor, channel) == ("B3", "X")
+    ]
+    np.testing.assert_array_equal(found, snapshot.results[method].noise_psd[:, 4])
+    assert set(table["unit"]) == {"m/s²"}

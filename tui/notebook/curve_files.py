@@ -1,0 +1,181 @@
+"""Curves in files of other programs: tidy CSV and Parquet, netCDF, MAT, NumPy, UFF 58.
+
+A tidy table has one row for each method, channel and frequency. All densities are one-sided, in
+unit²/Hz; the unit is in a column, an attribute or a variable of every file.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tui.notebook.tables import to_frame, to_xarray
+from tui.output.csv_text import csv_text
+from tui.output.extras import load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from daq.estimation.snapshot import Snapshot
+
+_COLUMNS = ("noise_psd", "noise_low", "noise_high", "cov")
+_FIELDS = ("noise_psd", "low", "high", "cov")
+_PSD = 9
+_DOUBLE = 4
+_DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "E": 1, "N": 2, "1": 1, "2": 2, "3": 3}
+
+
+def _csv(snapshot: Snapshot, path: Path) -> None:
+    header = ("method", "sensor", "channel", "unit", "frequency_hz", "data_psd", *_COLUMNS)
+    path.write_text(csv_text(header, _rows(snapshot)), encoding="utf-8")
+
+
+def _rows(snapshot: Snapshot) -> Iterator[tuple[object, ...]]:
+    for method, noise in snapshot.results.items():
+        for column, label in enumerate(snapshot.channels):
+            values = [snapshot.frequency, snapshot.data_psd[:, column]]
+            values += [getattr(noise, field)[:, column] for field in _FIELDS]
+            for row in np.stack(values, axis=1).tolist():
+                numbers = [None if value != value else value for value in row]  # noqa: PLR0124 - NaN
+                yield (method, label.sensor, label.channel, label.unit, *numbers)
+
+
+def _parquet(snapshot: Snapshot, path: Path) -> None:
+    load("pyarrow")
+    frame = to_frame(snapshot)
+    units = {(label.sensor, label.channel): label.unit for label in snapshot.channels}
+    keys = zip(frame["sensor"], frame["channel"], strict=True)
+    frame.insert(3, "unit", [units[key] for key in keys])
+    frame.rename(columns={"frequency": "frequency_hz"}).to_parquet(path, index=False)
+
+
+def _netcdf(snapshot: Snapshot, path: Path) -> None:
+    load("h5netcdf")
+    to_xarray(snapshot).to_netcdf(path, engine="h5netcdf")
+
+
+def _arrays(snapshot: Snapshot) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "frequency_hz": snapshot.frequency,
+        "sensors": [label.sensor for label in snapshot.channels],
+        "channels": [label.channel for label in snapshot.channels],
+        "units": [f"({label.unit})²/Hz" for label in snapshot.channels],
+        "data_psd": snapshot.data_psd,
+    }
+    for method, noise in snapshot.results.items():
+        for column, field in zip(_COLUMNS, _FIELDS, strict=True):
+            found[f"{method.replace('-', '_')}_{column}"] = getattr(noise, field)
+    return found
+
+
+def _mat(snapshot: Snapshot, path: Path) -> None:
+    from scipy.io import savemat  # noqa: PLC0415 - takes long
+
+    found = {
+        name: np.array(value, dtype=object) if isinstance(value, list) else value
+        for name, value in _arrays(snapshot).items()
+    }
+    savemat(
+        str(path),
+        found,
+        appendmat=False,
+        do_compression=True,
+        oned_as="column",
+        long_field_names=True,
+    )
+
+
+def _npz(snapshot: Snapshot, path: Path) -> None:
+    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in _arrays(snapshot).items()}
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _uff(snapshot: Snapshot, path: Path) -> None:
+    pyuff = load("pyuff")
+    path.unlink(missing_ok=True)
+    file = pyuff.UFF(str(path))
+    nodes = {name: number for number, name in enumerate(snapshot.sensor_names, start=1)}
+    frequency = snapshot.frequency
+    even = np.allclose(np.diff(frequency), frequency[1] - frequency[0])
+    for column, label in enumerate(snapshot.channels):
+        curves = {"data": snapshot.data_psd[:, column]}
+        for method, noise in snapshot.results.items():
+            for name, field in zip(_COLUMNS[:3], _FIELDS[:3], strict=True):
+                curves[f"{method} {name}"] = getattr(noise, field)[:, column]
+        for name, values in curves.items():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                file.write_sets(
+                    pyuff.prepare_58(
+                        binary=1,
+                        func_type=_PSD,
+                        id1=f"{label.name} {name}"[:80],
+                        id2=f"one-sided, ({_ascii(label.unit)})^2/Hz"[:80],
+                        rsp_ent_name=_ascii(label.sensor)[:10],
+                        rsp_node=nodes[label.sensor],
+                        rsp_dir=_DIRECTIONS.get(label.channel[-1:].upper(), 0),
+                        ref_node=nodes[label.sensor],
+                        ref_dir=_DIRECTIONS.get(label.channel[-1:].upper(), 0),
+                        ord_data_type=_DOUBLE,
+                        abscissa_spacing=int(even),
+                        abscissa_min=float(frequency[0]),
+                        abscissa_inc=float(frequency[1] - frequency[0]) if even else 0.0,
+                        num_pts=len(frequency),
+                        abscissa_spec_data_type=18,
+                        abscissa_axis_units_lab="Hz",
+                        ordinate_spec_data_type=0,
+                        ordinate_axis_units_lab=f"({_ascii(label.unit)})^2/Hz"[:20],
+                        orddenom_spec_data_type=0,
+                        z_axis_spec_data_type=0,
+                        x=frequency,
+                        data=np.asarray(values, dtype=np.float64),
+                    ),
+                    "add",
+                )
+
+
+def _ascii(text: str) -> str:
+    return text.replace("²", "^2").replace("µ", "u").encode("ascii", "replace").decode()
+
+
+WRITERS: dict[str, tuple[str, Callable[[Snapshot, Path], None]]] = {
+    "csv": (".csv", _csv),
+    "parquet": (".parquet", _parquet),
+    "netcdf": (".nc", _netcdf),
+    "mat": (".mat", _mat),
+    "npz": (".npz", _npz),
+    "uff58": (".uff", _uff),
+}
+"""Suffix and writer of each format."""
+
+
+def write_curves(snapshot: Snapshot, kind: str, path: Path) -> None:
+    """Write all curves; the file has its name when it is complete.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    kind : str
+        One of `WRITERS`.
+    path : Path
+
+    Raises
+    ------
+    MissingPackageError
+        A package is not installed.
+    OSError
+        The file cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        WRITERS[kind][1](snapshot, part)
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
