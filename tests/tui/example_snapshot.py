@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.results.verdict import TestVerdict
     from estimator.types import FloatArray
+    from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
 SETTINGS = Settings(
@@ -258,6 +259,7 @@ class ProgressCallback:
     told: list[str] = field(default_factory=list)
     announced: list[str] = field(default_factory=list)
     plan: TestPlan | None = None
+    sensors: Preview | None = None
 
     def start(self, plan: TestPlan) -> Path:
         """Note it."""
@@ -269,6 +271,11 @@ class ProgressCallback:
     def folder(self) -> Path:
         """Return where its recordings are."""
         return self.path.parent
+
+    @property
+    def preview(self) -> Preview | None:
+        """Return what was prepared."""
+        return self.sensors
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Note it."""

@@ -5,14 +5,32 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    import threading
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from daq.acquisition.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.verdict import TestVerdict
     from tui.application.plan import TestPlan
+
+
+class Preview(Protocol):
+    """Reads the sensors of a bench without recording."""
+
+    def __call__(
+        self, show: Callable[[tuple[SensorPreview, ...]], None], ended: threading.Event
+    ) -> None:
+        """Show all sensors again and again, until `ended` is set. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If the sensors cannot be read at all.
+        """
+        ...
 
 
 class Controls(Protocol):
@@ -57,6 +75,11 @@ class Controls(Protocol):
 
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
+        ...
+
+    @property
+    def preview(self) -> Preview | None:
+        """Reads the sensors before a test; None where there are none to be read."""
         ...
 
     def announce(self, event: str, text: str, path: Path | None) -> None:

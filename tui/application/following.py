@@ -94,6 +94,8 @@ class FollowingApp(App[None]):
         )
 
     def _new_view(self, kind: type[View]) -> View:
+        if kind is BenchView:
+            return BenchView(self.state, self._controls.preview)
         return kind(self.state)
 
     def on_unmount(self) -> None:

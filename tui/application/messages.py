@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from textual.app import App
 
+    from daq.acquisition.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -70,6 +71,13 @@ class DeletionRequested(Message):
     """A recording is to be deleted; that has been confirmed."""
 
     path: Path
+
+
+@dataclass
+class PreviewUpdated(Message):
+    """The sensors of the bench, as they are now; nothing is recorded."""
+
+    sensors: tuple[SensorPreview, ...]
 
 
 @dataclass

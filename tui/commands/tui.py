@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shlex
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from daq.acquisition.preview import preview
 from daq.acquisition.recorder import recording_path
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
@@ -27,13 +31,16 @@ from tui.output.logs.lines import screen_taken
 from tui.runs.estimate_settings import check_fit, chosen, settings_for
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
+from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from daq.acquisition.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.results.verdict import TestVerdict
+    from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
 ALWAYS = ("three-sensor", "three-channel")
@@ -57,6 +64,8 @@ class BenchControls:
     on_event: str = ""
     """Command for the end of a test, and for trouble."""
     started: list[RecorderProcess] = field(default_factory=list)
+    ports: threading.Lock = field(default_factory=threading.Lock)
+    """Held by who reads the sensors."""
 
     @property
     def name(self) -> str:
@@ -71,7 +80,10 @@ class BenchControls:
     def start(self, plan: TestPlan) -> Path:
         """Start a recorder; return its file once it exists."""
         out = recording_path(self.bench, SystemClock().now())
-        recorder = RecorderProcess(self.path, out, duration=plan.duration, operator=plan.operator)
+        with self.ports:  # a preview has released them
+            recorder = RecorderProcess(
+                self.path, out, duration=plan.duration, operator=plan.operator
+            )
         self.started.append(recorder)
         recorder.wait_for_file()
         return out
@@ -87,6 +99,11 @@ class BenchControls:
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
         ask(path, "mark", text)
+
+    @property
+    def preview(self) -> Preview | None:
+        """Reads the sensors of the bench."""
+        return partial(read_sensors, self.bench, self.ports)
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
@@ -152,6 +169,10 @@ class RecordingControls:
         """Ask the recorder to record a remark."""
         ask(path, "mark", text)
 
+    @property
+    def preview(self) -> None:
+        """Return nothing: the sensors of a recording may be anywhere."""
+
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
         announce(self.on_event, event, text, path)
@@ -168,6 +189,27 @@ class RecordingControls:
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report beside the recording."""
         return _report(path, snapshot, settings)
+
+
+def read_sensors(
+    bench: Bench,
+    ports: threading.Lock,
+    show: Callable[[tuple[SensorPreview, ...]], None],
+    ended: threading.Event,
+) -> None:
+    """Read the sensors of a bench until `ended` is set; holds the lock of the ports meanwhile.
+
+    Raises
+    ------
+    HuddleError
+        If they cannot be read.
+    """
+    clock, loop_factory = host_time(bench)
+    with ports, asyncio.Runner(loop_factory=loop_factory) as runner:
+        try:
+            runner.run(preview(bench, clock, show, ended=ended))
+        except* HuddleError as errors:
+            raise HuddleError("; ".join(map(str, errors.exceptions))) from errors
 
 
 def announce(command: str, event: str, text: str, path: Path | None) -> None:

@@ -1,27 +1,163 @@
-"""The sensors of a bench as a table. Does not use Textual."""
+"""The sensors of a bench as tables, and what the checks before a test say. No Textual here."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from daq.acquisition.preflight import Problem, check_before_test, is_complete
+from tui.application.bench_view.traces import trace
+from tui.output.formatting import listed, signed
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from rich.console import RenderableType
 
+    from daq.acquisition.preflight import Finding
+    from daq.acquisition.preview import SensorPreview
     from tui.application.state import State
+
+MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
+LEAST_TRACE, WIDEST_TRACE = 12, 60  # columns
+NUMBERS = {"Hz", "°C", "mean", "RMS", "peak"}
+ADVICE: Mapping[Problem, str] = {
+    Problem.TROUBLE: "{text}",
+    Problem.NO_SAMPLES: "{sensor} answers and sends no samples: check its settings",
+    Problem.RATE: "{sensor} sends {value:.1f} samples a second, the bench file says another rate:"
+    " correct sampling_rate",
+    Problem.MISSING: "{sensor} misses {value:.0f} samples: check cable and port",
+    Problem.CLIPPING: "{sensor} is clipping: reduce the motion, or check its mounting and range",
+    Problem.DEAD: "{sensor}.{channel} does not change: nothing is connected, or it is dead",
+    Problem.HUM: "{sensor}.{channel} hums: most of its power is at {value:.0f} Hz; check grounding"
+    " and shielding",
+    Problem.ALONE: "{sensor} shares no motion with the other sensors: is it on the same floor?",
+}
+"""What is wrong, and what to do."""
 
 
 def sensors_of_bench(state: State) -> RenderableType:
     """Return a row per sensor of the bench file."""
     if state.bench is None:
         return Text("This recording has no bench file: it was imported.")
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold #9aa5b8")
-    for column in ("sensor", "model", "driver", "port", "channels"):
-        table.add_column(column, no_wrap=True)
-    for sensor in state.bench.sensors:
-        channels = " ".join(channel.name for channel in sensor.channels)
-        row = (sensor.name, sensor.model, sensor.driver, sensor.port, channels)
-        table.add_row(*map(Text, row))
+    return _table(
+        ("sensor", "model", "driver", "port", "channels"),
+        [
+            [
+                *map(Text, (sensor.name, sensor.model, sensor.driver, sensor.port)),
+                Text(" ".join(channel.name for channel in sensor.channels)),
+            ]
+            for sensor in state.bench.sensors
+        ],
+    )
+
+
+def sensor_states(sensors: Sequence[SensorPreview], *, width: int) -> Table:
+    """Return a row per sensor: state, identity, actual rate, temperature, port."""
+    rows = []
+    for each in sensors:
+        about, rate = each.information, each.measured_rate
+        temperature = None if about is None else about.temperature
+        rows.append(
+            (
+                Text(each.sensor.name, "bold"),
+                _state(each),
+                Text("" if about is None else about.model or each.sensor.model),
+                Text("" if about is None else about.serial_number),
+                Text("…" if rate is None else f"{rate:.1f}"),
+                Text("" if temperature is None else f"{temperature:.1f}"),
+            )
+        )
+    titles = ("sensor", "state", "model", "serial no.", "Hz", "°C")
+    room = max(8, width - _width(titles, rows))
+    return _table(
+        (*titles, "port"),
+        [
+            (*row, Text(_tail(each.sensor.port, room)))
+            for row, each in zip(rows, sensors, strict=True)
+        ],
+    )
+
+
+def _tail(text: str, room: int) -> str:
+    """Return the end of a text: that of a port says more than its start."""
+    return text if len(text) <= room else f"…{text[1 - room :]}"
+
+
+def _state(each: SensorPreview) -> Text:
+    if each.trouble:
+        return Text("▲ trouble", BAD)
+    if len(each.samples) == 0:
+        return Text("○ waiting", DOUBTFUL)
+    return Text("▲ clipping", BAD) if each.is_clipping else Text("● live", GOOD)
+
+
+def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Table:
+    """Return a row per channel: the last second as numbers, the last ten as a trace."""
+    rows, shown = [], []
+    for each in sensors:
+        second = each.samples[-max(1, round(each.sensor.sampling_rate)) :]
+        for n, channel in enumerate(each.sensor.channels):
+            if channel.auxiliary or len(second) == 0:
+                continue
+            values = second[:, n]
+            mean = float(values.mean())
+            shown.append(each.samples[:, n])
+            rows.append(
+                (
+                    Text(f"{each.sensor.name}.{channel.name}", "bold"),
+                    Text(signed(mean, ".3g")),
+                    Text(f"{values.std():.2g}"),
+                    Text(f"{np.abs(values - mean).max():.2g}"),
+                    Text(channel.unit, MUTED),
+                )
+            )
+    titles = ("channel", "mean", "RMS", "peak", "unit")
+    room = min(max(LEAST_TRACE, width - _width(titles, rows)), WIDEST_TRACE)
+    return _table(
+        (*titles, "last 10 s"),
+        [
+            (*row, Text(trace(values, width=room), "#4cc9f0"))
+            for row, values in zip(rows, shown, strict=True)
+        ],
+    )
+
+
+def checks(sensors: Sequence[SensorPreview]) -> list[Text]:
+    """Return what the checks find, the worst first; the last line says whether all is ready."""
+    found = check_before_test(sensors)
+    lines = [
+        Text(f"▲ {sentence(each)}", BAD if each.prevents else DOUBTFUL)
+        for each in sorted(found, key=lambda each: not each.prevents)
+    ]
+    preventing = list(dict.fromkeys(each.sensor for each in found if each.prevents))
+    if not is_complete(sensors):
+        return [*lines, Text("checking …", MUTED)]
+    if preventing:
+        return [*lines, Text(f"not ready: put {listed(preventing)} right first", BAD)]
+    return [*lines, Text("✓ ready: s starts a test", f"bold {GOOD}")]
+
+
+def sentence(finding: Finding) -> str:
+    """Return a finding with what to do."""
+    return ADVICE[finding.problem].format(
+        sensor=finding.sensor, channel=finding.channel, value=finding.value, text=finding.text
+    )
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
+    for title in titles:
+        table.add_column(title, no_wrap=True, justify="right" if title in NUMBERS else "left")
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _width(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> int:
+    """Return the cells that columns take, each with the space after it."""
+    widest = (max(len(t), *(row[n].cell_len for row in rows), 0) for n, t in enumerate(titles))
+    return sum(widest) + 2 * len(titles)

@@ -1,20 +1,40 @@
-"""The Bench view: the sensors before a test."""
+"""The Bench view: the sensors before a test, live, and whether all is ready."""
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, ClassVar
 
+from rich.console import Group
 from rich.text import Text
+from textual import on, work
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
-from tui.application.bench_view.sensors import sensors_of_bench
+from daq.errors import HuddleError
+from tui.application.bench_view.sensors import (
+    channel_traces,
+    checks,
+    sensor_states,
+    sensors_of_bench,
+)
+from tui.application.messages import ErrorReported, PreviewUpdated
 from tui.application.state import BENCH
 from tui.application.view import BAD, MUTED, View
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from textual.app import ComposeResult
+
+    from daq.acquisition.preview import SensorPreview
+    from tui.application.controls import Preview
+    from tui.application.state import State
+
+
+MOST_LINES = 6
+"""Lines of findings that are shown."""
 
 
 class BenchView(View):
@@ -22,14 +42,27 @@ class BenchView(View):
 
     VIEW = BENCH
     BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("p", "preview", "Check sensors"),
+        Binding("f", "freeze", "Freeze"),
         Binding("s", "app.start", "Start test"),
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
     ]
-    KEYS = (("s", "start a recording of this bench"),)
+    KEYS = (
+        ("p", "check the sensors: read them live without recording; p again ends it"),
+        ("f", "freeze the traces; f again lets them go on"),
+        ("s", "start a test: operator, note, and when it ends by itself"),
+    )
+
+    def __init__(self, state: State, preview: Preview | None = None) -> None:
+        super().__init__(state)
+        self._preview = preview
+        self._sensors: Sequence[SensorPreview] = ()
+        self._ended: threading.Event | None = None
+        self._is_frozen = False
 
     def parts(self) -> ComposeResult:
-        """Yield the sensors, and one line on what to do."""
+        """Yield the sensors, what is wrong, and one line on what to do."""
         with VerticalScroll(id="bench", can_focus=False):
             yield Static(id="table")
         yield Static(id="alert")
@@ -38,9 +71,85 @@ class BenchView(View):
     def draw(self) -> None:
         """Draw the state."""
         state = self.state
-        self.query_one("#table", Static).update(sensors_of_bench(state))
-        failure = [Text(f"▲ {line}", BAD) for line in state.failure.splitlines()]
-        self.set_class(bool(failure), "-alert")
-        self.query_one("#alert", Static).update(Text("\n").join(failure[:5]))
-        todo = "s starts a test · ? helps" if state.can_start else "2 shows the test · ? helps"
-        self.query_one("#progress", Static).update(Text(state.note or todo, MUTED))
+        if (state.is_starting or state.is_recording) and self._ended is not None:
+            self.end_preview()
+        is_live = self._ended is not None and bool(self._sensors)
+        table = self.query_one("#table", Static)
+        if is_live:
+            width = self.app.size.width - 4
+            traces = channel_traces(self._sensors, width=width)
+            states = sensor_states(self._sensors, width=width)
+            table.update(Group(states, "", traces))
+        else:
+            table.update(sensors_of_bench(state))
+        lines = [Text(f"▲ {line}", BAD) for line in state.failure.splitlines()]
+        lines += checks(self._sensors) if is_live else []
+        self.set_class(bool(lines), "-alert")
+        if len(lines) > MOST_LINES:
+            more = Text(f"and {len(lines) - MOST_LINES + 1} more", MUTED)
+            lines = [*lines[: MOST_LINES - 2], more, lines[-1]]
+        self.query_one("#alert", Static).update(Text("\n").join(lines))
+        self.query_one("#progress", Static).update(Text(state.note or self._todo(), MUTED))
+
+    def _todo(self) -> str:
+        if self._ended is not None:
+            frozen = "frozen: f goes on · " if self._is_frozen else ""
+            return f"{frozen}reading the sensors, nothing is recorded · p ends it"
+        if self.check_action("preview", ()):
+            return "p checks the sensors · s starts a test · ? helps"
+        return "2 shows the test · ? helps"
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Offer only what can be done now."""
+        del parameters
+        state = self.state
+        if action == "preview":
+            is_busy = state.is_recording or state.is_starting
+            return self._preview is not None and state.can_start and not is_busy
+        return self._ended is not None if action == "freeze" else True
+
+    def on_screen_suspend(self) -> None:
+        """Release the ports when another view is shown."""
+        self.end_preview()
+
+    def on_unmount(self) -> None:
+        """Release the ports."""
+        self.end_preview()
+
+    def end_preview(self) -> None:
+        """End reading the sensors; the ports are free a moment later."""
+        if self._ended is not None:
+            self._ended.set()
+        self._ended, self._sensors, self._is_frozen = None, (), False
+
+    def action_preview(self) -> None:
+        """Read the sensors, or end that."""
+        if self._ended is not None:
+            self.end_preview()
+        elif self._preview is not None:
+            self._ended = threading.Event()
+            self._read(self._preview, self._ended)
+        self.show(self.state)
+        self.refresh_bindings()
+
+    def action_freeze(self) -> None:
+        """Keep the traces as they are, or let them go on."""
+        self._is_frozen = not self._is_frozen
+        self.show(self.state)
+
+    @work(thread=True, group="preview")
+    def _read(self, preview: Preview, ended: threading.Event) -> None:
+        def post(sensors: tuple[SensorPreview, ...]) -> None:
+            if not ended.is_set():
+                self.post_message(PreviewUpdated(sensors))
+
+        try:
+            preview(post, ended)
+        except (HuddleError, OSError) as error:
+            self.post_message(ErrorReported(str(error)))
+
+    @on(PreviewUpdated)
+    def _on_preview(self, message: PreviewUpdated) -> None:
+        if self._ended is not None and not self._is_frozen:
+            self._sensors = message.sensors
+            self.show(self.state)

@@ -1,0 +1,186 @@
+"""Reads the sensors of a bench before a test: their latest samples, and why a port fails.
+
+Nothing is recorded. A port that fails is tried again. The recorder opens the ports itself: end the
+preview before a test starts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from daq.acquisition.device_check import arrival_rate
+from daq.acquisition.device_identity import check_identity, with_owner
+from daq.drivers.registry import driver_type
+from daq.errors import DeviceError, WrongDeviceError
+from daq.protocols.block import Block, BlockFlag
+from daq.protocols.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import AsyncGenerator, Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Bench, Sensor
+    from daq.drivers.interface import DeviceInformation
+    from daq.host_clock import HostClock
+    from daq.protocols.block import Event
+
+LENGTH = 10.0
+"""Seconds of samples that are kept."""
+INTERVAL = 0.5
+"""Seconds from one update to the next."""
+RETRY = 2.0
+"""Seconds until a port that failed is opened again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorPreview:
+    """One sensor at one moment.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        As in the bench file.
+    information : DeviceInformation or None
+        As reported by the device; None before it has answered.
+    samples : float64, shape (n_samples, n_channels)
+        The latest samples in the units of the channels.
+    last_ns : int
+        Host monotonic time of the last one.
+    measured_rate : float or None
+        Samples per second by the host's clock; None while it is not known.
+    is_clipping : bool
+        Whether a sample reached the end of the range.
+    n_missing : int
+        Samples missing between those that are kept.
+    trouble : str
+        Why the sensor does not deliver, or is not the one that the bench file names.
+    """
+
+    sensor: Sensor
+    information: DeviceInformation | None
+    samples: NDArray[np.float64]
+    last_ns: int = 0
+    measured_rate: float | None = None
+    is_clipping: bool = False
+    n_missing: int = 0
+    trouble: str = ""
+
+
+class _SensorBuffer:
+    """The latest blocks of one sensor."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.information: DeviceInformation | None = None
+        self.trouble = ""
+        self._blocks: deque[Block] = deque()
+        self._n_samples = 0
+
+    def clear(self) -> None:
+        self._blocks.clear()
+        self._n_samples = 0
+
+    def add(self, block: Block) -> None:
+        self._blocks.append(block)
+        self._n_samples += block.n_samples
+        most = LENGTH * self.sensor.sampling_rate
+        while self._n_samples - self._blocks[0].n_samples >= most:
+            self._n_samples -= self._blocks.popleft().n_samples
+
+    def preview(self) -> SensorPreview:
+        blocks = list(self._blocks)
+        if not blocks:
+            none = np.empty((0, len(self.sensor.channels)))
+            return SensorPreview(self.sensor, self.information, none, trouble=self.trouble)
+        counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
+        return SensorPreview(
+            self.sensor,
+            self.information,
+            counts / [channel.sensitivity for channel in self.sensor.channels],
+            last_ns=blocks[-1].received.monotonic_ns,
+            measured_rate=arrival_rate(blocks),
+            is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
+            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
+            trouble=self.trouble,
+        )
+
+
+async def preview(
+    bench: Bench,
+    clock: HostClock,
+    show: Callable[[tuple[SensorPreview, ...]], None],
+    *,
+    ended: threading.Event,
+    interval: float = INTERVAL,
+) -> None:
+    """Read all sensors until `ended` is set, and show them again and again.
+
+    Parameters
+    ----------
+    bench : Bench
+    clock : HostClock
+    show : callable
+        Called with all sensors in the order of the bench file.
+    ended : threading.Event
+        May be set by another thread.
+    interval : float
+        Seconds between updates.
+    """
+    buffers = {sensor.name: _SensorBuffer(sensor) for sensor in bench.sensors}
+    async with asyncio.TaskGroup() as group:
+        tasks = [
+            group.create_task(_read_port(bench, sensors, clock, buffers))
+            for sensors in bench.ports().values()
+        ]
+        while not ended.is_set():
+            await asyncio.sleep(interval)
+            show(tuple(buffer.preview() for buffer in buffers.values()))
+        for task in tasks:
+            task.cancel()
+
+
+async def _read_port(
+    bench: Bench, sensors: Sequence[Sensor], clock: HostClock, buffers: dict[str, _SensorBuffer]
+) -> None:
+    """Read one port for ever; open it again after it failed."""
+    mine = [buffers[sensor.name] for sensor in sensors]
+    while True:
+        try:
+            await _read_once(bench, sensors, clock, buffers)
+            trouble = "the device ended by itself"
+        except DeviceError as error:
+            trouble = str(with_owner(error, bench.sensors))
+        except RemoteProtocolError as error:
+            trouble = f"port {sensors[0].port}: {error}"
+        for buffer in mine:
+            buffer.clear()
+            buffer.trouble = trouble
+        await asyncio.sleep(RETRY)
+
+
+async def _read_once(
+    bench: Bench, sensors: Sequence[Sensor], clock: HostClock, buffers: dict[str, _SensorBuffer]
+) -> None:
+    async with driver_type(sensors[0].driver).open(sensors, clock) as session:
+        for sensor, about in zip(sensors, session.information, strict=True):
+            buffer = buffers[sensor.name]
+            buffer.information, buffer.trouble = about, about.trouble
+            if not about.trouble:
+                try:
+                    check_identity(sensor, about)
+                except WrongDeviceError as error:
+                    buffer.trouble = str(with_owner(error, bench.sensors))
+        async with contextlib.aclosing(
+            cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
+        ) as stream:
+            async for item in stream:
+                if isinstance(item, Block):
+                    buffers[item.sensor].add(item)

@@ -1,0 +1,136 @@
+"""The Bench view: sensors live before a test, what is wrong, and ready."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.acquisition.preview import SensorPreview
+from daq.drivers.interface import DeviceInformation
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.application.test_app import NARROW, WIDE, shown
+from tests.tui.example_snapshot import ProgressCallback, demo_bench
+from tui.application.app import HuddleApp
+from tui.application.bench_view.traces import trace
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SOUND = tuple(
+    SensorPreview(
+        sensor,
+        DeviceInformation(sensor.name, "A352AD10", f"S{n}", "1.4", 200.0, 25.0),
+        np.random.default_rng(1).normal(size=(2000, 3)).cumsum(axis=0) * 1e-4 * (1 + n),
+        last_ns=10**10,
+        measured_rate=200.0 + n / 10,
+    )
+    for n, sensor in enumerate(demo_bench().sensors)
+)
+
+
+@dataclass
+class Reading:
+    """Shows sensors once, and waits until nobody wants more."""
+
+    sensors: tuple[SensorPreview, ...]
+    begun: threading.Event = field(default_factory=threading.Event)
+    is_over: threading.Event = field(default_factory=threading.Event)
+
+    def __call__(
+        self, show: Callable[[tuple[SensorPreview, ...]], None], ended: threading.Event
+    ) -> None:
+        """Show them."""
+        show(self.sensors)
+        self.begun.set()
+        ended.wait(60)
+        self.is_over.set()
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench(), sensors=Reading(SOUND))
+
+
+async def live(told: ProgressCallback, *sensors: SensorPreview) -> Reading:
+    """Prepare what a preview shows."""
+    told.sensors = reading = Reading(sensors or SOUND)
+    return reading
+
+
+@pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
+async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    reading = await live(told)
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(60)
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-bench")
+        await pilot.press("p")
+        reading.is_over.wait(60)
+        await shown(pilot, app)
+        assert "last 10 s" not in screen_text(app)
+
+
+async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(
+    told: ProgressCallback,
+) -> None:
+    a, b, c = SOUND
+    dead = a.samples.copy()
+    dead[:, 1] = 1.0
+    gone = replace(c, samples=c.samples[:0], trouble="sensor 'C' on /dev/ttyUSB2: no answer")
+    reading = await live(told, replace(a, samples=dead), replace(b, is_clipping=True), gone)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(60)
+        await shown(pilot, app)
+        text = screen_text(app)
+    for said in (
+        "A.Y does not change: nothing is connected, or it is dead",
+        "B is clipping: reduce the motion",
+        "sensor 'C' on /dev/ttyUSB2: no answer",
+        "not ready: put A, B and C right first",
+        "▲ trouble",
+    ):
+        assert said in text
+
+
+@pytest.mark.parametrize("key", ["2", "s"])
+async def test_the_ports_are_released_before_a_test_and_with_the_view(
+    told: ProgressCallback, key: str
+) -> None:
+    reading = await live(told)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(60)
+        await shown(pilot, app)
+        await pilot.press(key, *(["enter"] if key == "s" else []))
+        await shown(pilot, app)
+        assert reading.is_over.wait(60)
+
+
+async def test_frozen_traces_stay(told: ProgressCallback) -> None:
+    reading = await live(told)
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+        await pilot.press("p")
+        reading.begun.wait(60)
+        await shown(pilot, app)
+        await pilot.press("f")
+        await shown(pilot, app)
+        assert "frozen: f goes on" in screen_text(app)
+
+
+def test_a_trace_shows_the_range_of_the_values() -> None:
+    rising = trace(np.arange(80.0), width=4)
+    assert rising == "⣀⠤⠒⠉"
+    assert trace(np.zeros(80), width=4) == "⠤⠤⠤⠤"
+    assert trace(np.tile([0.0, 1.0], 40), width=2) == "⣿⣿"
+    assert trace(np.array([1.0]), width=3) == "   "

@@ -1,0 +1,41 @@
+"""Traces of channels as rows of Braille characters. Does not use Textual."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
+"""Bits of the dots of a Braille character, by column and row from the top."""
+
+
+def trace(values: NDArray[np.float64], *, width: int) -> str:
+    """Return one row that shows the range of the values in each of its dot columns.
+
+    The scale is that of the values: their range is the height of the row. Constant values are a
+    line in the middle.
+    """
+    n_columns = 2 * width
+    if len(values) < 2 or width < 1:
+        return " " * max(width, 0)
+    edges = np.linspace(0, len(values), min(n_columns, len(values)) + 1).astype(int)
+    high = np.maximum.reduceat(values, edges[:-1])
+    low = np.minimum.reduceat(values, edges[:-1])
+    bottom, span = float(low.min()), float(np.ptp(values))
+    if span == 0:
+        first = last = np.full(len(high), 2)
+    else:
+        first, last = (
+            np.clip(np.floor((1 - (each - bottom) / span) * 4), 0, 3).astype(int)
+            for each in (high, low)
+        )
+    cells = np.zeros(width, dtype=int)
+    for column in range(n_columns):
+        at = column * len(high) // n_columns
+        for row in range(first[at], last[at] + 1):
+            cells[column // 2] |= DOTS[column % 2][row]
+    return "".join(chr(0x2800 + cell) for cell in cells)
