@@ -97,6 +97,8 @@ class BenchView(View):
             return f"{frozen}reading the sensors, nothing is recorded · p ends it"
         if self.check_action("preview", ()):
             return "p checks the sensors · s starts a test · ? helps"
+        if self.state.can_start and not self.state.is_recording:
+            return "s starts a test · ? helps"
         return "2 shows the test · ? helps"
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
