@@ -21,7 +21,8 @@ def reproduce(
         typer.Argument(
             metavar="STUDY",
             help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, clocks, "
-            "verdicts (default: all).",
+            "verdicts, coverage, small-samples, many-sensors, quiet, unequal, shared-noise, "
+            "noise-terms (default: all).",
         ),
     ] = None,
     *,

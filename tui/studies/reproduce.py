@@ -16,6 +16,7 @@ from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
 from tui.studies.clocks import clocks
+from tui.studies.estimates import ESTIMATES
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback, Series, Study
 
 CLOCKS, VERDICTS = "clocks", "verdicts"
-STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS)
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
@@ -69,6 +70,8 @@ def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> I
             yield clocks(told, length=length)
         elif name == VERDICTS:
             yield verdicts(told, length=length)
+        elif name in ESTIMATES:
+            yield ESTIMATES[name](told, length)
         elif name in NUMERICAL:
             yield NUMERICAL[name](ingredients)
         else:
