@@ -115,6 +115,10 @@ class RecordingError(HuddleError, OSError):
     """A recording cannot be read or written."""
 
 
+class DiskError(RecordingError):
+    """The disk refused to take a recording, again and again."""
+
+
 class NotARecordingError(RecordingError):
     """The file is not a huddle recording, or of a format newer than this program."""
 

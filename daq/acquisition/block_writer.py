@@ -6,7 +6,7 @@ Has no clock and no event loop; the recorder calls it from its writing thread.
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
+from collections import defaultdict, deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from daq.acquisition.connection import SensorLate, SensorLost
 from daq.acquisition.sample_index import Gap, SampleIndexer
 from daq.protocols.block import Block, Event, EventKind
 from daq.recording.sensor_state import SensorState
+from daq.recording.writer import SensorCounts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -57,6 +58,51 @@ class _Sensor:
         self.n_missing = 0
         self.n_repeated = 0
         self.repeats_reported_ns = -_REPORT_INTERVAL_NS
+        self.unsafe = _Unsafe()
+        self.rows_before = self.gaps_before = 0
+        """Rows and gaps that are safe in earlier files."""
+        self.base = 0
+        """Index of the first sample of the current file."""
+
+
+class _Unsafe:
+    """What one sensor has in the current file and no commit has acknowledged.
+
+    Needed where a file cannot be written any more, and the recording goes on in another.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: deque[tuple[int, Block]] = (
+            deque()
+        )  # with the file's rows up to each one's end
+        self._gaps: deque[Gap] = deque()
+        self._n_rows = self._n_gaps = 0
+        self.safe = SensorCounts(0, 0, 0)
+
+    def add(self, item: Block | Gap) -> None:
+        if isinstance(item, Gap):
+            self._gaps.append(item)
+            self._n_gaps += 1
+        else:
+            self._n_rows += item.n_samples
+            self._blocks.append((self._n_rows, item))
+
+    def are_safe(self, counts: SensorCounts) -> None:
+        """Forget what a commit has acknowledged."""
+        self.safe = counts
+        while self._blocks and self._blocks[0][0] <= counts.rows:
+            self._blocks.popleft()
+        while self._n_gaps - len(self._gaps) < counts.gaps:
+            self._gaps.popleft()
+
+    def taken(self) -> list[Block | Gap]:
+        """Return the rest, for another file, which has nothing yet."""
+        rest: list[Block | Gap] = [*self._gaps, *(block for _, block in self._blocks)]
+        self._blocks.clear()
+        self._gaps.clear()
+        self._n_rows = self._n_gaps = 0
+        self.safe = SensorCounts(0, 0, 0)
+        return rest
 
 
 class _RateLimit:
@@ -93,16 +139,21 @@ class BlockWriter:
         self._writer = writer
         self._sensors = {name: _Sensor(rate) for name, rate in sampling_rates.items()}
         self._limits: defaultdict[tuple[str, str], _RateLimit] = defaultdict(_RateLimit)
+        self._items: deque[Item] = deque()
+        self._unsafe_events: list[Event] = []
+        self._ended = False
 
     def write(self, items: Iterable[Item]) -> None:
-        """Write items in order.
+        """Write items in order, after those that an error has left.
 
         Raises
         ------
         RecordingError
             If the file cannot be written.
         """
-        for item in items:
+        self._items.extend(items)
+        while self._items:
+            item = self._items.popleft()
             if isinstance(item, Block):
                 self._write_block(item)
             elif isinstance(item, Event):
@@ -115,16 +166,55 @@ class BlockWriter:
                 self._begin_session(item)
 
     @property
+    def run_id(self) -> str:
+        """Unique identifier of the current file."""
+        return self._writer.run_id
+
+    @property
     def n_written(self) -> int:
         """Rows of samples of all sensors in the file: those that a commit now would make safe."""
         return self._writer.n_written
 
     def commit(self) -> Committed:
         """Make what was written safe."""
-        return self._writer.commit()
+        committed = self._writer.commit()
+        for name, counts in committed.sensors.items():
+            self._sensors[name].unsafe.are_safe(counts)
+        self._unsafe_events.clear()
+        return committed
+
+    def continue_in(self, writer: RecordingWriter) -> None:
+        """Go on in another file, and write there what is not safe in the one before."""
+        before, self._writer = self._writer, writer
+        before.abandon()  # only now: a follower that sees it ended finds where it goes on
+        events, self._unsafe_events = self._unsafe_events, []
+        for event in events:
+            self._unsafe_events.append(event)
+            writer.event(event)
+        for name, sensor in self._sensors.items():
+            sensor.rows_before += sensor.unsafe.safe.rows
+            sensor.gaps_before += sensor.unsafe.safe.gaps
+            rest = sensor.unsafe.taken()
+            sensor.base = min(
+                (item.first_sample for item in rest), default=sensor.indexer.next_sample
+            )
+            for item in rest:
+                if isinstance(item, Block):
+                    self._append(name, item)
+                else:
+                    self._append_gap(name, item)
 
     def close(self, now: HostTime, reason: str) -> Committed:
-        """Record the last gap of lost sensors and why the run ended, and close the file."""
+        """Record the last gap of lost sensors and why the run ended, and close the file.
+
+        After an error it may be called again.
+        """
+        if not self._ended:
+            self._ended = True
+            self._end(now, reason)
+        return self._writer.close()
+
+    def _end(self, now: HostTime, reason: str) -> None:
         for name, sensor in self._sensors.items():
             if sensor.state.is_lost or sensor.state is SensorState.WAITING:
                 gap = sensor.indexer.lost_until(now, "lost at the end")
@@ -136,7 +226,6 @@ class BlockWriter:
             for event in limit.left_out(Event(name, kind, "", now)):
                 self._record(event)
         self._record(Event("", EventKind.STOPPED, reason, now))
-        return self._writer.close()
 
     def abandon(self) -> None:
         """Close the file without writing anything more."""
@@ -146,7 +235,10 @@ class BlockWriter:
         """Return the progress of each sensor."""
         return {
             name: SensorProgress(
-                self._sensors[name].state, counts.rows, counts.gaps, self._sensors[name].n_missing
+                self._sensors[name].state,
+                self._sensors[name].rows_before + counts.rows,
+                self._sensors[name].gaps_before + counts.gaps,
+                self._sensors[name].n_missing,
             )
             for name, counts in committed.sensors.items()
         }
@@ -198,7 +290,12 @@ class BlockWriter:
             self._write_gap(block.sensor, sensor, placed.gap)
         if placed.block is not None:
             sensor.state, sensor.late_event = SensorState.LIVE, None
-            self._writer.append(placed.block)
+            self._append(block.sensor, placed.block)
+
+    def _append(self, name: str, block: Block) -> None:
+        sensor = self._sensors[name]
+        sensor.unsafe.add(block)
+        self._writer.append(replace(block, first_sample=block.first_sample - sensor.base))
 
     def _report_repeated(self, sensor: _Sensor, block: Block) -> None:
         """Report at most once a second: a device may repeat everything, for weeks."""
@@ -210,6 +307,7 @@ class BlockWriter:
 
     def _record(self, event: Event) -> None:
         """Write an event to the recording and to the log."""
+        self._unsafe_events.append(event)
         self._writer.event(event)
         level = logging.INFO if event.kind in _ROUTINE else logging.WARNING
         what = " ".join(part for part in (event.sensor, event.kind) if part)
@@ -223,6 +321,15 @@ class BlockWriter:
             *(name, gap.missing, gap.first_sample, gap.reason),
             extra={"sensor": name, "first_sample": gap.first_sample, "missing": gap.missing},
         )
+        self._append_gap(name, gap)
+
+    def _append_gap(self, name: str, gap: Gap) -> None:
+        sensor = self._sensors[name]
+        sensor.unsafe.add(gap)
         self._writer.gap(
-            name, gap.first_sample, gap.missing, reason=gap.reason, estimated=gap.estimated
+            name,
+            gap.first_sample - sensor.base,
+            gap.missing,
+            reason=gap.reason,
+            estimated=gap.estimated,
         )

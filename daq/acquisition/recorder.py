@@ -18,24 +18,25 @@ import logging
 import math
 import re
 import signal
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from daq.acquisition.block_writer import BlockWriter, SensorProgress
 from daq.acquisition.connection import CLOSE_TIMEOUT, Connection
 from daq.acquisition.device_identity import with_owner
 from daq.drivers.registry import driver_type
-from daq.errors import DeviceError
+from daq.errors import DeviceError, DiskError, RecordingError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Event, EventKind
 from daq.protocols.errors import RemoteProtocolError
 from daq.recording import control
 from daq.recording.control import Command
 from daq.recording.file_format import SensorLayout
+from daq.recording.storage.names import CONTINUES, continuation_names
+from daq.recording.storage.writing_thread import WritingThread
 from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 0.5, 0.25
 CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
 """Seconds that all connections may take to end."""
 _BATCH_INTERVAL = 0.1
+MIN_CONTINUATION = 60.0
+"""Seconds that a file that continues another must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0
 """Seconds after the end of a run in which its last blocks may arrive."""
 _Result = TypeVar("_Result")
@@ -155,7 +158,7 @@ async def record(
     ExceptionGroup of DeviceError
         If devices cannot be used at the start: one error for each, naming its sensor.
     RecordingError
-        If the file cannot be written; everything acknowledged is safe.
+        If no file can be written; everything acknowledged is safe.
     """
     clock = SystemClock(bench.speed) if clock is None else clock
     recorder = _Recorder(bench, Path(path), clock, stop or asyncio.Event(), acknowledged)
@@ -172,12 +175,12 @@ class _Recorder:
         acknowledged: Callable[[RecorderStatus], None] | None,
     ) -> None:
         self._bench = bench
-        self._path = path
+        self._path = self._file = path
         self._clock = clock
         self._stop = stop
         self._acknowledged = acknowledged
         self._queue: asyncio.Queue[Item] = asyncio.Queue(QUEUE_LENGTH)
-        self._started = clock.now()
+        self._started = self._file_started = clock.now()
         self._end_reason = "stopped"
         self._status = RecorderStatus(str(path), 0.0, {})
 
@@ -196,7 +199,7 @@ class _Recorder:
             try:
                 if not await self._all_connected(connections):
                     return self._status
-                with _WritingThread() as thread:
+                with WritingThread() as thread:
                     writer = await thread.run(lambda: self._create(connections, address, duration))
                     try:
                         start.set()
@@ -271,15 +274,12 @@ class _Recorder:
                     )
                 layouts[sensor.name] = layout
         ordered = [layouts[sensor.name] for sensor in self._bench.sensors]
-        self._started = self._clock.now()
-        writer = RecordingWriter.create(
-            self._path,
-            self._bench,
-            sensors=ordered,
-            created=self._started,
-            control=address,
-            attributes={} if duration is None else {"duration": duration},
+        self._started = self._file_started = self._clock.now()
+        self._new_file = partial(
+            RecordingWriter.create, bench=self._bench, sensors=ordered, control=address
         )
+        attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
+        writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
         return BlockWriter(writer, {layout.name: layout.sampling_rate for layout in ordered})
@@ -287,7 +287,7 @@ class _Recorder:
     async def _write_until_end(
         self,
         writer: BlockWriter,
-        thread: _WritingThread,
+        thread: WritingThread,
         duration: float | None,
         tasks: Sequence[asyncio.Task[None]],
     ) -> None:
@@ -296,7 +296,9 @@ class _Recorder:
         last_commit, n_committed = -math.inf, 0
         while not self._stop.is_set():
             batch = await self._batch()
-            await thread.run(partial(writer.write, batch))
+            await self._done(
+                writer, thread, partial(writer.write, batch), partial(writer.write, ())
+            )
             for task in tasks:
                 if task.done():  # a connection ends only by an error in the program
                     task.result()
@@ -304,7 +306,7 @@ class _Recorder:
             interval = MIN_COMMIT_INTERVAL if chunk_waits else COMMIT_INTERVAL
             if loop.time() >= last_commit + interval:
                 n_committed = writer.n_written
-                self._acknowledge(writer, await thread.run(writer.commit))
+                self._acknowledge(writer, await self._done(writer, thread, writer.commit))
                 last_commit = loop.time()
             elif (sensors := self._with_current_states(writer)) != self._status.sensors:
                 self._publish(replace(self._status, sensors=sensors))
@@ -325,14 +327,56 @@ class _Recorder:
             batch.append(self._queue.get_nowait())
         return batch
 
-    async def _finish(self, writer: BlockWriter, thread: _WritingThread) -> None:
-        await thread.run(partial(writer.write, self._queued()))
+    async def _finish(self, writer: BlockWriter, thread: WritingThread) -> None:
+        write = partial(writer.write, self._queued())
+        await self._done(writer, thread, write, partial(writer.write, ()))
         close = partial(writer.close, self._clock.now(), self._end_reason)
-        self._acknowledge(writer, await thread.run(close))
+        self._acknowledge(writer, await self._done(writer, thread, close))
+
+    async def _done(
+        self,
+        writer: BlockWriter,
+        thread: WritingThread,
+        action: Callable[[], _Result],
+        again: Callable[[], _Result] | None = None,
+    ) -> _Result:
+        """Do something with the file; if the disk refuses, do it `again` in another file."""
+        try:
+            return await thread.run(action)
+        except DiskError as error:
+            await thread.run(partial(self._continue, writer, error))
+        return await thread.run(again or action)
+
+    def _continue(self, writer: BlockWriter, error: DiskError) -> None:
+        """Continue the recording in another file.
+
+        Raises
+        ------
+        DiskError
+            The one given, if there cannot be another file, or if this one has not lasted.
+        """
+        now, before = self._clock.now(), self._file
+        lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
+        if before != self._path and lasted < MIN_CONTINUATION:
+            raise error
+        path = next(each for each in continuation_names(self._path) if not each.exists())
+        attributes: dict[str, str | float] = {CONTINUES: writer.run_id}
+        following = None
+        try:
+            following = self._new_file(path, created=now, attributes=attributes)
+            writer.continue_in(following)
+        except RecordingError:
+            if following is not None:
+                following.discard()
+            raise error from None
+        self._file, self._file_started = path, now
+        _LOGGER.error("%s; the recording continues in %s", error, path)
+        text = f"continues {before.name}, which could not be written any more"
+        writer.write([Event("", EventKind.STATUS, text, now)])
 
     def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
         sensors = writer.progress(committed)
-        self._publish(RecorderStatus(str(self._path), self._elapsed(), sensors, committed.closed))
+        self._publish(RecorderStatus(str(self._file), self._elapsed(), sensors, committed.closed))
 
     def _publish(self, status: RecorderStatus) -> None:
         self._status = status
@@ -358,25 +402,3 @@ class _Recorder:
         elif command is Command.MARK:
             await self._queue.put(Event("", EventKind.MARK, text, self._clock.now()))
         return self._status.to_dict()
-
-
-class _WritingThread:
-    """The only thread that accesses the file."""
-
-    def __init__(self) -> None:
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-
-    async def run(self, function: Callable[[], _Result]) -> _Result:
-        """Run a function in the thread, to its end even if this task is cancelled meanwhile."""
-        future = asyncio.get_running_loop().run_in_executor(self._executor, function)
-        try:
-            return await asyncio.shield(future)
-        except asyncio.CancelledError:
-            await asyncio.wait([future])
-            raise

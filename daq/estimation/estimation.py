@@ -39,7 +39,14 @@ from daq.estimation.noise_estimates import (
     quantisation_psd,
     up_to,
 )
-from daq.estimation.recording_set import check_same, check_span, open_another
+from daq.estimation.recording_set import (
+    check_same,
+    check_span,
+    continuations,
+    is_complete,
+    is_left,
+    open_another,
+)
 from daq.estimation.segment_course import segment_course
 from daq.estimation.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import Settings
@@ -105,6 +112,7 @@ class Estimation:
         try:
             for path in paths:
                 self._recordings.append(open_another(path, self._recordings))
+            self._open_continuations()
             self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
             self._passes = [Pass(recording, self.settings) for recording in self._recordings]
             check_same(self._passes)
@@ -176,6 +184,7 @@ class Estimation:
             If a file is damaged.
         """
         before = self.n_seen
+        self._continue()
         for each in self._passes:
             each.aligned.refresh()
         total, done = sum(each.n_complete for each in self._passes), before
@@ -218,6 +227,7 @@ class Estimation:
         WrongSettingError
             If nothing lies between start and end.
         """
+        self._continue()
         for each in self._passes:
             each.aligned.refresh()
         is_exact = all(each.aligned.is_exact for each in self._passes)
@@ -253,6 +263,20 @@ class Estimation:
         if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
             raise NoResultError(self._why_nothing(snapshot), snapshot)
         return snapshot
+
+    def _open_continuations(self) -> None:
+        for recording in tuple(self._recordings):
+            self._recordings.extend(continuations(recording, self._recordings))
+
+    def _continue(self) -> None:
+        """Take in the files in which the recorder has gone on since."""
+        if not is_left(self._recordings[-1]):
+            return
+        self._open_continuations()
+        for recording in self._recordings[len(self._passes) :]:
+            self._passes.append(Pass(recording, self.settings))
+            check_same(self._passes)
+        self._filter()
 
     def _filter(self) -> None:
         """Begin all passes again with the filters as they are now."""
@@ -359,7 +383,7 @@ class Estimation:
             sensors=tuple(SensorTotals.of(record, events) for record in latest.sensors),
             clocks=last.aligned.clocks,
             drift=last.drift(),
-            closed=all(recording.closed for recording in self._recordings),
+            closed=all(map(is_complete, self._recordings, (*self._recordings[1:], None))),
             left_out=self._left_out(),
             octaves=tuple(map(Octave.of, bands)) if self.settings.octaves else (),
             diagnostics=diagnostics,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
+from daq.estimation.recording_set import is_continued
 from daq.estimation.snapshot import NoResultError
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
@@ -133,14 +134,18 @@ def follow(
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = Recording.open(path)
     with Estimation([recording], settings) as estimation:
-        known = _RemoteRecorder(recording, cancelled, silence) if recorder is None else recorder
-        sensors = _Sensors(recording, observer) if watch_sensors else None
+
+        def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
+            remote = _RemoteRecorder(recording, cancelled, silence)
+            sensors = _Sensors(recording, observer) if watch_sensors else None
+            return remote if recorder is None else recorder, sensors
+
+        known, sensors = seen(recording)
         looks, estimates = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE)
         bench, wanted = recording.bench, 0.0
         speed = 1.0 if bench is None else bench.speed
         if sensors is not None:
             sensors.look()
-        closed = recording.closed
 
         def catch_up(done: int, total: int) -> None:
             if cancelled.is_set():
@@ -148,15 +153,19 @@ def follow(
             if estimation.n_seen == 0 or done < total:  # not of the one new segment
                 observer.progress(done, total)
 
-        while not closed:
+        while not recording.closed:
             with looks:
-                left_open = known.ended  # asked before: what it wrote last is seen below
+                # Asked before: what it wrote last is seen below.
+                left_open = known.ended and not is_continued(recording)
                 try:
                     estimation.update(catch_up)
                 except _CancelledError:
                     return None
-                closed = recording.closed
-                if closed:
+                newest = estimation.recordings[-1]
+                if newest is not recording and isinstance(newest, Recording):
+                    recording = newest  # the disk refused the one before
+                    known, sensors = seen(recording)
+                if recording.closed:
                     break
                 if left_open:
                     raise RecordingLeftOpenError(

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.bench.durations import format_duration
-from daq.errors import CannotAlignError, WrongSettingError
+from daq.errors import CannotAlignError, RecordingError, WrongSettingError
 from daq.recording.reader import Recording
+from daq.recording.storage.locking import is_being_written
+from daq.recording.storage.names import continuation_names
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from daq.estimation.segment_pass import Pass
     from daq.estimation.settings import Settings
@@ -45,6 +48,64 @@ def open_another(
             recording.close()
             raise _twice(path, other)
     return recording
+
+
+def continuations(
+    recording: ReadableRecording, others: Sequence[ReadableRecording]
+) -> Iterator[Recording]:
+    """Open and yield the recordings that continue this one, but for `others` and empty ones.
+
+    A recorder goes on in another file where the disk refuses to take the first one. The caller
+    closes them.
+    """
+    known = {other.run_id for other in others}
+    for found in _following(recording):
+        if found.run_id in known or not all(sensor.n_samples for sensor in found.sensors):
+            found.close()
+        else:
+            yield found
+
+
+def is_continued(recording: ReadableRecording) -> bool:
+    """Return whether a recorder is writing a file that continues this recording."""
+    written = False
+    for found in _following(recording):
+        found.close()
+        written |= is_being_written(found.path)
+    return written
+
+
+def is_left(recording: ReadableRecording) -> bool:
+    """Return whether nobody writes a recording that was not closed; it may go on in another."""
+    return (
+        isinstance(recording, Recording)
+        and not recording.closed
+        and not is_being_written(recording.path)
+    )
+
+
+def is_complete(recording: ReadableRecording, following: ReadableRecording | None) -> bool:
+    """Return whether a recording was closed, or is continued by the one that follows."""
+    continues = following.continues if isinstance(following, Recording) else ""
+    return recording.closed or continues == recording.run_id
+
+
+def _following(recording: ReadableRecording) -> Iterator[Recording]:
+    """Open and yield the recordings that continue this one, in their order."""
+    if not isinstance(recording, Recording):
+        return
+    run_id = recording.run_id
+    names = continuation_names(recording.path)
+    for path in itertools.takewhile(lambda each: each.exists(), names):
+        try:
+            found = Recording.open(path)
+        except RecordingError:  # another file that has such a name
+            continue
+        if found.continues == run_id:
+            run_id = found.run_id
+            yield found
+        else:
+            found.close()
 
 
 def check_same(passes: Sequence[Pass]) -> None:

@@ -21,6 +21,7 @@ from daq.recording import file_format
 from daq.recording.description import damaged_tables, result_crc32
 from daq.recording.sensor_record import CommittedRows, SensorRecord
 from daq.recording.storage.journal import journal_path
+from daq.recording.storage.names import CONTINUES
 from daq.recording.storage.opening import open_file, refresh, source_of
 from daq.recording.storage.refusals import (
     check_counts,
@@ -63,6 +64,8 @@ class Recording:
         self.bench_text = text(attributes, "bench")
         self.duration = float(number(attributes, "duration")) if "duration" in attributes else None
         """Planned length in seconds; None where it was to last until stopped."""
+        self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
+        """The ``run_id`` of the recording that this one continues; empty for most."""
         self._committed = dataset(file, "committed", np.dtype("<i8"))
         names = [str(name) for name in self._committed.attrs["sensors"]]
         if not names or len(set(names)) < len(names):

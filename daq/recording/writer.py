@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from daq.errors import RecordingError
+from daq.errors import DiskError, RecordingError
 from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
 from daq.recording.creation import make_datasets, write_attributes
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime
     from daq.recording.file_format import SensorLayout
 
-_BROKEN: list[RecordingWriter] = []
+BROKEN: list[RecordingWriter] = []
 """Writers whose file HDF5 could not close. Their objects must not be freed: that fails, too, prints
 tracebacks, and may crash. The recorder ends without freeing anything."""
 
@@ -94,6 +94,7 @@ class RecordingWriter:
         self._sensors = {s.name: SensorRows(file["sensors"][s.name], s) for s in sensors}
         self._events = TableBuffer(file["events"])
         self._committed = file["committed"]
+        self._run_id = str(file.attrs["run_id"])
         self._failed = False
 
     @classmethod
@@ -177,6 +178,11 @@ class RecordingWriter:
         return writer
 
     @property
+    def run_id(self) -> str:
+        """Unique identifier of the recording."""
+        return self._run_id
+
+    @property
     def n_written(self) -> int:
         """Number of rows of samples of all sensors in the file, committed or not."""
         return sum(sensor.samples.n_written for sensor in self._sensors.values())
@@ -240,6 +246,14 @@ class RecordingWriter:
             return done
         finally:
             self.abandon()
+
+    def discard(self) -> None:
+        """Close and remove the file: nothing was acknowledged that is only there."""
+        self.abandon()
+        with contextlib.suppress(OSError):
+            self.path.unlink(missing_ok=True)
+            if self._journal is not None:
+                self._journal.remove()
 
     def abandon(self) -> None:
         """Close the file without writing buffered rows."""
@@ -337,7 +351,7 @@ class RecordingWriter:
                 yield
         except RecordingError:
             self._failed = True
-            _BROKEN.append(self)
+            BROKEN.append(self)
             raise
 
 
@@ -351,7 +365,7 @@ def _as_recording_error(path: Path) -> Iterator[None]:
         # HDF5 raises RuntimeError for a full disk, with the system's message only in its text.
         found = re.search(r"error message = '([^']+)'", str(error))
         reason = found[1] if found else error
-        raise RecordingError(f"{path}: cannot be written: {reason}") from error
+        raise DiskError(f"{path}: cannot be written: {reason}") from error
 
 
 def _field(text: str, n_bytes: int) -> bytes:

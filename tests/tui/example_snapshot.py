@@ -25,6 +25,7 @@ from daq.protocols.block import Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.monitor import RecordingStatus, SensorStatus
 from daq.recording.sensor_state import SensorState
+from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 from daq.timing.clock_model import ClockSource, ClockState
 from estimator.diagnostics.diagnose import diagnose
@@ -225,7 +226,9 @@ def demo_bench() -> Bench:
 
 
 @contextmanager
-def growing(path: Path, *, duration: float | None = None) -> Iterator[RecordingWriter]:
+def growing(
+    path: Path, *, duration: float | None = None, continues: str = ""
+) -> Iterator[RecordingWriter]:
     """Yield the writer of a recording of the demo's bench that nobody has closed."""
     bench = demo_bench()
     sensors = [
@@ -237,7 +240,10 @@ def growing(path: Path, *, duration: float | None = None) -> Iterator[RecordingW
         bench,
         sensors=sensors,
         created=SystemClock().now(),
-        attributes={} if duration is None else {"duration": duration},
+        attributes={
+            **({} if duration is None else {"duration": duration}),
+            **({CONTINUES: continues} if continues else {}),
+        },
     )
     writer.commit()
     try:

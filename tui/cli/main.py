@@ -198,11 +198,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         app(arguments)
     except SystemExit as ended:
-        if ended.code == ExitCode.TROUBLE and "h5py" in sys.modules:
-            # HDF5 can crash on exit after a full disk; all files of ours are closed by now.
+        writer = sys.modules.get("daq.recording.writer")
+        code = ExitCode.DONE if ended.code is None else ended.code
+        unsafe = code == ExitCode.TROUBLE or (writer is not None and writer.BROKEN)
+        if unsafe and "h5py" in sys.modules and isinstance(code, int):
+            # HDF5 can crash on exit after an error of the disk; all files of ours are closed.
             with suppress(OSError):
                 sys.stdout.flush()
                 sys.stderr.flush()
-            os._exit(ExitCode.TROUBLE)
+            os._exit(code)
         raise
     raise SystemExit(ExitCode.DONE)

@@ -65,7 +65,8 @@ def record_bench(
     else:
         status = record(acknowledged=gaps.look)
     if status.closed:
-        _LOGGER.info("%s closed: %s", out, progress_line(status), extra={"recording": str(out)})
+        closed = {"recording": status.path}
+        _LOGGER.info("%s closed: %s", status.path, progress_line(status), extra=closed)
     write_json(json, status.to_dict())
 
 

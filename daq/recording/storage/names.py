@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
+import itertools
 import os
 import sys
 import time
@@ -14,10 +15,13 @@ from daq.errors import RecordingError
 from daq.recording.storage.locking import is_being_written
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 PRIVATE = 0o600
 """Permissions of a recording: whoever can read one can stop its recorder."""
+CONTINUES = "continues"
+"""Attribute of a recording that continues another, which the disk refused: the other's run_id."""
 _STALE_SECONDS = 60.0
 """Age from which a temporary file that nobody writes is taken for a leftover."""
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
@@ -63,6 +67,11 @@ def _take_name(temporary: Path, path: Path) -> None:
 def taken(path: Path) -> RecordingError:
     """Return the error that a recording has this name already."""
     return RecordingError(f"{path}: exists already; expected a new file")
+
+
+def continuation_names(path: Path) -> Iterator[Path]:
+    """Yield the names that continuations of a recording may have, in their order."""
+    return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
 
 
 def remove_leftovers(path: Path) -> None:

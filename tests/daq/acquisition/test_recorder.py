@@ -538,6 +538,78 @@ def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
     report = verify(path)
     assert report.intact
     assert not report.closed
+    assert not path.with_stem("r-2").exists()  # which the disk refused, too
+
+
+REFUSED_ONCE = """
+import asyncio, os, resource, signal, sys
+from daq.acquisition.recorder import record
+from daq.host_clock import HostTime
+from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
+
+N = 300
+
+async def main():
+    clock, driver = ManualClock(), PlayedDriver({name: PlayedDevice() for name in "abc"})
+    stop, sent = asyncio.Event(), 0
+    samples = []
+
+    def acknowledged(status):
+        nonlocal sent
+        samples.append(status.sensors["a"].samples)
+        if status.path.endswith("-2.h5"):
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)  # the disk takes files again
+        if sent == N and samples[-1] >= 1000 * (N - 1):
+            stop.set()
+        for _ in range(min(10, N - sent)):
+            clock.advance(10.0)
+            for name in "abc":
+                at = clock.now()
+                driver.devices[name].items.put_nowait(block(name, 1000 * sent, 1000, at))
+            sent += 1
+
+    status = await record(
+        bench(*"abc"), sys.argv[1], clock=clock, drivers=driver.find, stop=stop,
+        acknowledged=acknowledged,
+    )
+    assert samples == sorted(samples)
+    print(status.closed, status.sensors["a"].samples, status.path, flush=True)
+    os._exit(0)  # as the command does: HDF5 cannot free what the disk refused
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, unlimited[1]))
+asyncio.run(main())
+"""
+
+
+def test_a_recording_that_the_disk_refuses_goes_on_in_another_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    said = subprocess.run(
+        [sys.executable, "-c", REFUSED_ONCE, str(path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=limit(),
+    )
+    following = path.with_stem("r-2")
+    assert said.stdout.split()[::2] == ["True", str(following)], said.stderr
+    assert "cannot be written: File too large; the recording continues in" in said.stderr
+    with Recording.open(path) as first, Recording.open(following) as second:
+        assert not first.closed
+        assert second.closed
+        assert second.continues == first.run_id
+        texts = [event.text for event in second.events]
+        assert "continues r.h5, which could not be written any more" in texts
+        for name in "abc":
+            one, two = first.sensor(name), second.sensor(name)
+            assert two.blocks["first_sample"][0] == 0
+            expected = counts(0, 300_000)
+            n = one.n_samples
+            assert n > 1000
+            assert np.array_equal(one.counts(), expected[:n])
+            assert np.array_equal(two.counts(), expected[len(expected) - two.n_samples :])
+            assert two.n_samples >= len(expected) - n  # nothing is lost between them
 
 
 STUBBORN = """

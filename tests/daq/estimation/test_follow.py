@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.estimation.estimation import estimate
 from daq.estimation.follow import (
     COMMIT_DELAY,
     LONGEST_INTERVAL,
@@ -44,6 +45,19 @@ class NoWait(threading.Event):
         """Return at once."""
         del timeout
         return self.is_set()
+
+
+class Goes(NoWait):
+    """An event during whose pauses something goes on."""
+
+    def __init__(self, goes_on: Callable[[], object]) -> None:
+        super().__init__()
+        self._goes_on = goes_on
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Go on."""
+        self._goes_on()
+        return super().wait(timeout)
 
 
 @dataclass
@@ -343,6 +357,44 @@ def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: P
         result = follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
     assert result is not None
     assert result.n_segments > 20
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks are seen there")
+@pytest.mark.parametrize("started_here", [True, False])
+def test_what_the_disk_refused_is_followed_into_the_next_file(
+    tmp_path: Path, started_here: bool
+) -> None:
+    path = tmp_path / "run.h5"
+    unrelated = tmp_path / "run-2.h5"
+    with growing(unrelated) as writer:
+        Bench(writer).send("ABC", 30)
+        writer.close()
+    with growing(path) as first:
+        Bench(first).send("ABC", 30)
+        with growing(tmp_path / "run-3.h5", continues=first.run_id) as second:
+            noted, bench = Noted(), Bench(second)
+            steps: list[Callable[[], object]] = [
+                first.abandon,
+                partial(bench.send, "ABC", 20),
+                second.close,
+            ]
+            stages = iter(steps)
+
+            def goes_on() -> None:
+                next(stages)()
+
+            noted.cancelled = Goes(goes_on)
+            recorder = Process(goes_on) if started_here else None
+            result = follow(path, SETTINGS, noted, recorder=recorder, cancelled=noted.cancelled)
+    assert result is not None
+    assert result.closed
+    assert noted.seen[-1].closed
+    alone = [estimate([tmp_path / name], SETTINGS) for name in ("run.h5", "run-3.h5")]
+    assert alone[0].n_segments == result.n_segments  # given the first, it finds the other
+    assert result.n_segments > alone[1].n_segments > 10
+    both = estimate([path, tmp_path / "run-3.h5"], SETTINGS)
+    assert both.n_segments == result.n_segments
+    np.testing.assert_array_equal(both.csm, result.csm)
 
 
 def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
