@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.tui.application.screen_text import screen_text
+from daq.bench.model import Limit
+from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, ended, running, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tui.application.app import HuddleApp
@@ -101,3 +102,22 @@ async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback
         await shown(pilot, app, *second)
         assert isinstance(second[1], SnapshotReady)
         assert app.snapshot is second[1].snapshot
+
+
+@pytest.mark.parametrize(("name", "size"), [("small", (40, 12)), ("middle", (120, 36))])
+async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
+    """Verdict, sensors, progress and alert are there at any size."""
+    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
+    told.bench = demo_bench().model_copy(update={"limits": (limit,)})
+    app = HuddleApp(told)
+    async with app.run_test(size=size) as pilot:
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-idle")
+        await shown(pilot, app, *running())
+        await assert_looks_as_before(pilot, f"{name}-running")
+        text = screen_text(app)
+        for said in ("● recording  1:40  FAIL", "known to 46 %", "C has been silent", "X −119.9"):
+            assert said in text
+        await shown(pilot, app, *ended())
+        await assert_looks_as_before(pilot, f"{name}-result")
+        assert "✗ FAIL: 2 of 9 channels" in screen_text(app)

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 
 
+SHORT = 14  # rows below which there is no room for curves
+
+
 class Board(Vertical):
     """Draws a state; parts without a change are not drawn again."""
 
@@ -53,6 +56,7 @@ class Board(Vertical):
     def on_resize(self, event: Resize) -> None:
         """Fit the screen's size."""
         self.set_class(event.size.height + 2 >= TALL, "-tall")  # beside status line and footer
+        self.set_class(event.size.height < SHORT, "-short")
         self._drawn = None
         self.call_after_refresh(self._draw)
 

@@ -74,6 +74,9 @@ def sensor_table(
             del columns[unneeded]
     if _width(columns) > width:
         columns |= noise(with_error=False)
+    if _width(columns) > width:  # the alert says in words what the marks mean
+        marks = [Text(cell.plain[:1], cell.style) for cell in columns.pop("state")]
+        columns = {"": marks, " ": columns.pop("sensor"), **columns}
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold #9aa5b8")
     for title in columns:
         right = title in {"Hz", "samples", "gaps"}
