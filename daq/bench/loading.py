@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from daq.bench.field_faults import field_faults
-from daq.bench.mask_file import embed_masks
+from daq.bench.masks.mask_file import embed_masks
 from daq.bench.model import Bench
 from daq.bench.validation import cross_faults
 from daq.errors import BenchFileError, FileFault

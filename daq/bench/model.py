@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
-from daq.bench.masks import NOISE_MODELS, Mask, check_points
+from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
 from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Storage
 from daq.bench.toml_text import to_toml
@@ -228,12 +228,12 @@ class Limit(Table):
     """A noise mask for pass or fail: the noise PSD's upper bound, straight in log-log between."""
 
     name: Name = Field(description="the limit's name")
-    frequency: tuple[PositiveNumber, ...] = Field((), description="frequencies in Hz")
-    psd: tuple[Number, ...] = Field((), description="noise PSD in unit²/Hz")
+    frequency: tuple[PositiveNumber, ...] = Field(default=(), description="frequencies in Hz")
+    psd: tuple[Number, ...] = Field(default=(), description="noise PSD in unit²/Hz")
     unit: str | None = None
     """Of ``psd``, such as ``µg/√Hz``; the channel's unit²/Hz, if not given."""
     model: str | None = None
-    """Name of a published model (`daq.bench.masks.NOISE_MODELS`), in place of the points."""
+    """Name of a published model (`daq.bench.masks.mask.NOISE_MODELS`), in place of the points."""
     file: str | None = None
     """CSV file with the points, beside the bench file; read when the bench file is."""
     sensors: tuple[str, ...] = ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from daq.bench.driver_rules import Checking
@@ -256,7 +255,7 @@ def _limit_unit_faults(limit: Limit, key: str, sensors: Sequence[Sensor]) -> Ite
             if channel.auxiliary or not limit.concerns(sensor.name, channel.name):
                 continue
             try:
-                limit.mask.at(np.ones(1), channel.unit)
+                limit.mask.check_unit(channel.unit)
             except WrongSettingError as error:
                 where = f"{key}.{'unit' if limit.model is None else 'model'}"
                 expected = f"{error} ({sensor.name}.{channel.name})"

@@ -22,6 +22,7 @@ from tui.output.formatting import clock_time
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.application.controls import Controls
@@ -40,6 +41,8 @@ class HuddleApp(FollowingApp):
         Recording to follow from the start.
     start : bool
         Whether to start a recording when the application opens.
+    models : tuple of Mask
+        Noise models to show beside the curves; in a unit of motion.
     """
 
     CSS_PATH = "huddle.tcss"
@@ -55,9 +58,14 @@ class HuddleApp(FollowingApp):
     ]
 
     def __init__(
-        self, controls: Controls, *, path: Path | None = None, start: bool = False
+        self,
+        controls: Controls,
+        *,
+        path: Path | None = None,
+        start: bool = False,
+        models: tuple[Mask, ...] = (),
     ) -> None:
-        super().__init__(controls)
+        super().__init__(controls, models)
         self._given = path
         self._start_at_once = start
 

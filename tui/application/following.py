@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from textual.filter import LineFilter
     from textual.screen import Screen
 
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
@@ -68,8 +69,9 @@ class FollowingApp(App[None]):
 
     state: var[State] = var(partial(State, ""), always_update=True)
 
-    def __init__(self, controls: Controls) -> None:
+    def __init__(self, controls: Controls, models: tuple[Mask, ...] = ()) -> None:
         super().__init__()
+        self._models = models
         self._controls = controls
         self._ended = threading.Event()
         self._quitting = threading.Event()
@@ -91,6 +93,7 @@ class FollowingApp(App[None]):
             can_start=controls.can_start,
             path=path,
             reference=self.state.reference,
+            models=self._models,
         )
 
     def _new_view(self, kind: type[View]) -> View:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -61,6 +62,8 @@ class State:
         When the test ends by itself, if it was started here.
     reference : Reference or None
         What the recording is compared with.
+    models : tuple of Mask
+        Noise models to show.
     """
 
     name: str
@@ -79,6 +82,7 @@ class State:
     is_starting: bool = False
     plan: TestPlan | None = None
     reference: Reference | None = None
+    models: tuple[Mask, ...] = ()
 
     @property
     def has_result(self) -> bool:

@@ -17,6 +17,7 @@ from tui.cli.options import (
     EndOption,
     FileArgument,
     JsonOption,
+    ModelsOption,
     OutOption,
     StartOption,
     with_estimate_options,
@@ -40,6 +41,7 @@ def tui(
             " HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and HUDDLE_RECORDING.",
         ),
     ] = "",
+    models: ModelsOption = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application: start, watch and stop a huddle test.
@@ -56,7 +58,7 @@ def tui(
         )
     from tui.commands.tui import open_application
 
-    open_application(source, on_event=on_event, **wanted)
+    open_application(source, on_event=on_event, models=models, **wanted)
 
 
 @examples(

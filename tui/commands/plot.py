@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.bench.mask_file import masks_named
+from daq.bench.masks.mask_file import masks_named
 from tui.commands.estimate import estimated
 from tui.output.console import check_places, console, notices
 from tui.output.extras import require

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.bench.mask_file import masks_named
+from daq.bench.masks.mask_file import masks_named
 from daq.results.limits import judge
 from tui.commands.estimate import estimated, exit_with
 from tui.output.console import check_places, console, notices
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from daq.bench.masks import Mask
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
 

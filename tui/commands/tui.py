@@ -17,6 +17,7 @@ import typer
 
 from daq.acquisition.preview import preview
 from daq.acquisition.recorder import recording_path
+from daq.bench.masks.mask_file import masks_named
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.estimation.settings import Settings
@@ -34,11 +35,13 @@ from tui.runs.recorder_process import RecorderProcess
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from daq.acquisition.preview import SensorPreview
-    from daq.bench.model import Bench
+    from daq.bench.masks.mask import Mask
+    from daq.bench.model import Bench, Sensor
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.interface import ReadableSensor
     from daq.results.verdict import TestVerdict
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
@@ -270,6 +273,7 @@ def open_application(
     source: Path,
     *,
     on_event: str = "",
+    models: str = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application on a bench file, or on a recording (``.h5``).
@@ -282,7 +286,7 @@ def open_application(
         Standard input or output is not a terminal.
     """
     if source.suffix.lower() in {".h5", ".hdf5"}:
-        open_recording(source, on_event=on_event, **wanted)
+        open_recording(source, on_event=on_event, models=models, **wanted)
     elif source.suffix.lower() in FOREIGN:
         problem = (
             "neither a bench file (.toml) nor a recording (.h5); convert it to a recording first:"
@@ -296,10 +300,16 @@ def open_application(
         )
         raise BenchFileError(FileFault("", problem), source=source)
     else:
-        open_bench(source, on_event=on_event, **wanted)
+        open_bench(source, on_event=on_event, models=models, **wanted)
 
 
-def open_bench(path: Path, *, on_event: str = "", **wanted: Any) -> None:  # noqa: ANN401 - fields of EstimateSettings
+def open_bench(
+    path: Path,
+    *,
+    on_event: str = "",
+    models: str = "",
+    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
+) -> None:
     """Open the application on a bench file."""
     bench = load(path)
     settings = chosen(Settings.of(bench), **wanted)
@@ -307,7 +317,7 @@ def open_bench(path: Path, *, on_event: str = "", **wanted: Any) -> None:  # noq
     settings = _with_comparison(settings, wanted)
     controls = BenchControls(path, bench, settings, on_event=on_event)
     try:
-        _run(HuddleApp(controls), again=path)
+        _run(HuddleApp(controls, models=_models(models, settings, bench.sensors)), again=path)
     finally:
         controls.release()
 
@@ -358,13 +368,33 @@ def open_recording(
     start: str | None = None,
     end: str | None = None,
     on_event: str = "",
+    models: str = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Open the application on a recording, growing or closed."""
     settings, bench = settings_for(path, start=start, end=end, **wanted)
     settings = _with_comparison(settings, wanted)
     controls = RecordingControls(path, settings, bench, on_event=on_event)
-    _run(HuddleApp(controls, path=path), again=path)
+    with Recording.open(path) as recording:
+        masks = _models(models, settings, recording.sensors)
+    _run(HuddleApp(controls, path=path, models=masks), again=path)
+
+
+def _models(
+    names: str, settings: Settings, sensors: Sequence[Sensor | ReadableSensor]
+) -> tuple[Mask, ...]:
+    """Return noise models that can be turned into the unit of the estimate.
+
+    Raises
+    ------
+    WrongSettingError
+        If one cannot.
+    """
+    masks = masks_named(names)
+    units = [c.unit for sensor in sensors for c in sensor.channels if not c.auxiliary]
+    for mask in masks:
+        mask.check_unit(settings.unit or units[0])
+    return masks
 
 
 def _with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:

@@ -24,7 +24,7 @@ from tui.report.wording import is_known, local_time, plain_number, utc_time
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.masks import Mask
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Channel
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from daq.bench.masks import SOURCES
+from daq.bench.masks.mask import SOURCES
 from daq.results.band_summary import band_of, channel_means, data_means, decibels
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
@@ -22,7 +22,7 @@ from tui.report.wording import decibel, plain_number, scientific
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from daq.bench.masks import Mask
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot

@@ -15,7 +15,7 @@ from tui.report.page import page
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.masks import Mask
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.report.parts import Report

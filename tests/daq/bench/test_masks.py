@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daq.bench.loading import load, parse
-from daq.bench.mask_file import MaskFileError, masks_named, read_mask
-from daq.bench.masks import NOISE_MODELS, Mask
+from daq.bench.masks.mask import NOISE_MODELS, Mask
+from daq.bench.masks.mask_file import MaskFileError, masks_named, read_mask
 from daq.bench.units import DensityUnit
 from daq.drivers import bench_file
 from daq.errors import BenchFileError, WrongSettingError

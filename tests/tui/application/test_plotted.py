@@ -5,14 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from textual.widgets import Static
 
+from daq.bench.masks.mask import NOISE_MODELS
+from daq.bench.masks.mask_file import masks_named
+from daq.bench.model import Limit
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
-from tests.tui.example_snapshot import ProgressCallback, demo_bench, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
-from tui.application.test_view.plotted import Choice, moved, panned, whole_span, zoomed
+from tui.application.state import State
+from tui.application.test_view.plotted import Choice, curves, moved, panned, whole_span, zoomed
 from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
 
 if TYPE_CHECKING:
@@ -115,3 +120,44 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await pilot.press("escape", "l", "u", "u", "u", "e")
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-test-like")
+
+
+def test_limits_and_noise_models_are_curves() -> None:
+    bench = demo_bench().model_copy(
+        update={
+            "limits": (
+                Limit(name="as the site", model="ahnm"),
+                Limit(name="sheet", frequency=(1.0, 30.0), psd=(0.5, 0.5), unit="µg/√Hz"),
+            )
+        }
+    )
+    state = State(
+        "b",
+        snapshot=made_snapshot(),
+        settings=SETTINGS,
+        judged_by=bench,
+        models=masks_named("nhnm"),
+    )
+    shown = {each.label: each for each in curves(state, Choice(), n_points=60)}
+    for label, model in (("as the site", "ahnm"), ("NHNM", "nhnm")):
+        curve = shown[label]
+        at = 10**curve.log_frequency
+        expected = 10 * np.log10(NOISE_MODELS[model].at(at, "m/s²"))
+        known = np.isfinite(expected) & np.isfinite(curve.level_db)
+        assert known.sum() > 10
+        # straight between the frequencies of the spectrum, the lowest of which are an octave apart
+        np.testing.assert_allclose(curve.level_db[known], expected[known], atol=1.5)
+        np.testing.assert_allclose(
+            curve.level_db[known][at[known] > 5], expected[known][at[known] > 5], atol=0.1
+        )
+    level = shown["sheet"].level_db
+    assert np.nanmax(np.abs(level - 20 * np.log10(0.5 * 9.80665e-6))) < 1e-9
+
+
+async def test_noise_models_are_named_in_the_key(told: ProgressCallback) -> None:
+    app = HuddleApp(told, models=masks_named("nhnm,nlnm"))
+    async with app.run_test(size=WIDE) as pilot:
+        await shown(pilot, app, *running())
+        screen = screen_text(app)
+    assert "NHNM" in screen
+    assert "NLNM" in screen

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from daq.bench.loading import parse
-from daq.bench.mask_file import masks_named
-from daq.bench.masks import NOISE_MODELS, Mask
+from daq.bench.masks.mask import NOISE_MODELS, Mask
+from daq.bench.masks.mask_file import masks_named
 from daq.errors import WrongSettingError
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record

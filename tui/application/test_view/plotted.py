@@ -17,6 +17,7 @@ from tui.application.test_view.units import units_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.application.state import State
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 NARROWEST = 0.02  # of a decade
 DATA_STYLE = "#7d8799"
 LIMIT_STYLE, LIMIT_MARKER = "#ff6b6b", "■"
+MODEL_STYLE, MODEL_MARKERS = "#aab4be", "▽△◇○"
 MARKERS = "●×◆+■▲"
 REFERENCE_STYLE = ("#7bd88f", "#3f6d4b", "≈")
 STYLES = {
@@ -130,7 +132,8 @@ def like_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
 def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     """Return the curves of the chosen channel, what is less important first.
 
-    Its data, the same channel of the recording it is compared with, the limits, the estimates.
+    Its data, noise models, the same channel of the recording it is compared with, the limits, the
+    estimates.
     """
     snapshot, settings = state.snapshot, state.settings
     if snapshot is None or settings is None or snapshot.n_segments == 0:
@@ -140,10 +143,12 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         n_points = round(n_points * (last - first) / (choice.span[1] - choice.span[0]))
     column, frequency = choice.channel, snapshot.frequency
     if choice.overlay:
-        return _limits(state, choice, n_points=n_points) + _like(state, choice, n_points=n_points)
+        masks = _models(state, n_points=n_points) + _limits(state, choice, n_points=n_points)
+        return masks + _like(state, choice, n_points=n_points)
     shown = [
         data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
     ]
+    shown += _models(state, n_points=n_points)
     shown += _reference(state, choice, n_points=n_points)
     shown += _limits(state, choice, n_points=n_points)
     for method in choice.methods:
@@ -240,7 +245,7 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         mask_curve(
             frequency,
             mask_psd(bench, limit, label, frequency[1:]),
-            span=(limit.frequency[0], limit.frequency[-1]),
+            span=(limit.mask.frequency[0], limit.mask.frequency[-1]),
             n_points=n_points,
             label=limit.name,
             style=LIMIT_STYLE,
@@ -249,6 +254,31 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         for limit in bench.limits
         if concerns(limit, label)
     ]
+
+
+def _models(state: State, *, n_points: int) -> list[Curve]:
+    """Return the noise models that were asked for, where they reach into the spectrum."""
+    snapshot = state.snapshot
+    if snapshot is None:
+        return []
+    frequency = snapshot.frequency
+    return [
+        mask_curve(
+            frequency,
+            model.at(np.clip(frequency[1:], *_ends(model)), snapshot.unit),
+            span=_ends(model),
+            n_points=n_points,
+            label=model.name,
+            style=MODEL_STYLE,
+            marker=MODEL_MARKERS[number % len(MODEL_MARKERS)],
+        )
+        for number, model in enumerate(state.models)
+        if _ends(model)[0] < frequency[-1] and _ends(model)[1] > frequency[1]
+    ]
+
+
+def _ends(mask: Mask) -> tuple[float, float]:
+    return mask.frequency[0], mask.frequency[-1]
 
 
 def plot_title(snapshot: Snapshot, choice: Choice) -> str:

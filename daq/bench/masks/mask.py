@@ -73,6 +73,17 @@ class Mask:
             psd = psd * np.abs(conversion(own, unit, frequency)) ** 2
         return np.asarray(psd)
 
+    def check_unit(self, unit: str) -> None:
+        """Refuse a unit of motion that the mask cannot be turned into.
+
+        Raises
+        ------
+        WrongSettingError
+            With the units there are.
+        """
+        if self.unit is not None:
+            conversion(self.unit, unit, np.ones(1))
+
     def points(self, frequency: FloatArray) -> FloatArray:
         """Return where to draw it: its own points, and the given ones that it covers; in Hz."""
         inside = (frequency >= self.frequency[0]) & (frequency <= self.frequency[-1])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import tomlkit
 
 from daq.bench.estimate_settings import one_of
-from daq.bench.masks import NOISE_MODELS, Mask, check_points
+from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.units import DensityUnit
 from daq.errors import FileFault, HuddleError, WrongSettingError
 
