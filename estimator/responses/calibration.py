@@ -241,9 +241,6 @@ def calibrate_sensor(
     delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
     covariance = covariance.reshape(d * d, d * d)
 
-    def derived(function: Callable[[FloatArray], FloatArray]) -> Value:
-        return _propagated(function, matrix, covariance)
-
     to_first = np.eye(d)
     to_first[:, 0] -= 1.0
     return SensorCalibration(
@@ -252,17 +249,23 @@ def calibrate_sensor(
         low=float(f[0]),
         high=float(f[-1]),
         matrix=Value(matrix, np.sqrt(np.diag(covariance)).reshape(d, d)),
-        gain=derived(lambda m: np.linalg.norm(m, axis=1)),
-        cross_axis=derived(lambda m: m / np.diag(m)[:, None]),
-        rotation_deg=derived(_rotation_vector),
-        angle_deg=derived(_axis_angles),
-        orthogonality_deg=derived(_orthogonality),
+        **{name: _propagated(function, matrix, covariance) for name, function in _DERIVED.items()},
         delay=Value(delay, np.sqrt(np.diag(delay_cov))),
         skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
         excess=excess,
         dof=2 * max(n_effective - d, 1.0) * len(f) / inflation,
         n_frequencies=len(f),
     )
+
+
+def derived(matrix: FloatArray) -> dict[str, FloatArray]:
+    """Return what follows from a relative response, by field of `SensorCalibration`.
+
+    Parameters
+    ----------
+    matrix : float64, shape (d, d)
+    """
+    return {"matrix": matrix} | {name: function(matrix) for name, function in _DERIVED.items()}
 
 
 def _delay_covariance(pair: _Pair, matrix: FloatArray, omega: FloatArray) -> FloatArray:
@@ -331,6 +334,15 @@ def _orthogonality(matrix: FloatArray) -> FloatArray:
     pairs = np.triu_indices(len(matrix), 1)
     cosine = np.einsum("ia,ia->i", directions[pairs[0]], directions[pairs[1]])
     return np.asarray(-np.rad2deg(np.arcsin(np.clip(cosine, -1.0, 1.0))))
+
+
+_DERIVED: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "gain": lambda m: np.asarray(np.linalg.norm(m, axis=1)),
+    "cross_axis": lambda m: np.asarray(m / np.diag(m)[:, None]),
+    "rotation_deg": _rotation_vector,
+    "angle_deg": _axis_angles,
+    "orthogonality_deg": _orthogonality,
+}
 
 
 def response_curve(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from estimator.responses.calibration import SensorCalibration, Value
 
 Rows = tuple[tuple[str, ...], ...]
+_LEAST_SHOWN = 1e-5
 _VARIES = 1.5
 """Scatter over frequencies, over what errors explain, from which on a remark says so."""
 LEGEND = (
@@ -46,7 +47,9 @@ def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
 
 def share(relative: float) -> str:
     """Return a relative uncertainty in per cent."""
-    return f"{100 * relative:.2g} %" if relative > 0 else "0"
+    if relative < _LEAST_SHOWN:
+        return "< 0.001 %" if relative > 0 else "0"
+    return f"{100 * relative:.0f} %" if relative >= 1 else f"{100 * relative:.2g} %"
 
 
 def title(found: Calibration, snapshot: Snapshot) -> str:
@@ -93,7 +96,7 @@ def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...]
         about = (f"{' to '.join(reference)} (°)",) * bool(most)
     pairs = max((each.orthogonality_deg.value.size for each in found.sensors), default=0)
     which = ("12", "13", "23")[:pairs]
-    header = ("sensor", *about, *(f"{pair[0]}–{pair[1]} less 90°" for pair in which))
+    header = ("sensor", *about, *(f"{pair[0]}–{pair[1]} less 90° (°)" for pair in which))
     rows = [
         (
             snapshot.sensor_names[each.sensor],

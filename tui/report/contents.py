@@ -9,6 +9,7 @@ from daq.bench.durations import format_duration
 from daq.results.band_summary import band_of
 from daq.results.limits import judge
 from tui.output.formatting import span
+from tui.report.calibration import calibration_section
 from tui.report.evidence import (
     advice_section,
     alignment_section,
@@ -79,6 +80,7 @@ def report_of(
         limits_section(snapshot, judged),
         noise_section(snapshot, settings, bench, models),
         parameters_section(snapshot, settings, bench),
+        calibration_section(snapshot, settings, bench),
         advice_section(snapshot),
         model_test_section(snapshot, settings),
         alignment_section(snapshot),

@@ -19,6 +19,7 @@ from tui.studies.clocks import clocks
 from tui.studies.estimates import ESTIMATES
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
+from tui.studies.responses import calibration, edges
 from tui.studies.study import TOLERANCE
 from tui.studies.verdicts import verdicts
 
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback, Series, Study
 
 CLOCKS, VERDICTS = "clocks", "verdicts"
-STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES)
+RESPONSES = {"calibration": calibration, "edges": edges}
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, *RESPONSES)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
@@ -72,6 +74,8 @@ def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> I
             yield verdicts(told, length=length)
         elif name in ESTIMATES:
             yield ESTIMATES[name](told, length)
+        elif name in RESPONSES:
+            yield RESPONSES[name](told, length=length)
         elif name in NUMERICAL:
             yield NUMERICAL[name](ingredients)
         else:

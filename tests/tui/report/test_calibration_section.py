@@ -1,0 +1,83 @@
+"""The calibration in the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.bench.model import Bench, Certificate, Channel, Sensor
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from tui.output.calibration import share
+from tui.report.calibration import calibration_section
+from tui.report.parts import Facts, Paragraph, Table
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import Snapshot
+
+SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
+
+
+def made(names: str, settings: Settings = SETTINGS) -> Snapshot:
+    rng = np.random.default_rng(2)
+    motion = 100 * rng.standard_normal((6000, 2))
+    samples = {name: motion + rng.standard_normal((6000, 2)) for name in names}
+    return estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
+
+
+def bench() -> Bench:
+    certificate = Certificate(value=1.0, expanded_uncertainty=0.01, number="L-7")
+    channels = tuple(Channel(name=n, sensitivity=1.0, certificate=certificate) for n in "12")
+    plain = tuple(Channel(name=n, sensitivity=1.0) for n in "12")
+    return Bench(
+        name="lab",
+        sampling_rate=50.0,
+        sensors=tuple(
+            Sensor(
+                name=name,
+                driver="text",
+                port=name,
+                sampling_rate=50.0,
+                channels=channels if name == "C" else plain,
+            )
+            for name in "ABC"
+        ),
+    )
+
+
+def test_values_budgets_and_certificates_are_there() -> None:
+    section = calibration_section(made("ABC"), SETTINGS, bench())
+    assert section is not None
+    opening = section.parts[0]
+    assert isinstance(opening, Paragraph)
+    assert "against C (absolute, by its certificate)" in opening.text
+    (facts,) = (part for part in section.parts if isinstance(part, Facts))
+    assert facts.rows[0] == (
+        "Certificate of C.1",
+        "1 counts per unit, U = 0.01 (k = 2), date not given, L-7",
+    )
+    tables = {part.title: part for part in section.parts if isinstance(part, Table)}
+    assert len(tables) == 6
+    budget = tables["Uncertainty budget of the sensitivities"]
+    assert "certificate (B)" in budget.header
+    assert {len(row) for table in tables.values() for row in table.rows} == {
+        len(table.header) for table in tables.values()
+    }
+    assert budget.rows[0][budget.header.index("certificate (B)")] == "0.5 %"
+
+
+def test_two_sensors_cannot_be_calibrated() -> None:
+    settings = Settings(segment=2.0, methods=("two-channel",))
+    assert calibration_section(made("AB", settings), settings, None) is None
+
+
+def test_shares_are_short() -> None:
+    assert [share(each) for each in (0.0, 1e-9, 0.00021, 0.05, 1.234)] == [
+        "0",
+        "< 0.001 %",
+        "0.021 %",
+        "5 %",
+        "123 %",
+    ]
