@@ -86,7 +86,7 @@ def on_cluster(
         If the scheduler does not answer.
     """
     try:
-        client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = distributed.Client(scheduler, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         raise ArchiveError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({error}); start one with:"

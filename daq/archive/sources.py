@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from daq.archive.store import PLAN_FILE
 from daq.archive.task import origin_of
 from daq.errors import HuddleError, RecordingError
 from daq.recording.reader import Recording
@@ -53,7 +54,9 @@ def recordings_in(sources: Iterable[Path], *, leave_out: Path) -> list[Path]:
         inside = [
             path
             for path in sorted(source.rglob("*.h5"))
-            if leave_out not in path.parents and not path.name.startswith(".")
+            if leave_out not in path.parents
+            and not path.name.startswith(".")
+            and not (path.parent / PLAN_FILE).exists()  # spectra of another archive
         ]
         if not inside:
             raise RecordingError(f"{source}: no recording (*.h5) in this folder")

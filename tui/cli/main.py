@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from tui.cli import acquisition, recordings, service, setup, studies
+from tui.cli import acquisition, archives, recordings, service, setup, studies
 from tui.cli.examples import EXAMPLES
 from tui.output.exit_codes import ExitCode
 
@@ -140,6 +140,7 @@ _PANELS = {
     "Recordings": (
         recordings.estimate,
         recordings.calibrate,
+        archives.archive,
         recordings.report,
         recordings.plot,
         recordings.import_,

@@ -21,6 +21,7 @@ _EXTRA = {
     "jinja2": "report",
     "fpdf": "report",
     "prometheus_client": "metrics",
+    "distributed": "cluster",
 }
 
 

@@ -1,0 +1,187 @@
+"""``huddle archive``: begun, killed, resumed, on a cluster, and what it shows."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.archive.answers import answer
+from daq.archive.store import Store
+from daq.python_process import python_command
+from tests.daq.archive.months import (
+    HOUR_NS,
+    SETTINGS,
+    START_NS,
+    content,
+    fill,
+    record,
+    store_for,
+    three,
+)
+from tests.waiting import finish, wait_until
+from tui.cli.main import app
+from tui.report.figures.archive import days_figure, density_figure
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+OPTIONS = ("--segment", "10s", "--method", "three-sensor")
+
+
+def huddle(*arguments: object) -> Any:  # noqa: ANN401 - click's result
+    return CliRunner().invoke(app, ["archive", *map(str, arguments)], terminal_width=200)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a folder of three recordings and their archive."""
+    made = tmp_path_factory.mktemp("recordings")
+    three(made)
+    result = huddle(made, *OPTIONS)
+    assert result.exit_code == 0, result.output
+    return made
+
+
+def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
+    folder: Path, tmp_path: Path
+) -> None:
+    days = tmp_path / "days.csv"
+    again = huddle(folder, "--json", "-", "--csv", days)
+    assert again.exit_code == 0
+    assert "0 recordings to take, 3 in the archive already" in again.stderr
+    found = json.loads(again.stdout)
+    files = sorted(map(str, folder.glob("*.h5")))
+    direct = CliRunner().invoke(app, ["estimate", *files, *OPTIONS, "--json", "-"])
+    wanted = json.loads(direct.stdout)
+    assert found["pooled"]["segments"] == wanted["segments"]
+    for one, other in zip(found["pooled"]["channels"], wanted["channels"], strict=True):
+        for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
+            a, b = (np.array(each[key], dtype=float) for each in (one, other))
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+    assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
+    assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)
+    assert found["archive"] == {"stretch_s": 3600, "recordings": 3, "problems": []}
+    rows = list(csv.reader(days.read_text(encoding="utf-8").splitlines()))
+    assert rows[0][6] == "noise PSD ((m/s²)²/Hz)"
+    assert len(rows) == 1 + 2 * len(found["bands_hz"]) * 6
+    assert float(rows[1][6]) == found["days"]["noise_psd"][0][0][0]
+
+
+def test_what_is_wrong_is_named_and_the_rest_is_shown(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "huddle-archive", tmp_path / "store")
+    bad = tmp_path / "bad.h5"
+    bad.write_text("nothing")
+    result = huddle(bad, "--store", tmp_path / "store")
+    assert result.exit_code == 3
+    assert "bad.h5" in result.stderr
+    assert "Noise by day" in result.stdout
+    assert "not decided: 2 days" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--segment", "20s"], "--segment 20.0 (the archive: 10.0)"),
+        (["--stretch", "day"], "--stretch day (the archive: hour)"),
+        (["--stretch", "week"], "expected hour or day"),
+        (["--time-zone", "Mars"], "Europe/London"),
+    ],
+)
+def test_wrong_options_are_refused(folder: Path, arguments: list[str], message: str) -> None:
+    before = content(Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]  # there is one
+    result = huddle(folder, "--store", folder / "huddle-archive", *arguments)
+    assert result.exit_code in {2, 3}
+    assert message in result.stderr.replace("\n", " ")
+    assert content(Store.open(folder / "huddle-archive")) == before  # type: ignore[arg-type]
+
+
+def test_without_recordings_and_archive_there_is_nothing_to_do(tmp_path: Path) -> None:
+    result = huddle("--store", tmp_path / "none")
+    assert result.exit_code == 2
+    assert "give recordings to begin one" in result.stderr
+
+
+def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    command = [*python_command("tui"), "archive", str(folder), "--store", str(store), *OPTIONS]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, **quiet) as process:  # type: ignore[call-overload]
+        wait_until(lambda: any(store.glob("*.h5")), "the first recording in the archive")
+        process.send_signal(signal.SIGKILL)
+    result = huddle(folder, "--store", store)
+    assert result.exit_code == 0
+    assert content(Store.open(store)) == content(Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+
+
+def test_the_workers_of_a_cluster_write_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    store, address = tmp_path / "store", tmp_path / "scheduler.json"
+    dask = [sys.executable, "-P", "-m", "dask"]
+    local = ["--host", "127.0.0.1", "--no-dashboard"]
+    with ExitStack() as stack:
+        for arguments in (
+            ["scheduler", "--port", "0", *local, "--scheduler-file", str(address)],
+            ["worker", "--no-nanny", "--nthreads", "1", *local, "--scheduler-file", str(address)],
+        ):
+            process = stack.enter_context(
+                subprocess.Popen([*dask, *arguments], cwd=tmp_path, stderr=subprocess.DEVNULL)
+            )
+            stack.callback(process.kill)
+        wait_until(lambda: address.exists() and address.read_text().endswith("}"), "a scheduler")
+        scheduler = json.loads(address.read_text())["address"]
+        command = [*python_command("tui"), "archive", str(folder), "--store", str(store)]
+        with subprocess.Popen(
+            [*command, *OPTIONS, "--scheduler", scheduler],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as huddle_command:
+            code, _, said = finish(huddle_command)
+    assert code == 0, said
+    assert "dashboard: http" in said
+    assert content(Store.open(store)) == content(Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+
+
+def test_figures_show_the_density_and_the_days(folder: Path, tmp_path: Path) -> None:
+    result = huddle("--store", folder / "huddle-archive", "-o", tmp_path, "--models", "nlnm")
+    assert result.exit_code == 0, result.output
+    written = {"density.png", "density.svg", "days.png", "days.svg"}
+    assert {path.name for path in tmp_path.iterdir() if path.stat().st_size > 5000} == written
+
+
+def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> None:
+    paths = [
+        record(
+            tmp_path / f"{day}.h5",
+            hours=0.3,
+            begin_ns=START_NS + 24 * day * HOUR_NS,
+            seed=day,
+            noise=20.0 if day < 5 else 40.0,
+        )
+        for day in range(10)
+    ]
+    store = store_for(tmp_path / "store", paths[0], stretch="day")
+    assert fill(store, paths) == []
+    found = answer(store.plan, store.entries()[0], SETTINGS)
+    assert found.changes.found[:6].all()
+    assert set(found.changes.day[:6]) == {5}
+    assert np.all(np.abs(found.changes.amount[:6] - 20 * np.log10(2)) < 0.5)
+    assert (found.drift.slope[:6] > 0).all()
+    days = days_figure(found)
+    titles = [axes.get_title(loc="left") for axes in days.axes]
+    assert titles == ["A.X", "A.Y", "B.X", "B.Y", "C.X", "C.Y"]
+    for axes in days.axes:
+        labels = axes.get_legend_handles_labels()[1]
+        assert {"drift", "change beyond uncertainty"} <= set(labels)
+    density = density_figure(found)
+    assert [axes.get_title(loc="left") for axes in density.axes[:6]] == titles

@@ -1,0 +1,1 @@
+"""What an archive says, as tables, JSON and CSV."""
