@@ -297,7 +297,7 @@ class _Tally:
         if alone.n_segments < whole / 2:
             self._n_short += 1
             return
-        snapshot = self._one.snapshot(alone)
+        snapshot = self._one.snapshot(alone, curves_only=True)
         if not snapshot.results:
             self._n_short += 1
             return

@@ -10,13 +10,20 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
-from daq.estimation.noise_estimates import known_gains, noise_estimates, responses, up_to
+from daq.estimation.equalisation import Equalisation
+from daq.estimation.noise_estimates import (
+    in_units,
+    known_gains,
+    noise_estimates,
+    responses,
+    up_to,
+)
 from daq.estimation.snapshot import (
     ChannelLabel,
     Snapshot,
     SnapshotDiagnostics,
     Synchronisation,
-    added_by_clocks,
+    added,
 )
 from estimator.errors import InsufficientDataError
 from estimator.spectra.multiresolution import Band
@@ -67,13 +74,22 @@ class Estimator:
         self.unit = canonical(settings.unit or channels[0][1].unit)
         self.window = get_window(self.welch.window, self.welch.segment_length)
         self._gains = known_gains(settings, channels)
+        self._equalisation = Equalisation("off", self.welch, channels, plan.dims)
 
     def responses(self, channels: Channels) -> ComplexArray | None:
-        """Return what makes the channels' units of the answer's; None where nothing does."""
-        found = responses(self.welch.frequencies, channels, self.unit)
-        return None if np.all(found == 1) else found
+        """Return responses of a recording's channels over those of `channels`; None if equal."""
+        if channels == self.channels:
+            return None
+        own, first = (
+            responses(self.welch.frequencies, each, self.unit) for each in (channels, self.channels)
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = own / first
+        return None if np.all((own == first) | (own == 0)) else found
 
-    def snapshot(self, average: Average, *, diagnose: bool = False) -> Snapshot:
+    def snapshot(
+        self, average: Average, *, diagnose: bool = False, curves_only: bool = False
+    ) -> Snapshot:
         """Return the estimate from an average.
 
         Parameters
@@ -82,13 +98,16 @@ class Estimator:
             Of one segment at least.
         diagnose : bool
             Whether the test itself is diagnosed, which takes longer.
+        curves_only : bool
+            Whether lower ends of intervals may leave out what leaks at edges of segments.
 
         Raises
         ------
         InsufficientDataError
             If the average is empty.
         """
-        band = up_to(average.band(self), average.usable)
+        raw = up_to(average.band(self), average.usable)
+        band = in_units(raw, self.channels, self.unit)
         estimates = noise_estimates(
             (band,), self.settings, dims=self.dims, gains=self._gains, dimensions=None
         )
@@ -103,19 +122,29 @@ class Estimator:
             synchronisation=synchronisation,
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
+        edges = None
+        if not curves_only:
+            edges = self._equalisation.leakage((raw,), self.channels, self.unit)
+            diagnostics = replace(diagnostics, edge_leakage=edges)
         if diagnose:
-            found, untested = diagnosis(
+            found = diagnosis(
                 (band,),
                 self.dims,
                 self.channels,
                 dimensions=estimates.dimensions,
                 faulty={*average.clipped, *average.stood_still},
             )
-            findings = Findings(average.clipped, average.stood_still, found, untested)
-            diagnostics = findings.added_to(diagnostics)
-        added = added_by_clocks(synchronisation, estimates.results)
+            diagnostics = Findings.of(
+                found,
+                edges,
+                bands=(band,),
+                dims=self.dims,
+                clipped=average.clipped,
+                stood_still=average.stood_still,
+            ).added_to(diagnostics)
+        too_much = added(diagnostics, estimates.results)
         results = {
-            name: each if added is None else replace(each, low=each.low - added)
+            name: each if too_much is None else replace(each, low=each.low - too_much)
             for name, each in estimates.results.items()
         }
         return Snapshot(
@@ -141,7 +170,7 @@ class Estimator:
 
 
 class Average:
-    """The mean of cross-spectral matrices, by segments, in the unit of the answer."""
+    """The mean of cross-spectral matrices, by segments, in the units of an estimator's channels."""
 
     def __init__(self) -> None:
         self._sum: ComplexArray | None = None
@@ -159,7 +188,7 @@ class Average:
     def add(
         self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
     ) -> None:
-        """Add a stretch of a recording, `csm` in the unit of the answer."""
+        """Add a stretch of a recording, `csm` from `converted`."""
         weighted = csm * n_segments
         if self._sum is None:
             self._sum = weighted
@@ -212,5 +241,5 @@ class Average:
 
 
 def converted(csm: ComplexArray, response: ComplexArray | None) -> ComplexArray:
-    """Return cross-spectra in the unit of the answer."""
+    """Return cross-spectra as the estimator's channels would give them (`Estimator.responses`)."""
     return csm if response is None else scale(csm, response)

@@ -23,7 +23,19 @@ FORMAT = "huddle-archive"
 FORMAT_VERSION = 1
 STRETCHES = {"hour": 3600, "day": 86400}
 """Seconds; stretches begin at whole hours or days of UTC."""
-SHAPING = ("segment", "overlap", "window", "detrend", "clocks", "reject", "octaves")
+SHAPING = (
+    *(
+        "segment",
+        "overlap",
+        "window",
+        "detrend",
+        "clocks",
+        "reject",
+        "octaves",
+        "equalise",
+        "bridge",
+    ),
+)
 """Settings that shape spectra."""
 
 
@@ -64,7 +76,10 @@ class Plan:
     def of(cls, each: Pass, settings: Settings, stretch: str) -> Self:
         """Return the plan of a store that begins with this recording."""
         return cls(
-            settings=replace(settings, start=None, end=None, sampling_rate=None),
+            # Filters and windows that depend on a recording would make days differ.
+            settings=replace(
+                settings, start=None, end=None, sampling_rate=None, equalise="off", bridge=0.0
+            ),
             stretch=stretch,
             sampling_rate=each.aligned.sampling_rate,
             sensors=described(each),

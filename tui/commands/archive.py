@@ -156,6 +156,7 @@ def _begun(
             settings, _ = settings_for(path, **wanted)
             with Recording.open(path) as recording:
                 plan = Plan.of(Pass(recording, settings), settings, stretch or "hour")
+            plan.changed(wanted, stretch)
         except (OSError, HuddleError) as error:
             if isinstance(error, HuddleError) and error.is_usage_error:
                 raise

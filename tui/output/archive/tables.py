@@ -78,7 +78,7 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
     n_channels = len(answer.pooled.channels)
     if changes.decided.any():
         yield (
-            f"The test for a change has {several(int(changes.decided.sum()), 'series')}"
+            f"The test for a change has {several(int(changes.decided.sum()), 'series', 'series')}"
             f" ({several(n_channels, 'channel')}, {several(len(answer.bands), 'band')}); without a"
             " change it raises a false alarm in any of them with a probability of"
             f" {percent(changes.false_alarm)}."
