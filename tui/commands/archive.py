@@ -15,7 +15,7 @@ from daq.archive.plan import STRETCHES, Plan
 from daq.archive.sources import recordings_in, sort
 from daq.archive.store import FOLDER, Store
 from daq.archive.task import Task, software_version
-from daq.bench.mask_file import masks_named
+from daq.bench.masks.mask_file import masks_named
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segment_pass import Pass
 from daq.recording.reader import Recording

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.archive.answers import Answer
-    from daq.bench.masks import Mask
+    from daq.bench.masks.mask import Mask
 
     FloatArray = NDArray[np.float64]
 
