@@ -178,11 +178,15 @@ class _Index:
         )
 
     def add(self, part: Part, cache: PartCache, order: int, problems: list[str]) -> None:
-        """Take a part; one that cannot be read is a problem."""
+        """Take a part; what cannot be read of it is a problem."""
         try:
             traces = cache.traces(part)
         except ImportFormatError as error:
-            problems.append(str(error))
+            smaller = part.split()
+            if not smaller:
+                problems.append(str(error))
+            for each in smaller:
+                self.add(each, cache, order, problems)
             return
         for trace, piece in pieces_of(part, traces, order):
             name = f"{trace.sensor}.{trace.channel}"

@@ -74,6 +74,9 @@ class Part(Protocol):
     def load(self) -> Sequence[Trace]:
         """Return its traces, every time the same."""
 
+    def split(self) -> Sequence[Part]:
+        """Return smaller parts, of which some may be sound; nothing if there are none."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedPart:
@@ -85,6 +88,10 @@ class LoadedPart:
     def load(self) -> Sequence[Trace]:
         """Return the traces."""
         return self.traces
+
+    def split(self) -> Sequence[Part]:
+        """Return nothing: it is read as a whole."""
+        return ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +109,10 @@ class FilePart:
     def load(self) -> Sequence[Trace]:
         """Read the file."""
         return self.read(self.path)
+
+    def split(self) -> Sequence[Part]:
+        """Return nothing: it is read as a whole."""
+        return ()
 
 
 def traces_of(sensors: Iterable[ForeignSensor]) -> list[Trace]:

@@ -8,6 +8,7 @@ first and the last record state: the clock of the digitizer is in them.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -50,11 +51,12 @@ def _pymseed() -> Any:  # noqa: ANN401 - its classes are made at run time
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MiniSeedPart:
-    """Records of a file, from one byte to another."""
+    """Records of a file, from one byte to another; `record_length` is 0 if it varies."""
 
     path: Path
     offset: int
     end: int
+    record_length: int
 
     @property
     def source(self) -> str:
@@ -68,19 +70,31 @@ class MiniSeedPart:
             with self.path.open("rb") as file:
                 file.seek(self.offset)
                 content = file.read(self.end - self.offset)
-            found = pymseed.MS3TraceList.from_buffer(content, unpack_data=True)
+            found = pymseed.MS3TraceList.from_buffer(content, unpack_data=True, record_list=True)
             traces = [
                 _trace(pymseed, trace.sourceid, segment)
                 for trace in found
                 for segment in trace
                 if segment.sampletype in _NUMERIC and segment.samprate and segment.numsamples
             ]
-            n_channels = len(found)
+            n_records = sum(s.recordlist.recordcnt for trace in found for s in trace)
         except (pymseed.MiniSEEDError, ValueError, OverflowError) as error:
             raise self._damaged(str(error)) from error
-        if n_channels == 0:
-            raise self._damaged("an incomplete record")
+        n_expected = -(-len(content) // self.record_length) if self.record_length else 1
+        if n_records < n_expected:  # libmseed passes over what is no record
+            raise self._damaged(f"{n_records} of {n_expected} records can be read")
         return traces
+
+    def split(self) -> Sequence[MiniSeedPart]:
+        """Return both halves of a part that is damaged somewhere; nothing if it is one record."""
+        n_records = -(-(self.end - self.offset) // (self.record_length or 1))
+        if n_records < 2 or not self.record_length:
+            return ()
+        middle = self.offset + n_records // 2 * self.record_length
+        return (
+            MiniSeedPart(self.path, self.offset, middle, self.record_length),
+            MiniSeedPart(self.path, middle, self.end, self.record_length),
+        )
 
     def _damaged(self, reason: str) -> ImportFormatError:
         where = f"bytes {self.offset} to {self.end}"
@@ -104,21 +118,13 @@ def _trace(pymseed: Any, sourceid: str, segment: Any) -> Trace:  # noqa: ANN401 
 def miniseed_parts(path: Path) -> Iterator[MiniSeedPart]:
     """Yield the parts of a file, in its order.
 
+    Records are as long as the first one, as in nearly all files, if there is a header wherever a
+    part would begin; otherwise they are walked through.
+
     Raises
     ------
     ImportFormatError
         pymseed is not installed, or the file begins with no record.
-    """
-    bounds = _bounds(path)
-    for offset, end in pairwise(bounds):
-        yield MiniSeedPart(path, offset, end)
-
-
-def _bounds(path: Path) -> list[int]:
-    """Return where parts begin, and the end of the file.
-
-    Records are as long as the first one, as in nearly all files, if there is a header wherever a
-    part would begin; otherwise they are walked through.
     """
     pymseed = _pymseed()
     size = path.stat().st_size
@@ -127,24 +133,27 @@ def _bounds(path: Path) -> list[int]:
             length = int(pymseed.MS3Record.parse(file.read(_PART_BYTES)).reclen)
         except (pymseed.MiniSEEDError, ValueError) as error:
             raise ImportFormatError(f"{path}: not sound miniSEED: {error}") from error
-        step = max(1, _PART_BYTES // length) * length
         whole = size // length * length
-        bounds = sorted({*range(0, whole, step), whole, size})
+        step = max(1, _PART_BYTES // length) * length
+        bounds = [*range(0, whole, step), whole]
         for offset in bounds[1:-1]:
             file.seek(offset)
             if not _is_header(file.read(_HEADER_BYTES)):
-                return _walked(pymseed, path)
-    return bounds
+                bounds, length = _walked(pymseed, path), 0
+                break
+    for offset, end in pairwise(bounds if bounds[-1] == size else [*bounds, size]):
+        yield MiniSeedPart(path, offset, end, length)
 
 
 def _walked(pymseed: Any, path: Path) -> list[int]:  # noqa: ANN401 - see above
+    """Return where parts begin, from record to record; the last one where no record follows."""
     bounds, at = [0], 0
-    try:
-        with pymseed.MS3RecordReader(str(path)) as records:
-            for record in records:
-                at += record.reclen
-                if at - bounds[-1] >= _PART_BYTES:
-                    bounds.append(at)
-    except (pymseed.MiniSEEDError, ValueError) as error:
-        raise ImportFormatError(f"{path}: from byte {at} not sound miniSEED: {error}") from error
+    with (
+        contextlib.suppress(pymseed.MiniSEEDError, ValueError),
+        pymseed.MS3RecordReader(str(path)) as records,
+    ):
+        for record in records:
+            at += record.reclen
+            if at - bounds[-1] >= _PART_BYTES:
+                bounds.append(at)
     return bounds if bounds[-1] == at else [*bounds, at]

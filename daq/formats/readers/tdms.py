@@ -64,6 +64,10 @@ class TdmsPart:
         except Exception as error:
             raise ImportFormatError(f"{self.path}: npTDMS cannot read it: {error}") from error
 
+    def split(self) -> tuple[TdmsPart, ...]:
+        """Return nothing: what npTDMS cannot read, it cannot read in pieces."""
+        return ()
+
     def _trace(self, group: str, channel: Any) -> Trace:  # noqa: ANN401 - see above
         properties = channel.properties
         interval = float(properties.get("wf_increment") or 0)

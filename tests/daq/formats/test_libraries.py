@@ -256,3 +256,17 @@ def test_the_extra_of_a_missing_library_is_named(
     monkeypatch.setitem(__import__("sys").modules, package, None)
     with pytest.raises(ImportFormatError, match=rf"not installed; run: pip install.*\[{extra}\]"):
         open_sources([tmp_path / name])
+
+
+@pytest.mark.parametrize(
+    ("name", "problems"),
+    [
+        ("corrupt_one_extra_byte_at_end.mseed", "bytes 512 to 513"),
+        ("brokenlastrecord.mseed", "bytes 4096 to"),
+        ("single_record_plus_noise_record.mseed", "bytes 512 to 1024"),
+    ],
+)
+def test_sound_records_of_a_damaged_file_that_obspy_provides(name: str, problems: str) -> None:
+    found = open_sources([OBSPY_IO / "mseed/tests/data" / name])
+    assert len(found.sensors) == 1
+    assert problems in found.problems[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
+from daq.formats.miniseed_export import export_miniseed
 from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
@@ -23,8 +25,6 @@ from tui.cli.main import app
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from typer.testing import Result
 
     from daq.estimation.snapshot import Snapshot
@@ -151,6 +151,31 @@ def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recordi
         for each in (exported, original)
     ]
     assert np.max(np.abs(20 * np.log10(curves[0] / curves[1]))) < 0.01
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "BW.BGLD.__.EHE.D.2008.001.first_10_records",
+        "CH.BALST..LHE.D.2025.314",
+        "gaps.mseed",
+        "qualityflags.mseed",
+        "two_channels.mseed",
+        "WUQ.XJ.HHN.D.2008.285.first_record",
+    ],
+)
+def test_files_of_networks_through_import_and_export(tmp_path: Path, name: str) -> None:
+    obspy = load_obspy()
+    source = Path(obspy.__file__).parent / "io/mseed/tests/data" / name
+    import_files([source], tmp_path / "a.h5")
+    with Recording.open(tmp_path / "a.h5") as opened:
+        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
+    ours = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1).sort()
+    theirs = obspy.read(str(source), format="MSEED").merge(method=-1).sort()
+    assert [trace.id for trace in ours] == [trace.id for trace in theirs]
+    for our, their in zip(ours, theirs, strict=True):
+        assert abs(our.stats.starttime.ns - their.stats.starttime.ns) <= 1000
+        np.testing.assert_array_equal(our.data, their.data)
 
 
 def test_tidy_csv(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
