@@ -125,6 +125,11 @@ class PatientSession(Session, Protocol):
         """What to check if no block comes; the end of the error message. May be missing."""
         ...
 
+    @property
+    def recovers(self) -> bool:
+        """Whether the device recovers from an overflow, and is not stalled. May be missing."""
+        ...
+
 
 class ResumedSession(Session, Protocol):
     """A session that may go on where another ended."""
@@ -132,15 +137,6 @@ class ResumedSession(Session, Protocol):
     @property
     def resumed(self) -> bool:
         """Whether its blocks are in the index of the session before."""
-        ...
-
-
-class RecoveringSession(Session, Protocol):
-    """A session that may know that its device lives while it sends no samples."""
-
-    @property
-    def recovers(self) -> bool:
-        """Whether it recovers from an overflow: it is waited for instead of called stalled."""
         ...
 
 

@@ -149,26 +149,6 @@ class CanonicalCoherence:
         return self._roots[channels]
 
 
-def canonical_coherence(
-    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
-) -> FloatArray:
-    """Magnitude squared coherence of two sensors' motion, direction by direction.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        Coherency or cross-spectral matrix, channels grouped by sensor.
-    dims : tuple of int
-    first, second : int
-
-    Returns
-    -------
-    float64, shape (n_freqs, min(dims[first], dims[second]))
-        As `CanonicalCoherence.between` gives it.
-    """
-    return CanonicalCoherence(csm).between(own_channels(dims, first), own_channels(dims, second))
-
-
 def own_channels(dims: tuple[int, ...], sensor: int) -> range:
     """Return which channels are a sensor's."""
     return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))

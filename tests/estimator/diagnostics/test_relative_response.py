@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from estimator.diagnostics.advice import ModelMisfit, Rotated
 from estimator.diagnostics.diagnose import diagnose
 from estimator.diagnostics.relative_response import (
-    canonical_coherence,
+    CanonicalCoherence,
     matched_coherence,
     relative_response,
 )
@@ -170,7 +170,7 @@ def test_coherence_of_like_channels() -> None:
 def test_coherence_by_direction_does_not_see_orientation() -> None:
     turned = Rotation.from_rotvec([1.0, 2.0, -1.5]).as_matrix()
     plain, other = bench([np.eye(3)] * 3, snr=10), bench([np.eye(3), turned, turned.T], snr=10)
-    one, two = (canonical_coherence(csm, (3, 3, 3), 0, 1) for csm in (plain, other))
+    one, two = (CanonicalCoherence(csm).between(range(3), range(3, 6)) for csm in (plain, other))
     np.testing.assert_allclose(one, two, rtol=1e-9)
     snr = 10 * np.linalg.eigvalsh(MOTION)[::-1]
     np.testing.assert_allclose(one[0], (snr / (snr + 1)) ** 2, rtol=1e-9)

@@ -35,7 +35,7 @@ def drawn(rng: np.random.Generator, terms: FloatArray, n: float) -> tuple[FloatA
 @pytest.mark.parametrize("n", [20, 400])
 def test_terms_are_unbiased_and_their_errors_cover(n: int) -> None:
     rng = np.random.default_rng(1)
-    found = [fit(FREQUENCY, *drawn(rng, TERMS, n), INDEPENDENT) for _ in range(150)]
+    found = [fit(FREQUENCY, *drawn(rng, TERMS, n), INDEPENDENT) for _ in range(60)]
     values = np.array([each.values for each in found])
     errors = np.array([each.errors for each in found])
     away = np.abs(values.mean(axis=0) - TERMS)
@@ -44,13 +44,13 @@ def test_terms_are_unbiased_and_their_errors_cover(n: int) -> None:
     covers = np.abs(values - TERMS) < 1.96 * errors
     assert np.all(np.abs(covers.mean(axis=0) - 0.95) < 4 * np.sqrt(0.05 * 0.95 / len(found)))
     chi_square = np.mean([each.chi_square for each in found])
-    assert chi_square == pytest.approx(1.0, abs=0.04 if n == 20 else 0.01)
+    assert chi_square == pytest.approx(1.0, abs=0.04 if n == 20 else 0.015)
 
 
 def test_a_term_that_is_not_there_comes_out_as_zero_within_its_error() -> None:
     rng = np.random.default_rng(2)
     white = np.array([0, 0, 1e-12, 0])
-    found = [fit(FREQUENCY, *drawn(rng, white, 100), INDEPENDENT) for _ in range(100)]
+    found = [fit(FREQUENCY, *drawn(rng, white, 100), INDEPENDENT) for _ in range(50)]
     scores = np.array([each.values / each.errors for each in found])[:, [0, 1, 3]]
     assert np.abs(scores.mean(axis=0)).max() < 4 / np.sqrt(len(found))
     assert (scores < 0).mean() > 0.3  # not clipped
