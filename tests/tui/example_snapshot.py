@@ -317,3 +317,11 @@ class ProgressCallback:
     def mark(self, path: Path, text: str) -> None:
         """Note it."""
         self.told.append(f"mark {path.name} {text}")
+
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Note it."""
+        del settings, verdict
+        self.told.append(f"save {path.name} {len(snapshot.channels)}")
+        return (path.with_suffix(".csv"), path.with_suffix(".json"))

@@ -87,6 +87,8 @@ class HuddleApp(FollowingApp):
             return state.can_start and not state.is_recording and not state.is_starting
         if action in {"stop", "mark"}:
             return self.recording and self.now is not None
+        if action == "save":
+            return self.snapshot is not None and self.path is not None
         if action in {"report", "open_report"}:
             return self.state.has_result
         return True
@@ -188,3 +190,26 @@ class HuddleApp(FollowingApp):
             self.call_from_thread(self.open_url, report.resolve().as_uri())
         else:
             tell(title="Report written")
+
+    def action_save(self) -> None:
+        """Write the estimate as CSV and JSON, and the screen as a picture (SVG)."""
+        path, snapshot, settings = self.path, self.snapshot, self.state.settings
+        if path is None or snapshot is None or settings is None:
+            return
+        picture = self.export_screenshot(title=path.name)
+        self._save(path, picture)
+
+    @work(thread=True, group="control")
+    def _save(self, path: Path, picture: str) -> None:
+        state = self.state
+        snapshot, settings = state.snapshot, state.settings
+        if snapshot is None or settings is None:
+            return
+        files = self._try(partial(self._controls.save, path, snapshot, settings, state.verdict))
+        if files is None:
+            return
+        drawn = files[0].with_suffix(".svg")
+        if self._try(partial(drawn.write_text, picture, encoding="utf-8")) is not None:
+            names = ", ".join(file.name for file in (*files, drawn))
+            text = f"{names} in {drawn.parent}"
+            self.call_from_thread(self.notify, text, title="Written", timeout=10, markup=False)

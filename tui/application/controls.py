@@ -105,3 +105,9 @@ class Controls(Protocol):
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report of a recording; returns its file. Blocks."""
         ...
+
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Write the estimate as CSV and JSON beside its recording; returns the files. Blocks."""
+        ...

@@ -24,11 +24,14 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.control import ask
 from daq.recording.reader import Recording
+from daq.results.sources import sources
 from daq.results.store import store_results
 from tui.application.app import HuddleApp
-from tui.output.console import notices
+from tui.output.console import notices, write_json
 from tui.output.extras import require
+from tui.output.json_document import document
 from tui.output.logs.lines import screen_taken
+from tui.output.results import curves_csv
 from tui.runs.estimate_settings import check_fit, chosen, settings_for
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
@@ -129,6 +132,12 @@ class BenchControls:
         """Write the report."""
         return _report(path, snapshot, settings, folder=self.reports)
 
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Write CSV and JSON beside the recording, or with the reports."""
+        return save_result(path, snapshot, settings, verdict, folder=self.reports or path.parent)
+
     def release(self) -> None:
         """Release the recorders, which continue."""
         for recorder in self.started:
@@ -193,6 +202,12 @@ class RecordingControls:
         """Write the report beside the recording."""
         return _report(path, snapshot, settings)
 
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Write CSV and JSON beside the recording."""
+        return save_result(path, snapshot, settings, verdict, folder=path.parent)
+
 
 def read_sensors(
     bench: Bench,
@@ -256,6 +271,29 @@ def about(path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | Non
     except typer.BadParameter as error:
         raise HuddleError(error.message) from None
     return _with_comparison(settings, changes), bench
+
+
+def save_result(
+    path: Path,
+    snapshot: Snapshot,
+    settings: Settings,
+    verdict: TestVerdict | None,
+    *,
+    folder: Path,
+) -> tuple[Path, ...]:
+    """Write an estimate as CSV and JSON; that of a growing recording says nothing of its file.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
+    """
+    csv, json = (folder / f"{path.stem}{suffix}" for suffix in (".csv", ".json"))
+    csv.write_text(curves_csv(snapshot), encoding="utf-8")
+    about = sources([path]) if snapshot.closed else ()
+    result = document(snapshot, settings, sources=about, verdict=verdict)
+    write_json(str(json), result)
+    return csv, json
 
 
 def _report(

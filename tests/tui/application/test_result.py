@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from importlib import resources
+from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ from tui.application.app import HuddleApp
 from tui.application.messages import ReferenceReady
 from tui.application.reference import reference_of
 from tui.application.state import RECORDINGS, RESULT, Reference
+from tui.commands.tui import save_result
+from tui.output.results import curves_csv
 from tui.simulation.write_recording import simulate_recording
 
 if TYPE_CHECKING:
@@ -103,3 +106,22 @@ def test_the_reference_is_estimated_with_the_settings_of_what_is_shown(tmp_path:
     ended = threading.Event()
     ended.set()
     assert reference_of(path, settings, lambda *_: (None, None), ended=ended) is None
+
+
+async def test_the_estimate_and_the_screen_are_saved(told: ProgressCallback) -> None:
+    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
+    async with app.run_test(size=NARROW, notifications=True) as pilot:
+        await app.workers.wait_for_complete()
+        await at_result(pilot, app)
+        await pilot.press("v")
+        await app.workers.wait_for_complete()
+    assert told.told == ["save run.h5 9"]
+    assert "FAIL" in told.path.with_suffix(".svg").read_text(encoding="utf-8")
+
+
+def test_csv_and_json_are_those_of_the_commands(tmp_path: Path) -> None:
+    snapshot = made_snapshot()  # growing: nothing is said of its file
+    csv, json = save_result(tmp_path / "run.h5", snapshot, SETTINGS, None, folder=tmp_path)
+    assert csv.read_text(encoding="utf-8") == curves_csv(snapshot)
+    found = loads(json.read_text(encoding="utf-8"))
+    assert len(found["results"]) == len(snapshot.results)

@@ -32,6 +32,7 @@ class ResultView(View):
         Binding("o", "app.open_report", "Open"),
         Binding("e", "estimate", "Estimate"),
         Binding("c", "compare", "Compare"),
+        Binding("v", "app.save", "Save", show=False),
         Binding("s", "app.start", "Start"),
     ]
     KEYS = (
@@ -39,6 +40,7 @@ class ResultView(View):
         ("o", "open the report in a browser; written first, if it is not there"),
         ("e", "estimate the recording again with other settings"),
         ("c", "compare: choose an earlier recording, c there; c again ends it"),
+        ("v", "save the estimate as CSV and JSON, and this screen as a picture (SVG)"),
         ("s", "start the next recording of this bench"),
         ("↑ ↓", "scroll"),
     )

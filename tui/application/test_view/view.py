@@ -52,6 +52,7 @@ class TestView(View):
         Binding("t", "table", "Table", show=False),
         Binding("c", "clocks", "Clocks"),
         Binding("d", "details", "Details"),
+        Binding("v", "app.save", "Save", show=False),
         Binding("l", "overlay", "Like channels", show=False),
         Binding("f", "freeze", "Freeze", show=False),
         Binding("full_stop", "cursor(0.02)", "Cursor right", show=False),
@@ -77,6 +78,7 @@ class TestView(View):
         ("f", "freeze the curves; recording goes on"),
         ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
+        ("v", "save the estimate as CSV and JSON, and this screen as a picture (SVG)"),
         ("d", "details: states, segments, pairs of sensors, diagnosis, events"),
     )
 
