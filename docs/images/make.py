@@ -23,6 +23,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.importer import import_files
 from daq.python_process import python_command
+from daq.recording.reader import Recording
 from daq.results.band_summary import correlation_of
 from daq.results.sources import sources
 from estimator.self_noise.band_means import band_means, log_edges
@@ -70,9 +71,11 @@ def placed(run: re.Match[str]) -> str:
 
 
 async def photograph(recording: Path, *, size: tuple[int, int], keys: tuple[str, ...]) -> str:
-    """Return a picture (SVG) of the application on a recording, after some keys."""
+    """Return a picture (SVG) of the application on a recording of a bench, after some keys."""
     settings = Settings(segment=2.0, methods=METHODS, band=(2.0, 20.0), target_cov=0.15)
-    app = HuddleApp(RecordingControls(recording, settings), path=recording)
+    with Recording.open(recording) as opened:
+        bench = opened.bench
+    app = HuddleApp(RecordingControls(recording, settings, bench), path=recording)
     async with app.run_test(size=size) as pilot:
         while app.snapshot is None:
             await pilot.pause(0.1)
@@ -94,13 +97,20 @@ def draw(picture: str, out: Path) -> None:
 
 
 def application(folder: Path) -> None:
-    """Draw the application on the demo's bench."""
-    recording = folder / "lab.h5"
-    bench = ROOT / "tui" / "resources" / "demo.toml"
+    """Draw the views of the application on the demo's bench, with a limit."""
+    bench, recording = folder / "bench.toml", folder / "lab.h5"
+    demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
+    bench.write_text(demo + LIMIT, encoding="utf-8")
     command = python_command("tui", "simulate", str(bench), "--duration", "300s")
     subprocess.run([*command, "--out", str(recording)], check=True)
-    picture = asyncio.run(photograph(recording, size=(100, 30), keys=("down",)))
-    draw(picture, HERE / "application.png")
+    views = {
+        "application": ("down",),
+        "application-cursor": ("down", "full_stop", "u", "u", "u", "t"),
+        "application-result": ("3",),
+    }
+    for name, keys in views.items():
+        picture = asyncio.run(photograph(recording, size=(100, 30), keys=keys))
+        draw(picture, HERE / f"{name}.png")
 
 
 def real_recording(folder: Path) -> None:

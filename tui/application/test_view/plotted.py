@@ -313,4 +313,4 @@ def read_out(snapshot: Snapshot, choice: Choice, curves: Sequence[Curve]) -> str
         parts.append(f"{curve.label} {text}")
     name = snapshot.channels[choice.channel].name
     what = "" if choice.overlay else f"{name}  "
-    return f"{10**cursor:.3g} Hz  {what}{' · '.join(parts)}  {unit.name}"
+    return f"{10**cursor:.3g} Hz  {what}{unit.name}:  {' · '.join(parts)}"

@@ -77,7 +77,7 @@ class SpectrumUnit:
         """Return the labels of ticks."""
         if self.is_db:
             return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
-        return [f"{self.value(tick):.1g}" for tick in ticks]
+        return [f"{float(f'{self.value(tick):.1g}'):.4g}" for tick in ticks]
 
 
 def units_of(unit: str) -> tuple[SpectrumUnit, ...]:
