@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -85,6 +86,8 @@ def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> Non
     assert f"{pdf} written" in err
     live, offline = json.loads(said), estimate(out)
     assert live["segments"] == offline["segments"] >= 8
+    assert live["recordings"] == offline["recordings"]  # checksum of the file with its results
+    assert live["recordings"][0]["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     for ours, theirs in zip(live["channels"], offline["channels"], strict=True):
         assert (ours["sensor"], ours["channel"]) == (theirs["sensor"], theirs["channel"])
         for key in ("data_psd", "noise_psd", "noise_psd_low", "noise_psd_high", "cov"):
