@@ -450,6 +450,11 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
         assert entry.bias.tolist() == document["bias"]
     assert repr(found).split() == command("plan", str(bench), *arguments).split()
     aligned = huddle.plan(snr=250, fs=200, segment="10s")
+    assert "Six sensors do" in aligned.remarks[-1]
+    four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)
+    assert "without knowing the noise" in four.remarks[-1]
+    six = huddle.plan(snr=250, fs=200, segment="10s", sensors=6)
+    assert not any("waves cross" in line for line in six.remarks)
     assert max(map(abs, aligned["three-channel"].bias)) < 1e-3
     for wrong, said in (
         ({"fs": None}, "fs=None: expected a sampling rate"),

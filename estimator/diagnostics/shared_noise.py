@@ -32,6 +32,9 @@ UNEXPLAINED = 1e-3
 """Probability of what named pairs leave unexplained, below which none is named."""
 SEEN = 3.0
 """Standard deviations from which on a band shows that pairs share noise, once they are found."""
+OF_BANDS = 0.5
+"""Level of all single bands together, over that of all frequencies. The scores of pairs depend on
+each other, so that both together raise fewer false alarms than their sum."""
 SMALL_PART = 0.1
 """Of the statistic: a part that may be left although it is no scatter, where much is shared."""
 A_PARAMETER = 8.0
@@ -125,14 +128,13 @@ def shared_noise(
         return None
     whole = reduce(add, scores.values())
     groups = _groups(whole, dims)
-    # Half of the false alarms come from all frequencies together, half from single bands.
-    chosen, of_bands = stepwise(whole, REJECT / 2, groups), tuple(known)
+    chosen, of_bands = stepwise(whole, REJECT, groups), tuple(known)
     if chosen is not None and len(chosen):
         of_bands = _showing(scores, chosen)
         if not _is_steady([scores[n] for n in of_bands], chosen):
             return None
     elif chosen is not None and len(known) > 1:
-        each_band = {n: stepwise(scores[n], REJECT / 2 / len(known), groups) for n in known}
+        each_band = {n: stepwise(scores[n], OF_BANDS * REJECT / len(known), groups) for n in known}
         named = [n for n, pairs in each_band.items() if pairs is not None and len(pairs)]
         if named:
             clearest = max(named, key=lambda n: float(np.abs(scores[n].z).max()))

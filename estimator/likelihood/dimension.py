@@ -34,6 +34,8 @@ LEVEL = 0.05
 precision, a missing one is a bias: one band in twenty pays rather than all risk it."""
 SURE = 0.01
 """Below this p value a band that nothing explains is not left to chance."""
+ENOUGH_SENSORS = 5
+"""Sensors from which on further dimensions leave enough to tell the noise of each apart."""
 LEAST_BINS = 8
 MOST_BINS = 64
 """Frequencies of a band that are tested: of more, every second, third, …"""
@@ -52,7 +54,8 @@ class BandDimension:
     usual : int
         Channels of the largest sensor, the dimension taken otherwise.
     accepted : bool
-        False if even the most factors that can be identified do not explain the band.
+        False if even the most factors that can be identified do not explain the band, and where it
+        is undetermined.
     test : BandTest
         Of the chosen dimension.
     tried : tuple of BandTest
@@ -62,6 +65,8 @@ class BandDimension:
         leave the noise undetermined.
     usual_cov : float
         The same with the usual dimension; NaN if that could not be fitted.
+    n_sensors : int
+        Sensors that have a signal of their own.
     """
 
     low: float
@@ -73,6 +78,16 @@ class BandDimension:
     tried: tuple[BandTest, ...]
     cov: float
     usual_cov: float
+    n_sensors: int = ENOUGH_SENSORS
+
+    @property
+    def is_undetermined(self) -> bool:
+        """Whether the averages are explained, but by more than so few sensors can tell apart.
+
+        Further dimensions leave four sensors too few directions without motion to tell the noise of
+        all of them: the model then fits wrong noise as well as the true one.
+        """
+        return self.n_factors > self.usual and self.n_sensors < ENOUGH_SENSORS
 
     @property
     def is_biased(self) -> bool:
@@ -218,7 +233,9 @@ def choose_dimension(
             high=float(frequency[number == b][-1]),
             n_factors=len(tests) - 1,
             usual=usual,
-            accepted=b not in open_bands,
+            accepted=b not in open_bands
+            and not (len(tests) - 1 > usual and len(there.sensors) < ENOUGH_SENSORS),
+            n_sensors=len(there.sensors),
             test=tests[-1],
             tried=tuple(tests),
             cov=cov[b],

@@ -72,6 +72,24 @@ class MethodPlan:
         )
 
 
+ENOUGH_FOR_GRADIENTS = 6
+"""Triaxial sensors that tell any gradient of the motion from the noise of all of them."""
+_ADVICE = (
+    " Six sensors do, at different distances from their centre and turned differently; or put the"
+    " sensors closer together."
+)
+_WAVES = {
+    3: "This assumes that all sensors measure one motion. Where waves cross the bench, three"
+    f" sensors cannot tell its gradients from noise; the model test can only warn.{_ADVICE}",
+    4: "This assumes that all sensors measure one motion. Where waves cross the bench, four sensors"
+    f" explain the averages by more dimensions (--dimension auto) without knowing the noise."
+    f"{_ADVICE}",
+    5: "This assumes that all sensors measure one motion. Where waves cross the bench, five sensors"
+    " estimate the noise if like channels have like noise (--dimension auto); six need no such"
+    " assumption.",
+}
+
+
 class RecordingPlan(Mapping[str, MethodPlan]):
     """What every method needs, as `huddle.plan` returns it: a `MethodPlan` by name of the method.
 
@@ -79,12 +97,20 @@ class RecordingPlan(Mapping[str, MethodPlan]):
     ----------
     snr, cov : float
     settings : WelchSettings
+    n_sensors : int
     """
 
     def __init__(
-        self, plans: Mapping[str, MethodPlan], *, snr: float, cov: float, settings: WelchSettings
+        self,
+        plans: Mapping[str, MethodPlan],
+        *,
+        snr: float,
+        cov: float,
+        settings: WelchSettings,
+        n_sensors: int,
     ) -> None:
         self.snr, self.cov, self.settings = snr, cov, settings
+        self.n_sensors = n_sensors
         self._plans = dict(plans)
 
     def __getitem__(self, method: str) -> MethodPlan:
@@ -134,6 +160,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
                 f"{plans[0].method} assumes known gains of the channels, the bound does not; so "
                 "its duration can be shorter than that of the bound."
             )
+        if self.n_sensors < ENOUGH_FOR_GRADIENTS:
+            lines.append(_WAVES[max(3, self.n_sensors)])
         return lines
 
 
@@ -230,7 +258,13 @@ def _planned(
     csm, noise = planning.planned_csm(directions, snr=snr)
     found = planning.plan(csm, noise, dims=dims, settings=welch, cov=cov)
     plans = map(MethodPlan.of, found)
-    return RecordingPlan({each.method: each for each in plans}, snr=snr, cov=cov, settings=welch)
+    return RecordingPlan(
+        {each.method: each for each in plans},
+        snr=snr,
+        cov=cov,
+        settings=welch,
+        n_sensors=len(dims),
+    )
 
 
 def _directions(bench: Bench) -> FloatArray:

@@ -203,7 +203,16 @@ def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
             f"At {bands} Hz no dimension that these sensors allow explains the averages: the noise "
             "estimate is biased there."
         )
-    if len(unusual) + len(failing) < len(choices):
+    unknown = [choice for choice in choices if choice.is_undetermined and not choice.is_biased]
+    if unknown:
+        bands = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in unknown)
+        lines.append(
+            f"At {bands} Hz the sensors do not share one motion of {unknown[0].usual} dimensions. "
+            f"More dimensions explain the averages, but {unknown[0].n_sensors} sensors cannot tell "
+            "them from noise: the noise estimate may be wrong by any amount. Use six sensors, or "
+            "put them closer together."
+        )
+    if len(unusual) + len(failing) + len(unknown) < len(choices):
         elsewhere = "Elsewhere" if lines else "In all bands"
         lines.append(f"{elsewhere} the motion has all {choices[0].usual} dimensions.")
     return lines

@@ -134,6 +134,20 @@ def test_three_sensors_have_no_room_and_say_so() -> None:
     assert choice.is_biased
 
 
+def test_four_sensors_fit_further_dimensions_but_are_never_sure() -> None:
+    """The test does not reject the model, and the noise is far from true."""
+    frequency = np.linspace(18, 22, 20)
+    csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
+    n_factors, (choice,) = choose_dimension(
+        csm, frequency, dims=(3,) * 4, n_effective=1080, band=np.zeros(20, np.int64)
+    )
+    assert choice.n_factors > choice.usual
+    assert choice.is_undetermined
+    assert not choice.accepted
+    found = maximum_likelihood(csm, dims=(3,) * 4, n_effective=1080, n_factors=n_factors)
+    assert np.abs(found.noise_psd.mean(axis=0) - 1).max() > 0.2
+
+
 def test_a_missing_dimension_is_left_out_and_precision_gained() -> None:
     """Horizontal motion only, triaxial sensors at random orientations."""
     rng = np.random.default_rng(3)
