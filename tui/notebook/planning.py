@@ -14,9 +14,13 @@ from rich.table import Table
 from daq.bench.durations import format_duration
 from daq.drivers.bench_file import load
 from daq.errors import WrongSettingError
+from daq.estimation.noise_estimates import responses
 from daq.estimation.settings import Settings
 from estimator import planning
+from estimator.responses.edge_leakage import slope_factor
+from estimator.responses.equalisation import MATTERS
 from estimator.spectra.welch import WelchSettings
+from estimator.spectra.windows import get_window
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
 from tui.output.formatting import percent, signed
@@ -90,6 +94,28 @@ _WAVES = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Leakage:
+    """What unequal responses leak into the noise at the edges of segments, without equalisation.
+
+    Attributes
+    ----------
+    channel : str
+        With its sensor: the one into which most leaks.
+    frequency : float
+        Where, in Hz.
+    share : float
+        Of its noise there.
+    segment : float
+        Seconds of a segment with which it would be 1 %.
+    """
+
+    channel: str
+    frequency: float
+    share: float
+    segment: float
+
+
 class RecordingPlan(Mapping[str, MethodPlan]):
     """What every method needs, as `huddle.plan` returns it: a `MethodPlan` by name of the method.
 
@@ -98,6 +124,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
     snr, cov : float
     settings : WelchSettings
     n_sensors : int
+    leakage : Leakage or None
+        What responses of the bench file that differ leak into the noise; None if they do not.
     """
 
     def __init__(
@@ -108,9 +136,10 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         cov: float,
         settings: WelchSettings,
         n_sensors: int,
+        leakage: Leakage | None = None,
     ) -> None:
         self.snr, self.cov, self.settings = snr, cov, settings
-        self.n_sensors = n_sensors
+        self.n_sensors, self.leakage = n_sensors, leakage
         self._plans = dict(plans)
 
     def __getitem__(self, method: str) -> MethodPlan:
@@ -162,6 +191,14 @@ class RecordingPlan(Mapping[str, MethodPlan]):
             )
         if self.n_sensors < ENOUGH_FOR_GRADIENTS:
             lines.append(_WAVES[max(3, self.n_sensors)])
+        if self.leakage is not None:
+            found = self.leakage
+            lines.append(
+                f"Responses in the bench file differ. Equalised (--equalise auto), they do no harm;"
+                f" otherwise motion leaks at the edges of segments: {percent(found.share)} of the"
+                f" noise of {found.channel} at {found.frequency:.3g} Hz, 1 % with segments of"
+                f" {format_duration(math.ceil(found.segment))}."
+            )
         return lines
 
 
@@ -171,7 +208,41 @@ def plan_bench(path: Path, *, snr: float, cov: float) -> RecordingPlan:
     settings = Settings.of(bench)
     dims = tuple(sensor.n_main_channels for sensor in bench.sensors)
     return _planned(
-        _directions(bench), dims, settings, sampling_rate=bench.sampling_rate, snr=snr, cov=cov
+        _directions(bench),
+        dims,
+        settings,
+        sampling_rate=bench.sampling_rate,
+        snr=snr,
+        cov=cov,
+        leakage=_leakage(bench, settings, snr),
+    )
+
+
+def _leakage(bench: Bench, settings: Settings, snr: float) -> Leakage | None:
+    """Return what known responses that differ leak; None below 1 % of the noise."""
+    channels = [
+        (sensor.name, channel)
+        for sensor in bench.sensors
+        for channel in sensor.channels
+        if not channel.auxiliary
+    ]
+    length = round(settings.segment * bench.sampling_rate)
+    frequency = np.arange(1, length // 2) * bench.sampling_rate / length
+    response = responses(frequency, channels, channels[0][1].unit)
+    slopes = np.gradient(response, frequency, axis=0) / response
+    usual = np.median(slopes.real, axis=1) + 1j * np.median(slopes.imag, axis=1)
+    factor = slope_factor(get_window(settings.window, length), bench.sampling_rate)
+    share = factor * snr * np.abs(slopes - usual[:, None]) ** 2
+    place = np.unravel_index(int(np.argmax(share)), share.shape)
+    most = float(share[place])
+    if most < MATTERS:
+        return None
+    sensor, channel = channels[int(place[1])]
+    return Leakage(
+        channel=f"{sensor}.{channel.name}",
+        frequency=float(frequency[place[0]]),
+        share=most,
+        segment=settings.segment * math.sqrt(most / MATTERS),
     )
 
 
@@ -248,6 +319,7 @@ def _planned(
     sampling_rate: float,
     snr: float,
     cov: float,
+    leakage: Leakage | None = None,
 ) -> RecordingPlan:
     welch = WelchSettings(
         sampling_rate=sampling_rate,
@@ -264,6 +336,7 @@ def _planned(
         cov=cov,
         settings=welch,
         n_sensors=len(dims),
+        leakage=leakage,
     )
 
 
