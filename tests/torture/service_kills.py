@@ -1,10 +1,11 @@
 """A service under fire: SIGKILL to it, its recorders and estimates, and a clock that is set.
 
-``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS]`` runs a simulated
-bench at 20 times real time by a schedule of ten minutes, until so many kills (default 300; one in
-INTERVAL seconds, default 4) or seconds have passed, with so many steps of the clock. Cables are
-pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and
-descriptors of the service went. The clock begins an hour before clocks change in Berlin.
+``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS] [RATE]`` runs a
+simulated bench at RATE (default 20) times real time by a schedule of ten minutes, until so many
+kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, with so many steps
+of the clock. Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and
+how memory and descriptors of the service went. The clock begins an hour before clocks change in
+Berlin.
 """
 
 from __future__ import annotations
@@ -78,10 +79,10 @@ def processes(folder: Path) -> dict[str, list[int]]:
 class Soak:
     """One service, started again whenever it has been killed."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
+    def __init__(self, folder: Path, rate: float, *, seed: int) -> None:
         self.folder = folder
         self.bench = folder / "bench.toml"
-        self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=RATE)
+        self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=rate)
         self.rng = np.random.default_rng(seed)
         self.kills: Counter[str] = Counter()
         self.usage: list[tuple[float, float, float]] = []
@@ -101,6 +102,8 @@ class Soak:
     def kill(self) -> None:
         """Kill one of the processes, of a kind that is drawn by lot."""
         found = {kind: pids for kind, pids in processes(self.folder).items() if pids}
+        if "service" in found and not self._has_planned() and self.rng.random() < 0.8:
+            del found["service"]  # most kills would strike a service that only starts
         if not found:
             return
         kind = str(self.rng.choice(sorted(found)))
@@ -109,6 +112,13 @@ class Soak:
             self.kills[kind] += 1
         if kind == "service" and self._service is not None:
             self._service.wait()
+
+    def _has_planned(self) -> bool:
+        """Whether the service knows what is due next: all that was due before is accounted for."""
+        with suppress(HuddleError):
+            runs = RunStore(load(self.bench).recording_directory).runs(None, RunState.DUE)
+            return any(run.due > self.clock.now() for run in runs)
+        return False
 
     def measure(self) -> None:
         """Note memory (MB) and descriptors of the service, once it has warmed up."""
@@ -128,7 +138,8 @@ class Soak:
         while time.monotonic() < deadline:
             self.keep_alive()
             with suppress(HuddleError):
-                if not any(run.state in {"recording", "estimating"} for run in store.runs()):
+                unfinished = store.runs(None, RunState.RECORDING, RunState.ESTIMATING)
+                if self._has_planned() and not unfinished:
                     break
             time.sleep(0.5)
         if self._service is not None:
@@ -148,7 +159,9 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
         if not run.is_over and run.state is not RunState.DUE
     ]
     known = {run.due.timestamp() for run in runs}
-    due = takewhile(lambda at: at < until, due_times(ENTRY, BEGIN + timedelta(minutes=2)))
+    # What is due before a service has planned anything, nobody knows of.
+    begin = min((run.due for run in runs), default=BEGIN) - timedelta(seconds=1)
+    due = takewhile(lambda at: at < until, due_times(ENTRY, begin))
     found += [f"{at:%d %H:%M %Z}: no row" for at in due if at.timestamp() not in known]
     kept = {part for run in runs if run.removed is None for part in run.parts}
     for part in sorted(kept):
@@ -180,17 +193,18 @@ def main() -> int:
     seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 3600.0
     interval = float(sys.argv[3]) if len(sys.argv) > 3 else 4.0
     n_steps = int(sys.argv[4]) if len(sys.argv) > 4 else 0
+    rate = float(sys.argv[5]) if len(sys.argv) > 5 else RATE
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory(prefix="huddle-soak-") as name:
         folder = Path(name)
-        with simulated(with_pulled_cables(parse(text)), speed=RATE) as reachable:
+        with simulated(with_pulled_cables(parse(text)), speed=rate) as reachable:
             changes = {
                 "schedule": Schedule(runs=(ENTRY,)),
                 "storage": Storage(keep_runs=40, min_free=10**7),
             }
             bench = reachable.model_copy(update=changes)
             (folder / "bench.toml").write_text(dump(bench), encoding="utf-8")
-            soak = Soak(folder, seed=1)
+            soak = Soak(folder, rate, seed=1)
             begin = time.monotonic()
             next_kill = begin + 5.0
             steps = [begin + seconds * (k + 1) / (n_steps + 1) for k in range(n_steps)]

@@ -47,6 +47,7 @@ def hook_document(run: Run, event: str, folder: Path) -> dict[str, Any]:
     """Return what a hook reads: the run, the event, its files, and its noise."""
     document = run.document()
     document["event"] = event
+    folder = folder.resolve()
     document["recordings"] = [str(folder / part) for part in run.parts]
     result = (folder / run.parts[-1]).with_suffix(".json") if run.parts else None
     document["result"] = str(result) if result is not None and result.exists() else None

@@ -32,6 +32,8 @@ STALL = timedelta(minutes=2)
 """Time without progress after which a recorder is killed: devices that are lost do not matter."""
 RETRY, LONGEST_RETRY = 5.0, 300.0
 """Seconds until the rest of a window is tried to be recorded: at first, and at most."""
+START = timedelta(minutes=5)
+"""Time for which a recorder that cannot begin is started again: a cable may just be plugged in."""
 STOPPED = "interrupted: the service was stopped"
 INTERRUPTED = "interrupted: the service, its recorder or the computer ended"
 
@@ -94,7 +96,7 @@ class Window:
             if self._is_complete(run):
                 return self._recorded(run)
             run = run.because(STOPPED if STOPPED in run.reason else INTERRUPTED)
-        wait = RETRY
+        wait, begun = RETRY, self._clock.now()
         while True:
             if recorder is None:
                 if self._stop.is_set():
@@ -113,7 +115,7 @@ class Window:
                     break
                 run = run.because(text)
                 self._save(run)
-                if not self._existing(run):
+                if not self._existing(run) and self._clock.now() - begun > START:
                     break  # the devices, the bench file or the disk let no recording begin
             run = await self._pause(run, wait)
             wait = min(2 * wait, LONGEST_RETRY)

@@ -109,6 +109,7 @@ class FakeSteps:
     left_running: dict[str, float] = field(default_factory=dict)
     is_stuck: bool = False
     refuses: bool = False
+    refuses_first: int = 0
     started: list[tuple[str, float]] = field(default_factory=list)
     finished: list[Request] = field(default_factory=list)
 
@@ -121,7 +122,7 @@ class FakeSteps:
         del target_cov
         self.started.append((part, round(seconds)))
         until, error = self.endings.pop(0) if self.endings else (None, "")
-        if not self.refuses:
+        if not self.refuses and len(self.started) > self.refuses_first:
             (self.folder / part).touch()
         return FakeRecorder(self, self.folder / part, seconds if until is None else until, error)
 

@@ -17,6 +17,7 @@ from tui.service.processes.steps import FinishFailedError
 from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
 from tui.service.records.store import RunStore, StoreError
 from tui.service.window import STALL, STOPPED
+from tui.service.window import START as START_LIMIT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -119,10 +120,23 @@ async def test_a_killed_recorder_is_followed_by_another(tmp_path: Path) -> None:
 async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.steps.refuses = True
-    place.steps.endings = [(3.0, "a: no answer")]
-    await place.serve(HOUR)
+    place.steps.endings = [(3.0, "a: no answer")] * 20
+    await place.serve(1.2 * HOUR)
     run = place.store.runs()[0]
     assert (run.state, run.reason, run.parts) == (RunState.FAILED, "a: no answer", ())
+    assert run.ended is not None
+    assert START_LIMIT < run.ended - run.due < 2 * START_LIMIT
+
+
+async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.endings = [(3.0, "a: no answer"), (3.0, "a: no answer"), (None, "")]
+    place.steps.refuses_first = 2
+    await place.serve(1.2 * HOUR)
+    run = place.store.runs()[0]
+    assert (run.state, run.reason) == (RunState.DONE, "a: no answer")
+    assert len(run.parts) == 1
+    assert [seconds for _, seconds in place.steps.started] == [600, 592, 579]
 
 
 async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:
