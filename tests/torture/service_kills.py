@@ -102,7 +102,7 @@ class Soak:
     def kill(self) -> None:
         """Kill one of the processes, of a kind that is drawn by lot."""
         found = {kind: pids for kind, pids in processes(self.folder).items() if pids}
-        if "service" in found and not self._has_planned() and self.rng.random() < 0.8:
+        if "service" in found and (not self._has_planned() or self.rng.random() < 0.5):
             del found["service"]  # most kills would strike a service that only starts
         if not found:
             return
