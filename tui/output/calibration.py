@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from daq.results.band_summary import decibels
 from daq.results.calibration import student_quantile
 from tui.output.formatting import signed, span
@@ -300,8 +298,8 @@ def _element(value: Value, number: int, k: float, scale: float = 1.0) -> str:
     if number >= value.value.size:
         return ""
     return with_error(
-        scale * float(np.ravel(value.value)[number]),
-        scale * k * float(np.ravel(value.error)[number]),
+        scale * float(value.value.ravel()[number]),
+        scale * k * float(value.error.ravel()[number]),
     )
 
 
