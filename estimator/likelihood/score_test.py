@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from estimator.likelihood.factor_analysis import Maximum
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-MOST_BINS = 12
+MOST_BINS = 4
 """Frequencies of a band whose information is computed; it changes little from one to the next."""
 RESOLVED = 0.05
 """Most scatter of the directions of the motion at which scores are normal."""
