@@ -17,7 +17,7 @@ from daq.estimation.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daq.estimation.segment_pass import Pass
+    from daq.estimation.segments.segment_pass import Pass
 
 FORMAT = "huddle-archive"
 FORMAT_VERSION = 1

@@ -17,9 +17,9 @@ import numpy as np
 from daq.archive.plan import Plan
 from daq.archive.spectra_file import Described, Origin, SpectraWriter
 from daq.errors import HuddleError
-from daq.estimation.clipping import clipped_columns
 from daq.estimation.diagnosis import synchronisation
-from daq.estimation.segment_pass import Pass, still_for_a_while
+from daq.estimation.segments.clipping import clipped_columns
+from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
 from estimator.spectra.segment_rejection import Reason

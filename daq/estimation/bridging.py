@@ -12,7 +12,7 @@ from daq.estimation.snapshot import Bridged
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.estimation.segment_pass import Pass
+    from daq.estimation.segments.segment_pass import Pass
     from estimator.self_noise.result import SelfNoise
 
 

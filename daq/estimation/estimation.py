@@ -26,7 +26,6 @@ import numpy as np
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
 from daq.estimation.bridging import bridged, widened
-from daq.estimation.clipping import clipped_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
 from daq.estimation.equalisation import ROUNDS, SETTLED, Equalisation
 from daq.estimation.noise_estimates import (
@@ -48,7 +47,8 @@ from daq.estimation.recording_set import (
     open_another,
 )
 from daq.estimation.segment_course import segment_course
-from daq.estimation.segment_pass import Pass, still_for_a_while
+from daq.estimation.segments.clipping import clipped_columns
+from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
     ChannelLabel,

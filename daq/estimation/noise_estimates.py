@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
-    from daq.estimation.segment_pass import Pass
+    from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
 
     FloatArray = NDArray[np.float64]

@@ -17,7 +17,7 @@ from daq.recording.storage.names import continuation_names
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from daq.estimation.segment_pass import Pass
+    from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.estimation.noise_estimates import Channels
-    from daq.estimation.segment_pass import Pass
+    from daq.estimation.segments.segment_pass import Pass
 
 
 def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> SegmentCourse | None:

@@ -17,7 +17,7 @@ from daq.archive.store import FOLDER, Store
 from daq.archive.task import Task, software_version
 from daq.bench.masks.mask_file import masks_named
 from daq.errors import ArchiveError, HuddleError
-from daq.estimation.segment_pass import Pass
+from daq.estimation.segments.segment_pass import Pass
 from daq.recording.reader import Recording
 from tui.output.archive.document import archive_document, days_csv
 from tui.output.archive.tables import (

@@ -13,7 +13,7 @@ from daq.archive.sources import sort
 from daq.archive.store import Store
 from daq.archive.task import Task, software_version
 from daq.bench.model import Channel
-from daq.estimation.segment_pass import Pass
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter

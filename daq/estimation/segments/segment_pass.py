@@ -12,8 +12,8 @@ import numpy as np
 
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.delay_estimation import DelayEstimator
-from daq.estimation.flatline import FlatlineDetector, stands_still
-from daq.estimation.gap_bridge import GapBridge
+from daq.estimation.segments.flatline import FlatlineDetector, stands_still
+from daq.estimation.segments.gap_bridge import GapBridge
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
