@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from textual.app import App
 
-    from daq.acquisition.preview import SensorPreview
+    from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot

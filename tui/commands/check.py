@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.table import Table
 
-from daq.acquisition.device_check import discover, probe_bench, search_description
+from daq.acquisition.before_test.device_check import discover, probe_bench, search_description
 from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
 from daq.bench.toml_text import to_toml
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from daq.acquisition.device_check import DiscoveredDevice, SensorCheck
+    from daq.acquisition.before_test.device_check import DiscoveredDevice, SensorCheck
     from daq.bench.model import Bench
     from daq.errors import DeviceError
 

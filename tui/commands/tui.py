@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from daq.acquisition.preview import preview
+from daq.acquisition.before_test.preview import preview
 from daq.acquisition.recorder import recording_path
 from daq.bench.masks.mask_file import masks_named
 from daq.drivers.bench_file import load
@@ -40,7 +40,7 @@ from tui.simulation.host_time import host_time
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from daq.acquisition.preview import SensorPreview
+    from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench, Sensor
     from daq.estimation.snapshot import Snapshot

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from daq.acquisition.device_check import discover
+from daq.acquisition.before_test.device_check import discover
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError
 from tests.daq.drivers import reading

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.acquisition.preview import SensorPreview
+from daq.acquisition.before_test.preview import SensorPreview
 from daq.drivers.interface import DeviceInformation
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown

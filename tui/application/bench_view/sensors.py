@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.acquisition.preflight import Problem, check_before_test, is_complete
+from daq.acquisition.before_test.preflight import Problem, check_before_test, is_complete
 from tui.application.bench_view.traces import trace
 from tui.output.formatting import listed, signed
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.acquisition.preflight import Finding
-    from daq.acquisition.preview import SensorPreview
+    from daq.acquisition.before_test.preflight import Finding
+    from daq.acquisition.before_test.preview import SensorPreview
     from tui.application.state import State
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"

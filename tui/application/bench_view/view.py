@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from textual.app import ComposeResult
 
-    from daq.acquisition.preview import SensorPreview
+    from daq.acquisition.before_test.preview import SensorPreview
     from tui.application.controls import Preview
     from tui.application.state import State
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daq.acquisition.preview import preview
+from daq.acquisition.before_test.preview import preview
 from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import bench_of, device, spec
 
 if TYPE_CHECKING:
-    from daq.acquisition.preview import SensorPreview
+    from daq.acquisition.before_test.preview import SensorPreview
 
 pytestmark = pytest.mark.devices
 

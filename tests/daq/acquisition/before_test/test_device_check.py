@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.acquisition.device_check import (
+from daq.acquisition.before_test.device_check import (
     MODBUS_BAUD_RATES,
     MODBUS_DEVICES,
     arrival_rate,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daq.acquisition.preflight import Problem, check_before_test, is_complete
-from daq.acquisition.preview import SensorPreview
+from daq.acquisition.before_test.preflight import Problem, check_before_test, is_complete
+from daq.acquisition.before_test.preview import SensorPreview
 from tests.tui.example_snapshot import demo_bench
 
 RATE = 200.0

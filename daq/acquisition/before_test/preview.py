@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from daq.acquisition.device_check import arrival_rate
+from daq.acquisition.before_test.device_check import arrival_rate
 from daq.acquisition.device_identity import check_identity, with_owner
 from daq.drivers.registry import driver_type
 from daq.errors import DeviceError, WrongDeviceError

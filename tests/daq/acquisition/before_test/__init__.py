@@ -1,0 +1,1 @@
+"""Tests of daq.acquisition.before_test."""
