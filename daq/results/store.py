@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from daq.recording.repair import write_results
-from daq.results.verdict import Verdict
+from daq.results.decision.verdict import Verdict
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
     from daq.recording.reader import Recording
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from estimator.self_noise.band_means import FloatArray
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.model import Bench
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from estimator.types import FloatArray
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan

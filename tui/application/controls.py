@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from tui.application.plan import TestPlan
 
 

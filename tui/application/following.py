@@ -14,7 +14,7 @@ from textual.reactive import var
 
 from daq.errors import HuddleError
 from daq.estimation.follow import follow
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
 from tui.application.messages import (

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration, parse_duration
+from daq.results.decision.verdict import Verdict
 from daq.results.precision import precision
-from daq.results.verdict import Verdict
 from tui.output.formatting import percent
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.verdict import LimitResult, TestVerdict
+    from daq.results.decision.verdict import LimitResult, TestVerdict
 
 SURER = 1.25
 """How much wider than the interval of a verdict the one is that ends a test."""

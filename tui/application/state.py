@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from tui.application.plan import TestPlan
 
 BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")

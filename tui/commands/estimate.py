@@ -11,11 +11,11 @@ from rich.text import Text
 
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
+from daq.results.decision.verdict import Verdict
 from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
 from daq.results.sources import sources
-from daq.results.verdict import Verdict
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
 from tui.output.diagnostics import details, summary
 from tui.output.json_document import document
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
+    from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
-    from daq.results.verdict import TestVerdict
 
 
 def estimate_recordings(

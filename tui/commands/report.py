@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.bench.masks.mask_file import masks_named
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from tui.commands.estimate import estimated, exit_with
 from tui.output.console import check_places, console, notices
 from tui.output.extras import require

@@ -22,7 +22,7 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from daq.results.precision import precision
 from daq.results.store import store_results
 from tui.commands.estimate import exit_with, show_result
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
 
 _LOGGER = logging.getLogger(__name__)
 STATUS_INTERVAL = 1.0

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Sensor
     from daq.estimation.snapshot import Snapshot
     from daq.recording.interface import ReadableSensor
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 

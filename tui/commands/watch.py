@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.estimation.follow import follow
 from daq.results.band_summary import band_of, channel_means
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from daq.results.precision import precision
 from tui.commands.estimate import exit_with, show_result
 from tui.output.console import console, finite, write_text

@@ -321,7 +321,7 @@ class Result:
         RecordingError
             If a recording cannot be read any more.
         """
-        from daq.results.limits import judge  # noqa: PLC0415 - seldom needed
+        from daq.results.decision.limits import judge  # noqa: PLC0415 - seldom needed
         from daq.results.sources import sources  # noqa: PLC0415
         from tui.output.json_document import document  # noqa: PLC0415
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Diagnosis, Snapshot
+    from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
     from daq.results.sources import Source
-    from daq.results.verdict import TestVerdict
 
 SCHEMA_VERSION = 1
 """Rises when a key is removed or changes its meaning; new keys do not change it."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from daq.results.decision_time import LIKELY
-from daq.results.limits import FEWEST_AVERAGES
-from daq.results.verdict import Obstacle, Verdict
+from daq.results.decision.decision_time import LIKELY
+from daq.results.decision.limits import FEWEST_AVERAGES
+from daq.results.decision.verdict import Obstacle, Verdict
 from tui.output.exit_codes import ExitCode
 from tui.output.formatting import level, listed, roughly, several, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daq.results.verdict import LimitResult, Prediction, TestVerdict
+    from daq.results.decision.verdict import LimitResult, Prediction, TestVerdict
 
 WORDS: Mapping[Verdict, str] = {
     Verdict.PASS: "PASS",

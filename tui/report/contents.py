@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
 from daq.results.band_summary import band_of
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from tui.output.formatting import span
 from tui.report.calibration import calibration_section
 from tui.report.evidence import (

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from daq.bench.masks.mask import SOURCES
 from daq.results.band_summary import band_of, channel_means, data_means, decibels
+from daq.results.decision.verdict import Verdict
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
-from daq.results.verdict import Verdict
 from estimator.self_noise.result import Flag
 from tui.output.formatting import ONE_SIDED, span
 from tui.output.results import flagged
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from estimator.self_noise.band_means import BandMeans
     from tui.report.parts import Tone
 

@@ -15,9 +15,9 @@ import numpy as np
 from daq.bench.model import Bench, Channel, Limit, Sensor
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
-from daq.results.decision_time import LIKELY
-from daq.results.limits import judge
-from daq.results.verdict import Verdict
+from daq.results.decision.decision_time import LIKELY
+from daq.results.decision.limits import judge
+from daq.results.decision.verdict import Verdict
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra.welch import CrossSpectra, WelchSettings
@@ -27,7 +27,7 @@ from tui.studies.study import Panel, Point, Series, Study
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from estimator.self_noise.result import SelfNoise
     from tui.studies.study import ProgressCallback
 

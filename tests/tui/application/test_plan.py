@@ -11,8 +11,8 @@ import pytest
 from daq.bench.model import Limit
 from daq.errors import HuddleError
 from daq.recording.sensor_state import SensorState
-from daq.results.limits import judge
-from daq.results.verdict import Verdict
+from daq.results.decision.limits import judge
+from daq.results.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import NARROW, ended, running, shown
 from tests.tui.example_snapshot import (

@@ -10,9 +10,9 @@ import pytest
 from daq.bench.model import Limit
 from daq.errors import RecordingError
 from daq.recording.reader import Recording
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
+from daq.results.decision.verdict import Verdict
 from daq.results.store import store_results
-from daq.results.verdict import Verdict
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
 from tui.runs.catalogue import catalogue, delete_recording
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.comparison import Difference
-    from daq.results.verdict import TestVerdict
+    from daq.results.decision.verdict import TestVerdict
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"

@@ -23,7 +23,7 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
 from daq.results.band_summary import band_of, channel_means, judged_method
-from daq.results.limits import judge
+from daq.results.decision.limits import judge
 from daq.results.sources import sources
 from daq.results.store import store_results
 from estimator.errors import BandError, EstimatorError

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
-from daq.results.limits import FEWEST_AVERAGES, judge
-from daq.results.verdict import LimitResult, Obstacle, TestVerdict, Verdict
+from daq.results.decision.limits import FEWEST_AVERAGES, judge
+from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise

@@ -27,9 +27,9 @@ from daq.results.band_summary import (
     judged_method,
 )
 from daq.results.clock_effect import added_in_bands
-from daq.results.decision_time import Margins, predict
+from daq.results.decision.decision_time import Margins, predict
+from daq.results.decision.verdict import SHRINKS, LimitResult, Obstacle, TestVerdict, Verdict
 from daq.results.partners import without_partners
-from daq.results.verdict import SHRINKS, LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import SharedNoise
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench, Limit
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
-    from daq.results.verdict import Prediction
+    from daq.results.decision.verdict import Prediction
     from estimator.self_noise.band_means import FloatArray
 
 BANDS_PER_OCTAVE = 3

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.results.verdict import Prediction
+from daq.results.decision.verdict import Prediction
 from estimator.self_noise.band_means import interval_of_cov
 
 if TYPE_CHECKING:

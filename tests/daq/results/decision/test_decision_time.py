@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daq.results.decision_time import LIKELY, Margins, predict
+from daq.results.decision.decision_time import LIKELY, Margins, predict
 
 if TYPE_CHECKING:
-    from daq.results.verdict import Prediction
+    from daq.results.decision.verdict import Prediction
 
 QUANTILE = 3.5
 
