@@ -99,7 +99,7 @@ def messages(error: BaseException) -> Iterator[str]:
         yield from (str(error) or type(error).__name__).splitlines()
         loaded = sys.modules.get("daq.estimation.snapshot")
         if loaded is not None and isinstance(error, loaded.NoResultError):
-            from tui.output.diagnostics import problems  # noqa: PLC0415 - seldom needed
+            from tui.output.advice.diagnostics import problems  # noqa: PLC0415 - seldom needed
 
             yield from problems(error.snapshot)
 

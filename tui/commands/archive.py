@@ -19,6 +19,7 @@ from daq.bench.masks.mask_file import masks_named
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segments.segment_pass import Pass
 from daq.recording.reader import Recording
+from tui.output.advice.diagnostics import summary
 from tui.output.archive.document import archive_document, days_csv
 from tui.output.archive.tables import (
     course_table,
@@ -33,7 +34,6 @@ from tui.output.console import (
     write_json,
     write_text,
 )
-from tui.output.diagnostics import summary
 from tui.output.exit_codes import ExitCode
 from tui.output.extras import load, require
 from tui.output.formatting import several

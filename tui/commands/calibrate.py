@@ -9,6 +9,7 @@ from rich.text import Text
 
 from daq.results.calibration import calibrate
 from tui.commands.estimate import estimated
+from tui.output.advice.diagnostics import problems
 from tui.output.calibration import (
     LEGEND,
     angle_table,
@@ -21,7 +22,6 @@ from tui.output.calibration import (
     title,
 )
 from tui.output.console import check_places, for_people, hint, write_json
-from tui.output.diagnostics import problems
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

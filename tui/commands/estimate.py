@@ -16,8 +16,8 @@ from daq.results.decision.verdict import Verdict
 from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
 from daq.results.sources import sources
+from tui.output.advice.diagnostics import details, summary
 from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
-from tui.output.diagnostics import details, summary
 from tui.output.json_document import document
 from tui.output.noise_parameters import (
     allan_table,

@@ -10,7 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from estimator.errors import BandError
-from tui.output import diagnostics, results
+from tui.output import results
+from tui.output.advice import diagnostics
 from tui.output.formatting import level, level_with_error
 
 if TYPE_CHECKING:

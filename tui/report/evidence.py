@@ -13,7 +13,7 @@ from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
-from tui.output.diagnostics import summary, why_untested
+from tui.output.advice.diagnostics import summary, why_untested
 from tui.output.formatting import several, span, utc
 from tui.output.results import faulty_channels, left_out
 from tui.output.vocabulary import clock_source

@@ -15,7 +15,7 @@ from daq.results.partners import without_partners
 from daq.results.precision import channel_covs, precision
 from tui.application.dialogs import item
 from tui.application.test_view.panels import alerts, known_to
-from tui.output.diagnostics import summary
+from tui.output.advice.diagnostics import summary
 from tui.output.formatting import clock_time, level, level_with_error, percent, signed
 from tui.output.results import remarks
 from tui.output.verdict_text import (

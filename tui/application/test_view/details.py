@@ -11,7 +11,7 @@ from rich.text import Text
 from daq.protocols.block import EventKind
 from tui.application.dialogs import item
 from tui.application.test_view.panels import grouped, state
-from tui.output.diagnostics import details as diagnosis_details
+from tui.output.advice.diagnostics import details as diagnosis_details
 from tui.output.formatting import clock_time, utc
 from tui.output.results import left_out
 

@@ -1,6 +1,6 @@
 """Advice as words: whole sentences, several pieces in one line, a few words for a screen.
 
-Chosen by the type of the advice; never parsed.
+Chosen by the type of the advice; never parsed. Tables of numbers are in `tui.output`.
 """
 
 from tui.output.advice import misfit as misfit  # registers its sentences

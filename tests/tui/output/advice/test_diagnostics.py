@@ -19,7 +19,7 @@ from estimator.diagnostics.kinds import Level, Untested
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot, rotation
-from tui.output.diagnostics import details, summary
+from tui.output.advice.diagnostics import details, summary
 from tui.output.results import remarks, result_table
 
 if TYPE_CHECKING:
