@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from rich.console import Console
+    from rich.console import Console, JustifyMethod
+
+_GAP = 2
+"""Characters between columns."""
 
 
 def calibrate_recordings(
@@ -63,14 +67,31 @@ def calibrate_recordings(
 def _show(
     screen: Console, heading: str, content: tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
 ) -> None:
+    """Print a table; columns that do not fit beside the others follow below it."""
     header, rows = content
     if not rows:
         return
     if heading:
         screen.print(Text(heading, "bold"))
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for number, name in enumerate(header):
-        table.add_column(Text(name), justify="left" if number < 2 else "right")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    screen.print(table)
+    widths = [max(map(cell_len, column)) + _GAP for column in zip(header, *rows, strict=True)]
+    for columns in side_by_side(widths, screen.width, n_keys=2 if header[1] == "channel" else 1):
+        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
+        for number in columns:
+            justify: JustifyMethod = "left" if header[number] in {"sensor", "channel"} else "right"
+            table.add_column(Text(header[number]), justify=justify, no_wrap=True)
+        for row in rows:
+            table.add_row(*(Text(row[number]) for number in columns))
+        needed = sum(widths[number] for number in columns)
+        screen.print(table, width=max(needed, screen.width), crop=False)
+
+
+def side_by_side(widths: Sequence[int], width: int, *, n_keys: int) -> list[list[int]]:
+    """Return the columns of each part of a table that is too wide; each begins with the keys."""
+    keys = list(range(n_keys))
+    parts = [[*keys]]
+    for number in range(n_keys, len(widths)):
+        used = sum(widths[each] for each in parts[-1])
+        if len(parts[-1]) > n_keys and used + widths[number] - _GAP > width:
+            parts.append([*keys])
+        parts[-1].append(number)
+    return parts

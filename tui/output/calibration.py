@@ -21,12 +21,24 @@ Rows = tuple[tuple[str, ...], ...]
 _LEAST_SHOWN = 1e-5
 _VARIES = 1.5
 """Scatter over frequencies, over what errors explain, from which on a remark says so."""
+_SHORT = {
+    "estimate": "est.",
+    "variation": "var.",
+    "clocks": "clocks",
+    "leakage": "leak.",
+    "quantisation": "quant.",
+    "certificate": "cert.",
+    "sensitivity": "sens.",
+    "incoherence": "incoh.",
+}
 LEGEND = (
-    "Relative standard uncertainties; A: from the scatter of these data, B: from elsewhere. "
-    "estimate: finite averages. variation: scatter over the frequencies beyond that, by "
-    "incoherence or by responses that vary. clocks: what is left between them. leakage: width and "
-    "edges of segments. quantisation: whole counts. certificate: of the reference. sensitivity: "
-    "twice that of the channel. incoherence: what the model test leaves."
+    "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
+    "sources. est.: finite averages. var.: scatter over the frequencies beyond that, by "
+    "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
+    "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
+    "the reference. sens.: twice the uncertainty of the sensitivity. incoh.: motion or noise that "
+    "the model does not explain. u: combined standard uncertainty. U: expanded uncertainty, k u. "
+    "1–2: angle between the first and the second channel, less 90°."
 )
 
 
@@ -44,10 +56,11 @@ def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
 
 
 def share(relative: float) -> str:
-    """Return a relative uncertainty in per cent."""
+    """Return a relative uncertainty in per cent, to two digits."""
     if relative < _LEAST_SHOWN:
         return "< 0.001 %" if relative > 0 else "0"
-    return f"{100 * relative:.0f} %" if relative >= 1 else f"{100 * relative:.2g} %"
+    rounded = float(f"{100 * relative:.2g}")
+    return f"{rounded:.0f} %" if rounded >= 10 else f"{rounded:g} %"
 
 
 def title(found: Calibration, snapshot: Snapshot) -> str:
@@ -94,7 +107,7 @@ def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...]
         about = (f"{' to '.join(reference)} (°)",) * bool(most)
     pairs = max((each.orthogonality_deg.value.size for each in found.sensors), default=0)
     which = ("12", "13", "23")[:pairs]
-    header = ("sensor", *about, *(f"{pair[0]}–{pair[1]} less 90° (°)" for pair in which))
+    header = ("sensor", *about, *(f"{pair[0]}–{pair[1]} (°)" for pair in which))
     rows = [
         (
             snapshot.sensor_names[each.sensor],
@@ -135,10 +148,10 @@ def budget_table(budgets: Sequence[Budget]) -> tuple[tuple[str, ...], Rows]:
     header = (
         "sensor",
         "channel",
-        *(f"{source} ({types[source]})" for source in sources),
-        "combined",
+        *(f"{_SHORT.get(source, source)} ({types[source]})" for source in sources),
+        "u",
         "k",
-        "expanded",
+        "U",
     )
     rows = []
     for budget in budgets:

@@ -18,6 +18,7 @@ from daq.estimation.settings import Settings
 from daq.results.calibration import Budget, Component, calibrate, student_quantile
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
+from tui.commands.calibrate import side_by_side
 from tui.output.calibration import with_error
 
 if TYPE_CHECKING:
@@ -177,3 +178,10 @@ def test_the_command_says_it_all(recording: Path) -> None:
     )
     assert "Calibration against a (relative to it)" in shown.stdout
     assert "Budget of the noise PSD" in shown.stdout
+
+
+def test_columns_that_do_not_fit_follow_below_with_the_names() -> None:
+    widths = [12, 9, 20, 20, 20]
+    assert side_by_side(widths, 79, n_keys=2) == [[0, 1, 2, 3, 4]]
+    assert side_by_side(widths, 78, n_keys=2) == [[0, 1, 2, 3], [0, 1, 4]]
+    assert side_by_side(widths, 10, n_keys=2) == [[0, 1, 2], [0, 1, 3], [0, 1, 4]]

@@ -61,11 +61,11 @@ def test_values_budgets_and_certificates_are_there() -> None:
     tables = {part.title: part for part in section.parts if isinstance(part, Table)}
     assert len(tables) == 6
     budget = tables["Uncertainty budget of the sensitivities"]
-    assert "certificate (B)" in budget.header
+    assert "cert. (B)" in budget.header
     assert {len(row) for table in tables.values() for row in table.rows} == {
         len(table.header) for table in tables.values()
     }
-    assert budget.rows[0][budget.header.index("certificate (B)")] == "0.5 %"
+    assert budget.rows[0][budget.header.index("cert. (B)")] == "0.5 %"
 
 
 def test_two_sensors_cannot_be_calibrated() -> None:
@@ -74,10 +74,11 @@ def test_two_sensors_cannot_be_calibrated() -> None:
 
 
 def test_shares_are_short() -> None:
-    assert [share(each) for each in (0.0, 1e-9, 0.00021, 0.05, 1.234)] == [
+    assert [share(each) for each in (0.0, 1e-9, 0.00021, 0.05, 0.996, 1.234)] == [
         "0",
         "< 0.001 %",
         "0.021 %",
         "5 %",
-        "123 %",
+        "100 %",
+        "120 %",
     ]
