@@ -44,6 +44,7 @@ _ASSUMED_SNR = 1e6  # of known responses that differ
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
 _IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
 _AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
+_FEWEST = 20.0  # averages, below which responses are too uncertain to estimate filters from
 _FINE = 4  # points of known responses for each of a spectrum
 
 
@@ -145,7 +146,7 @@ class Equalisation:
         if found is None or not bands:
             return False
         n_effective = min(band.n_effective for band in bands)
-        if not found.share.max(initial=0.0) > matters(n_effective):
+        if n_effective < _FEWEST or not found.share.max(initial=0.0) > matters(n_effective):
             return False
         frequency = np.concatenate([band.frequencies for band in bands])
         csm = np.concatenate([band.csm for band in bands])

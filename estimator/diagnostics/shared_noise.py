@@ -43,6 +43,8 @@ MOST_STEPS = 4
 """Pairs or groups that are named."""
 MOST_BINS = 16
 """Frequencies at which the effect on the estimates is computed."""
+MOST_SHIFT = 5.0
+"""Largest bias stated, in ln of the PSD; the theory is of first order: beyond, it is just large."""
 MANY = 1e9
 """Averages of matrices without scatter."""
 
@@ -143,6 +145,8 @@ def shared_noise(
         return None
     there = reduce(add, (scores[n] for n in of_bands))
     amount, error = there.amounts(chosen)
+    if np.any(np.abs(amount) > 1 + SEEN * error):  # no coherency: the scores say something else
+        return None
     amounts = np.zeros(len(there.pairs))
     amounts[chosen] = amount
     inside = np.any([bands[n] for n in of_bands], axis=0)
@@ -276,7 +280,7 @@ def _effect(
     if len(dims) >= 3:
         off = three_sensor(shared, dims=dims, n_effective=MANY).noise_psd
         closed = (off - three_sensor(sound, dims=dims, n_effective=MANY).noise_psd) / psi
-    likely = np.expm1(shift(maximum, rows, scores, amounts))
+    likely = np.expm1(np.clip(shift(maximum, rows, scores, amounts), -MOST_SHIFT, MOST_SHIFT))
     return _median(closed), _median(likely)
 
 

@@ -37,8 +37,8 @@ def reproduce(
     """Reproduce the figures of the paper and compare them with theory.
 
     Recordings are simulated at the length of the paper, three and ten hours.
-    All studies together take a few minutes. The exit code is 1 if a point
-    deviates from theory by more than its statistical error.
+    The figures take a few minutes, some other studies up to half an hour. The exit
+    code is 1 if a point deviates from theory by more than its statistical error.
     """
     from tui.studies.reproduce import run
 

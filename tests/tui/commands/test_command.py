@@ -91,7 +91,8 @@ def test_every_command_has_help_with_examples(name: str) -> None:
 
 def test_help_names_every_study_and_scenario() -> None:
     said = {
-        name: set(re.findall(r"\w+", huddle(name, "--help"))) for name in ("reproduce", "simulate")
+        name: set(re.findall(r"[\w-]+", huddle(name, "--help")))
+        for name in ("reproduce", "simulate")
     }
     assert set(STUDIES) <= said["reproduce"]
     assert set(SCENARIOS) <= said["simulate"]

@@ -10,7 +10,14 @@ import pytest
 import daq.errors
 import estimator.errors
 import sim_devices.errors
-from daq.errors import ArrayError, BenchFileError, DeviceError, HuddleError, WrongSettingError
+from daq.errors import (
+    ArrayError,
+    BenchFileError,
+    DeviceError,
+    HuddleError,
+    WrongArchiveError,
+    WrongSettingError,
+)
 from estimator.errors import BandError, EstimatorError, UnknownMethodError
 from sim_devices.errors import ScenarioError, ServeError, SimulationError
 from tui.cli.main import exit_code, messages
@@ -27,6 +34,7 @@ USAGE_ERRORS = {
     BandError,
     UnknownMethodError,
     ScenarioError,
+    WrongArchiveError,
 }
 
 
