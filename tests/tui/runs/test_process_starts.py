@@ -18,6 +18,7 @@ from daq.bench.loading import dump
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from daq.recording.reader import Recording
+from tests.daq.archive import months
 from tui.runs.recorder_process import RecorderProcess
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.steps import ProcessSteps
@@ -125,6 +126,18 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
     assert not record.exists()
 
 
+def test_processes_of_an_archive_execute_none(record: Path, tmp_path: Path) -> None:
+    begin = months.START_NS
+    paths = [
+        months.record(tmp_path / f"{hour}.h5", begin_ns=begin + hour * months.HOUR_NS, seed=hour)
+        for hour in (0, 3)
+    ]
+    store = months.store_for(tmp_path / "archive", paths[0])
+    with store.writing():
+        assert months.fill(store, paths, jobs=2) == []
+    assert not record.exists()
+
+
 STARTS = re.compile(r"\b(Popen|subprocess\.(run|call|check_\w+)|create_subprocess_\w+)\(")
 OTHER_STARTS = re.compile(r"\bos\.(exec|spawn|posix_spawn|system|popen)|\bmultiprocessing\b|runpy")
 
@@ -138,13 +151,16 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     interpreters = [name for name, text in sources.items() if "sys.executable" in text]
     assert interpreters == [str(Path("daq", "python_process.py"))]
     assert not [name for name, text in sources.items() if OTHER_STARTS.search(text)]
-    # Each has its own test above: simulated devices, the recorder, and runs of a service.
+    # Each has its own test above: simulated devices, the recorder, archives, runs of a service.
     starts = {name for name, text in sources.items() if STARTS.search(text)}
-    assert starts == {
+    users = {  # run what the bench file or --on-event says
+        str(Path("tui", "commands", "tui.py")),
+        str(Path("tui", "service", "hooks.py")),
+    }
+    assert starts == users | {
+        str(Path("daq", "archive", "execution.py")),
         str(Path("sim_devices", "server", "launch.py")),
         str(Path("tui", "runs", "recorder_process.py")),
-        str(Path("tui", "service", "hooks.py")),
         str(Path("tui", "service", "processes", "steps.py")),
     }
-    hooks = str(Path("tui", "service", "hooks.py"))  # runs what the bench file says
-    assert all("python_command(" in sources[name] for name in starts - {hooks})
+    assert all("python_command(" in sources[name] for name in starts - users)
