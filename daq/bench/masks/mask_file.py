@@ -12,8 +12,6 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tomlkit
-
 from daq.bench.estimate_settings import one_of
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.units import DensityUnit
@@ -106,6 +104,8 @@ def embed_masks(text: str, folder: Path) -> tuple[str, list[FileFault]]:
         isinstance(limit, dict) and "file" in limit for limit in limits
     ):
         return text, []
+    import tomlkit  # noqa: PLC0415 - only where a bench file names files of masks
+
     document = tomlkit.parse(text)
     faults = []
     for limit in document["limits"]:
