@@ -51,9 +51,11 @@ def test_headless_commands_never_load_textual(command: str) -> None:
 ARRAYS_IN = {"notebook", "report", "simulation", "studies"}
 """Packages of the front ends that take or draw arrays."""
 ARRAYS_OF = {
-    "application/clocks.py", "application/curves.py", "application/panels.py",
-    "application/plot.py", "output/json_values.py", "output/noise_parameters.py",
-    "output/results.py",
+    "application/bench_view/sensors.py", "application/bench_view/traces.py",
+    "application/test_view/clocks.py", "application/test_view/curves.py",
+    "application/test_view/panels.py", "application/test_view/plot.py",
+    "application/test_view/plotted.py", "application/test_view/units.py",
+    "output/json_values.py", "output/noise_parameters.py", "output/results.py",
 }  # fmt: skip
 """Modules that draw curves, count flags, or write arrays as text."""
 

@@ -81,6 +81,12 @@ class Scatter:
     deviation: FloatArray
     expected: FloatArray
 
+    @property
+    def typically_expected(self) -> FloatArray:
+        """Medians of `expected` over the live channels, (n_groups,); NaN where there is none."""
+        rows = [row[np.isfinite(row)] for row in self.expected]
+        return np.array([np.median(row) if len(row) else np.nan for row in rows])
+
     def among(self, channels: Sequence[int], n_channels: int) -> Scatter:
         """Return the same with channels numbered among all, dead ones included."""
         deviation, expected = np.full((2, len(self.deviation), n_channels), np.nan)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -165,10 +164,9 @@ def _repeatability(found: Stability, names: Names) -> tuple[str, Table]:
     scatter = found.parts if found.runs is None else found.runs
     table = _table("band (Hz)", *names.channels, "if steady")
     for low, high, deviation, expected in zip(
-        found.low, found.high, scatter.deviation, scatter.expected, strict=True
+        found.low, found.high, scatter.deviation, scatter.typically_expected, strict=True
     ):
-        steady = expected[np.isfinite(expected)]
-        numbers = [*deviation.tolist(), float(np.median(steady)) if len(steady) else math.nan]
+        numbers = [*deviation.tolist(), float(expected)]
         cells = ["?" if math.isnan(each) else f"{100 * each:.1f} %" for each in numbers]
         table.add_row(f"{low:.3g}–{high:.3g}", *cells)
     what = "parts of the recording" if found.runs is None else "recordings"
