@@ -1,15 +1,19 @@
 """Recordings as miniSEED with StationXML, both written by ObsPy.
 
 Counts are written as they are: Steim 2 for integers, as floats otherwise. Every stretch between
-gaps states its time; where a clock runs off the nominal rate, every block does. Sensors whose names
-are no codes of the FDSN get some: the network ``XX``, a station, and channels by rate and unit.
+gaps states its time. A record of miniSEED continues at the nominal rate: where a clock runs off
+that, blocks are split, so that no sample is off by more than 0.5 % of the sampling interval.
+Sensors whose names are no codes of the FDSN get some: the network ``XX``, a station, and channels
+by rate and unit.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +38,12 @@ if TYPE_CHECKING:
 _ROWS_AT_ONCE = 1 << 18
 _NOMINAL_NS = 1000
 """By how much times may miss the nominal rate: they are written to the microsecond."""
+_OFF = 0.005
+"""By how much of a sampling interval a sample may be off the time that its record implies."""
+_STEP = 0.01
+"""Difference from the nominal length of a block, as a fraction of it, beyond which it is a step."""
+_SHORT_ROWS, _SHORT_RECORD, _RECORD = 500, 512, 4096
+"""Rows up to which records are short, and bytes of a record."""
 _STEIM2_LIMIT = 1 << 29
 _BANDS = ((1000.0, "F"), (250.0, "C"), (80.0, "H"), (10.0, "B"), (1.0, "M"), (0.0, "L"))
 """Band codes of broadband channels, by the least rate in Hz (SEED manual, appendix A)."""
@@ -150,40 +160,85 @@ def _runs(recording: Recording, sensor: SensorRecord) -> Iterator[_Run]:
     first = blocks["first_sample"].astype(np.int64)
     length = blocks["n_samples"].astype(np.int64)
     rows = blocks["first_row"].astype(np.int64)
-    times = _times(recording, sensor, blocks)
+    times, ends = _times(recording, sensor, blocks)
+    interval = NS_PER_S / sensor.sampling_rate
     begins = np.concatenate([[True], first[1:] != (first + length)[:-1]])
     if (blocks["flags"] & int(BlockFlag.DEVICE_UTC)).all():
         begins |= (blocks["flags"] & int(BlockFlag.CLOCK_RESTART)) != 0
     starts = np.flatnonzero(begins).tolist()
     for stretch, (begin, end) in enumerate(zip(starts, [*starts[1:], len(blocks)], strict=True)):
         mine = slice(begin, end)
-        nominal = times[begin] + (rows[mine] - rows[begin]) * (NS_PER_S / sensor.sampling_rate)
+        nominal = times[begin] + (rows[mine] - rows[begin]) * interval
+        late = ends[mine] - nominal - length[mine] * interval
         last_row = int(rows[end - 1] + length[end - 1])
-        if np.max(np.abs(times[mine] - nominal)) <= _NOMINAL_NS:
+        if max(np.max(np.abs(times[mine] - nominal)), np.max(np.abs(late))) <= _NOMINAL_NS:
             yield _Run(int(rows[begin]), last_row, int(times[begin]), stretch)
-        else:
-            edges = [*rows[mine].tolist(), last_row]
-            for number, at in enumerate(times[mine].tolist()):
-                yield _Run(edges[number], edges[number + 1], int(at), stretch)
+            continue
+        for number in range(begin, end):
+            row, count = int(rows[number]), int(length[number])
+            for first_of, end_of, at in _pieces(
+                count, int(times[number]), int(ends[number]), interval
+            ):
+                yield _Run(row + first_of, row + end_of, at, stretch)
+
+
+def _pieces(count: int, start: int, end: int, interval: float) -> Iterator[tuple[int, int, int]]:
+    """Return first and end sample of the parts of a block, and the time of each, in ns."""
+    excess = end - start - count * interval
+    n_pieces = 1
+    if abs(excess) <= _STEP * count * interval:
+        n_pieces = min(count, max(1, math.ceil(abs(excess) / (_OFF * interval))))
+    edges = [round(number * count / n_pieces) for number in range(n_pieces + 1)]
+    for first, last in pairwise(edges):
+        yield first, last, start + round(first * (end - start) / count)
 
 
 def _times(
     recording: Recording, sensor: SensorRecord, blocks: NDArray[np.void]
-) -> NDArray[np.int64]:
-    """Return UTC of the first sample of each block: as stated, or by the clock of the sensor."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return UTC of each block's begin and end: as stated, or by the clock of the sensor."""
+    first = blocks["first_sample"].astype(np.int64)
+    length = blocks["n_samples"].astype(np.int64)
     if (blocks["flags"] & int(BlockFlag.DEVICE_UTC)).all():
-        return blocks["device_counter"].astype(np.int64)
+        stated = blocks["device_counter"].astype(np.int64)
+        return stated, _ends(stated, blocks, sensor.sampling_rate)
     created = recording.created_at
     if sensor.polled:
         instants = [
             int(sensor.instants_ns(int(row), int(row) + 1)[0]) for row in blocks["first_row"]
         ]
-        return np.array(instants, np.int64) - created.monotonic_ns + created.utc_ns
+        polls: NDArray[np.int64] = np.array(instants, np.int64)
+        polls += created.utc_ns - created.monotonic_ns
+        return polls, _ends(polls, blocks, sensor.sampling_rate)
     arrivals = ArrivalTimes(sensor.sampling_rate, created.monotonic_ns, created.utc_ns)
     arrivals.add(blocks)
     clock = arrivals.solve(sensor.name)
-    seconds = clock.at(blocks["first_sample"].astype(np.float64))
-    return created.utc_ns + np.rint(seconds * NS_PER_S).astype(np.int64)
+    begins, lasts = (
+        NS_PER_S * clock.at(at.astype(np.float64)) for at in (first, first + length - 1)
+    )
+    steps = np.where(
+        length > 1, (lasts - begins) / np.maximum(length - 1, 1), NS_PER_S / sensor.sampling_rate
+    )  # the next sample may be of a clock that was set
+    return (
+        created.utc_ns + np.rint(begins).astype(np.int64),
+        created.utc_ns + np.rint(lasts + steps).astype(np.int64),
+    )
+
+
+def _ends(times: NDArray[np.int64], blocks: NDArray[np.void], rate: float) -> NDArray[np.int64]:
+    """Return the ends of blocks: the next begin, or else at the rate of the block before."""
+    first = blocks["first_sample"].astype(np.int64)
+    length = blocks["n_samples"].astype(np.int64)
+    ends: NDArray[np.int64] = times + np.rint(length * (NS_PER_S / rate)).astype(np.int64)
+    restarted = (blocks["flags"] & int(BlockFlag.CLOCK_RESTART)) != 0
+    joined = [False, *((first[1:] == (first + length)[:-1]) & ~restarted[1:]), False]
+    for number in range(len(times)):
+        if joined[number + 1]:
+            ends[number] = times[number + 1]
+        elif joined[number]:
+            before = (ends[number - 1] - times[number - 1]) / length[number - 1]
+            ends[number] = times[number] + round(length[number] * before)
+    return ends
 
 
 def _write_rows(
@@ -215,7 +270,12 @@ def _write_rows(
                 "starttime": obspy.UTCDateTime(ns=start_ns),
             },
         )
-        trace.write(file, format="MSEED", encoding=encoding, reclen=4096)
+        trace.write(
+            file,
+            format="MSEED",
+            encoding=encoding,
+            reclen=_SHORT_RECORD if len(counts) <= _SHORT_ROWS else _RECORD,
+        )
     return len(counts)
 
 

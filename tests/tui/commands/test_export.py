@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from daq.formats.importer import import_files
 from daq.formats.miniseed_export import export_miniseed
 from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
+from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.cli.main import app
 from tui.output.exit_codes import ExitCode
@@ -126,6 +128,35 @@ def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_
     np.testing.assert_allclose(trace.data, samples, rtol=1e-12)
     assert run(recording, "--format", "mseed", "--start", "1s").exit_code == ExitCode.USAGE
     assert run(recording, "--format", "sac").exit_code == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("states_utc", [True, False])
+def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_utc: bool) -> None:
+    obspy = load_obspy()
+    rate, n = 100 * (1 + 80e-6), 8 * 4100
+    sensor = Sensor(
+        np.arange(n, dtype=np.int32)[:, None] % 9973, rate=rate, nominal=100.0, utc=states_utc
+    )
+    writer = create(tmp_path / "a.h5", {"a": sensor})
+    for block in blocks("a", sensor, block=41.0):
+        writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "a.h5") as opened:
+        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
+    content = (tmp_path / "a.mseed").read_bytes()
+    late, first = [], 0
+    for at in range(0, len(content), 512):  # a reader joins records; each states its time
+        (record,) = obspy.read(io.BytesIO(content[at : at + 512]), format="MSEED")
+        index = first + np.arange(record.stats.npts)
+        np.testing.assert_array_equal(record.data, index % 9973)
+        stated = (record.stats.starttime.ns - ORIGIN.utc_ns) / 1e9 + (index - first) / 100
+        late.append(stated - index / rate)
+        first += record.stats.npts
+    assert first == n
+    error = np.concatenate(late)
+    if states_utc:
+        assert np.max(np.abs(error)) <= 0.005 / 100 + 1e-6
+    assert np.ptp(error) <= 0.005 / 100 + 2e-6  # times of miniSEED are whole microseconds
 
 
 def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recording: Path) -> None:
