@@ -25,7 +25,7 @@ def archive(
         list[Path] | None,
         typer.Argument(
             metavar="SRC",
-            help="Recordings, or folders of them. Without any, only what the archive has.",
+            help="Recordings, or folders of them. Without SRC, show what the archive holds.",
         ),
     ] = None,
     *,
@@ -42,18 +42,18 @@ def archive(
         typer.Option(
             "--stretch",
             metavar="LENGTH",
-            help="What spectra are kept of: every hour or every day (UTC). Default: hour.",
+            help="Length of time of each stored spectrum: hour or day, in UTC (default: hour).",
         ),
     ] = None,
     jobs: Annotated[
-        int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Processes to work with.")
+        int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of processes.")
     ] = 1,
     scheduler: Annotated[
         str | None,
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="Dask scheduler, such as tcp://host:8786, whose workers do the work; they see"
+            help="Use the workers of this Dask scheduler, such as tcp://host:8786. They must see"
             " recordings and archive under the same paths.",
         ),
     ] = None,
@@ -67,7 +67,7 @@ def archive(
         typer.Option(
             "--time-zone",
             metavar="ZONE",
-            help="Of working hours and nights, such as Europe/London.",
+            help="Time zone of working hours and nights, such as Europe/London.",
         ),
     ] = "UTC",
     false_alarm: Annotated[
@@ -87,13 +87,13 @@ def archive(
 ) -> None:
     """Keep the spectra of months of recordings, and show the noise over time.
 
-    Spectra of every hour (or day) go into a store. Recordings that the store
-    has are not read again, so the command goes on where it was interrupted,
-    and takes new recordings only. Shown are the noise of all recordings
-    together, of every day, its drift, changes beyond uncertainty, and working
-    hours against nights.
+    The spectra of every hour (or day) are stored in the archive. Recordings
+    that it holds are not read again: an interrupted command continues, and a
+    later one adds new recordings only. The result is the noise of all
+    recordings together and of every day, its drift, changes beyond
+    uncertainty, and the difference between working hours and nights.
 
-    Options that shape spectra (--segment, …) are fixed when a store begins.
+    Options that shape spectra (--segment, …) cannot be changed later.
     """
     from tui.commands.archive import archive_recordings
 

@@ -25,7 +25,7 @@ def _band(text: str) -> tuple[float, float]:
 
 @examples("huddle status lab.toml", "huddle status lab.toml --json -")
 def status(bench: BenchArgument, *, json: JsonOption = None) -> None:
-    """Show what the service of a bench does: runs, sensors, disk, clock.
+    """Show the state of the service of a bench: runs, sensors, disk, clock.
 
     The exit code is 3 if no service runs.
     """
@@ -69,7 +69,9 @@ def history(
     band: Annotated[
         str | None,
         typer.Option(
-            "--band", metavar="LOW:HIGH", help="Band in Hz, one that runs have kept (default: all)."
+            "--band",
+            metavar="LOW:HIGH",
+            help="Band in Hz that the runs have stored (default: all).",
         ),
     ] = None,
     scatter: Annotated[
@@ -78,7 +80,7 @@ def history(
             "--scatter",
             min=0.0,
             metavar="DB",
-            help="Standard deviation from run to run that is no change, in dB.",
+            help="Standard deviation between runs that does not count as change, in dB.",
         ),
     ] = 0.1,
     false_alarms: Annotated[
@@ -100,9 +102,8 @@ def history(
 ) -> None:
     """Show the noise of every channel from run to run, and whether it has changed.
 
-    Serial numbers tie the history of a sensor together over benches and
-    ports. The test allows for the uncertainty of each run; its false-alarm
-    rate holds for the whole history.
+    Serial numbers identify a sensor across benches and ports. The test
+    allows for the uncertainty of each run; its false-alarm rate holds for the whole history.
     """
     from tui.commands.history import show_history
 
@@ -127,9 +128,9 @@ def pin(
         list[str], typer.Argument(metavar="RUN", help="Recording or due time, as in huddle runs.")
     ],
     *,
-    remove: Annotated[bool, typer.Option("--remove", help="Do not keep them any longer.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Allow their removal again.")] = False,
 ) -> None:
-    """Keep runs, whatever the limits of storage in the bench file."""
+    """Protect runs from removal by the storage limits of the bench file."""
     from tui.commands.runs import pin_runs
 
     pin_runs(source, names, pinned=not remove)
@@ -144,9 +145,9 @@ def verify(
     *,
     json: JsonOption = None,
 ) -> None:
-    """Verify the checksums of recordings: of all that a service keeps, or of files.
+    """Verify the checksums of recordings, or of all recordings of a service.
 
-    The exit code is 3 if one is damaged or lost.
+    The exit code is 3 if a recording is damaged or lost.
     """
     from tui.commands.runs import verify_recordings
 
