@@ -339,7 +339,7 @@ def export(
 ) -> None:
     """Write samples or noise curves for other programs.
 
-    [b]mseed[/b]        all samples (times to 0.5 % of a sampling interval), and StationXML
+    [b]mseed[/b]        all samples (times to 0.5 % of a sample), and StationXML
 
     [b]csv parquet[/b]  a row for each method, channel and frequency
 
