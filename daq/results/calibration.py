@@ -1,17 +1,18 @@
-"""Calibration results: every sensor against the reference, and uncertainty budgets by the GUM."""
+"""Calibration results: every sensor against the reference, with budgets of the uncertainty."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means, correlation_of, judged_method
+from daq.results.certificates import certificates_of, channel_of
 from daq.results.clock_effect import effect
+from daq.results.uncertainty_budget import Budget, Component
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
@@ -21,7 +22,7 @@ from estimator.spectra.windows import get_window
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.model import Bench, Certificate, Channel
+    from daq.bench.model import Bench, Certificate
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from estimator.responses.calibration import ResponseCurve, SensorCalibration
@@ -30,84 +31,6 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 BANDS_PER_OCTAVE = 1
 _RECTANGULAR = math.sqrt(3.0)
-_MANY = 1e6  # degrees of freedom: those of a stated uncertainty
-
-
-@dataclass(frozen=True, slots=True)
-class Component:
-    """One line of a budget.
-
-    Attributes
-    ----------
-    source : str
-        "estimate", "variation", "clocks", "leakage", "quantisation", "certificate",
-        "sensitivity" or "incoherence".
-    kind : str
-        "A" (from the scatter of these data) or "B" (from elsewhere).
-    distribution : str
-        "normal" or "rectangular".
-    relative : float
-        Standard uncertainty over the value.
-    dof : float
-        Degrees of freedom.
-    """
-
-    source: str
-    kind: str
-    distribution: str
-    relative: float
-    dof: float = _MANY
-
-
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """The uncertainty of one value of one channel in one band.
-
-    Attributes
-    ----------
-    sensor, channel : str
-    quantity : str
-        "sensitivity" (in counts per unit, if absolute; else relative to that of the bench file) or
-        "noise" (PSD).
-    low, high : float
-        Band, Hz.
-    value : float
-    components : tuple of Component
-    confidence : float
-    is_absolute : bool
-        Whether the value rests on a certificate.
-    """
-
-    sensor: str
-    channel: str
-    quantity: str
-    low: float
-    high: float
-    value: float
-    components: tuple[Component, ...]
-    confidence: float
-    is_absolute: bool = False
-
-    @property
-    def combined(self) -> float:
-        """Combined standard uncertainty, as a fraction of the value."""
-        return math.sqrt(sum(each.relative**2 for each in self.components))
-
-    @property
-    def dof(self) -> float:
-        """Effective degrees of freedom (Welch and Satterthwaite)."""
-        total = sum(each.relative**4 / each.dof for each in self.components)
-        return self.combined**4 / total if total > 0 else _MANY
-
-    @property
-    def k(self) -> float:
-        """Coverage factor of the confidence level."""
-        return student_quantile(0.5 + self.confidence / 2, self.dof)
-
-    @property
-    def expanded(self) -> float:
-        """Expanded uncertainty, in the unit of the value."""
-        return abs(self.value) * self.k * self.combined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,21 +69,6 @@ class Calibration:
         return tuple(each for each in found if widest[each.sensor, each.channel] is each)
 
 
-def student_quantile(probability: float, dof: float) -> float:
-    """Return a quantile of Student's distribution, by its expansion about the normal one.
-
-    To 0.2 % from 5 degrees of freedom on (Abramowitz and Stegun 26.7.5).
-    """
-    z, v = NormalDist().inv_cdf(probability), max(dof, 2.0)
-    terms = (
-        z,
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-    )
-    return sum(term / v**power for power, term in enumerate(terms))
-
-
 def calibrate(
     snapshot: Snapshot,
     settings: Settings,
@@ -193,7 +101,7 @@ def calibrate(
     if not 0 < confidence < 1:
         raise WrongSettingError(f"confidence {confidence:g}: expected a fraction such as 0.95")
     names = snapshot.sensor_names
-    certified = [_certificates(snapshot, bench, name) for name in names]
+    certified = [certificates_of(snapshot, bench, name) for name in names]
     if reference is not None and reference not in names:
         raise WrongSettingError(f"reference {reference!r}: expected one of {', '.join(names)}")
     chosen = next((n for n, each in enumerate(certified) if each), 0)
@@ -242,30 +150,6 @@ def calibrate(
     )
 
 
-def _certificates(snapshot: Snapshot, bench: Bench | None, name: str) -> tuple[Certificate, ...]:
-    """Return the certificates of a sensor, in the order of its channels; empty if one has none."""
-    channels = [
-        _channel(bench, name, each.channel) for each in snapshot.channels if each.sensor == name
-    ]
-    found = tuple(
-        each.certificate for each in channels if each is not None and each.certificate is not None
-    )
-    return found if len(found) == len(channels) else ()
-
-
-def _channel(bench: Bench | None, sensor: str, channel: str) -> Channel | None:
-    return next(
-        (
-            found
-            for each in (() if bench is None else bench.sensors)
-            if each.name == sensor
-            for found in each.channels
-            if found.name == channel
-        ),
-        None,
-    )
-
-
 class _Work:
     """What all sensors are calibrated with."""
 
@@ -290,7 +174,7 @@ class _Work:
         for number, certificate in enumerate(certificates):
             column = int(self._first[reference]) + number
             label = snapshot.channels[column]
-            channel = _channel(bench, label.sensor, label.channel)
+            channel = channel_of(bench, label.sensor, label.channel)
             if channel is not None:  # motion by the certificate, not by the bench file
                 scale[column] = channel.sensitivity / certificate.value
             # conservative: as if the certificates of all its channels erred together
@@ -368,7 +252,7 @@ class _Work:
         for number in range(self.snapshot.dims[found.sensor]):
             column = int(self._first[found.sensor]) + number
             label = labels[column]
-            channel = _channel(self._bench, label.sensor, label.channel)
+            channel = channel_of(self._bench, label.sensor, label.channel)
             gain = float(found.gain.value[number])
             scatter = float(found.gain.error[number]) / gain
             bent = self._bending[inside, column, found.reference]

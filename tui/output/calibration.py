@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from daq.results.band_summary import decibels
-from daq.results.calibration import student_quantile
+from daq.results.uncertainty_budget import student_quantile
 from tui.output.formatting import signed, span
 from tui.output.json_values import plain
 
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.estimation.snapshot import Snapshot
-    from daq.results.calibration import Budget, Calibration, Component
+    from daq.results.calibration import Calibration
+    from daq.results.uncertainty_budget import Budget, Component
     from estimator.responses.calibration import SensorCalibration, Value
 
 Rows = tuple[tuple[str, ...], ...]

@@ -15,7 +15,8 @@ from daq.bench.model import Sensor as BenchSensor
 from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.calibration import Budget, Component, calibrate, student_quantile
+from daq.results.calibration import calibrate
+from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
