@@ -38,6 +38,19 @@ if TYPE_CHECKING:
 OPTIONS = ("--segment", "10s", "--method", "three-sensor")
 PLAIN = ("--equalise", "off", "--bridge", "0")
 """As the spectra of archives are."""
+CLUSTER = """
+import asyncio, sys
+from distributed import Scheduler, Worker
+
+async def serve():
+    local = {"host": "127.0.0.1", "dashboard": False}
+    async with Scheduler(port=0, scheduler_file=sys.argv[1], **local) as scheduler:
+        async with Worker(scheduler.address, nthreads=1, **local):
+            await scheduler.finished()
+
+asyncio.run(serve())
+"""
+"""A scheduler and a worker in one process, which takes half the time of two."""
 
 
 def huddle(*arguments: object) -> Any:  # noqa: ANN401 - click's result
@@ -129,17 +142,15 @@ def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> No
 def test_the_workers_of_a_cluster_write_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     store, address = tmp_path / "store", tmp_path / "scheduler.json"
-    dask = [sys.executable, "-P", "-m", "dask"]
-    local = ["--host", "127.0.0.1", "--no-dashboard"]
     with ExitStack() as stack:
-        for arguments in (
-            ["scheduler", "--port", "0", *local, "--scheduler-file", str(address)],
-            ["worker", "--no-nanny", "--nthreads", "1", *local, "--scheduler-file", str(address)],
-        ):
-            process = stack.enter_context(
-                subprocess.Popen([*dask, *arguments], cwd=tmp_path, stderr=subprocess.DEVNULL)
+        process = stack.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-P", "-c", CLUSTER, str(address)],
+                cwd=tmp_path,
+                stderr=subprocess.DEVNULL,
             )
-            stack.callback(process.kill)
+        )
+        stack.callback(process.kill)
         wait_until(lambda: address.exists() and address.read_text().endswith("}"), "a scheduler")
         scheduler = json.loads(address.read_text())["address"]
         command = [*python_command("tui"), "archive", str(folder), "--store", str(store)]
