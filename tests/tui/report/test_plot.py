@@ -149,13 +149,12 @@ def test_the_key_fits_into_a_narrow_figure() -> None:
 
 def test_the_same_estimate_gives_the_same_file(tmp_path: Path) -> None:
     contents = {}
-    for name in ("a.svg", "b.svg", "a.pdf", "b.pdf", "a.png"):
+    for name in ("a.svg", "b.svg", "a.pdf", "b.pdf"):
         write_figure(SNAPSHOT, SETTINGS, None, tmp_path / name, width=7.1)
         contents[name] = (tmp_path / name).read_bytes()
     for kind in ("svg", "pdf"):
         assert contents[f"a.{kind}"] == contents[f"b.{kind}"]
     assert contents["a.pdf"].startswith(b"%PDF-")
-    assert contents["a.png"].startswith(b"\x89PNG")
     root = ET.fromstring(contents["a.svg"])  # noqa: S314 - our own
     assert root.attrib["width"] == "511.2pt"
     assert not root.findall(".//{*}text")  # letters are shapes: no font is needed
@@ -172,6 +171,7 @@ def test_the_command_writes_what_the_suffix_says(tmp_path: Path) -> None:
     out.write_bytes(b"old")
     result = runner.invoke(app, [*arguments, "-o", str(out), "--width", "90"])
     assert result.exit_code == 0, result.output
+    assert out.read_bytes().startswith(b"\x89PNG")
     width = int.from_bytes(out.read_bytes()[16:20], "big")
     assert width == pytest.approx(90 / 25.4 * 300, abs=1)
 

@@ -267,12 +267,11 @@ def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
 def test_the_same_recording_gives_the_same_files(
     reported: Reported, paper: PdfReader, tmp_path: Path
 ) -> None:
-    for name in ("a.html", "a.pdf"):
-        write(
-            reported.snapshot, tmp_path / name, recordings=[reported.recording],
-            settings=reported.settings,
-        )  # fmt: skip
-    assert (tmp_path / "a.html").read_text(encoding="utf-8") == reported.page
+    """As PDF; that pages are the same, the test of the demo's reports shows."""
+    write(
+        reported.snapshot, tmp_path / "a.pdf", recordings=[reported.recording],
+        settings=reported.settings,
+    )  # fmt: skip
     assert paper.stream is not None
     paper.stream.seek(0)
     assert (tmp_path / "a.pdf").read_bytes() == paper.stream.read()
