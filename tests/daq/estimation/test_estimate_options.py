@@ -70,7 +70,7 @@ def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snap
     with Estimation([path], settings) as live:
         for number, block in enumerate(arriving):
             writer.append(block)
-            if number % 60 == 59:
+            if number % 120 == 119:
                 writer.commit()
                 live.update()
                 growing = live.snapshot()
