@@ -16,10 +16,8 @@ import asyncio
 import contextlib
 import logging
 import math
-import re
 import signal
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -46,7 +44,6 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.drivers.interface import DriverType
     from daq.host_clock import HostClock
-    from daq.protocols.block import HostTime
     from daq.recording.writer import Committed
 
 _LOGGER = logging.getLogger(__name__)
@@ -76,13 +73,6 @@ class RecorderStatus:
     def to_dict(self) -> dict[str, Any]:
         """Return the status as a JSON object."""
         return asdict(self)
-
-
-def recording_path(bench: Bench, at: HostTime) -> Path:
-    """Return the default path of a recording that starts at this instant."""
-    name = re.sub(r"[^\w.-]+", "-", bench.name).strip("-.") or "recording"
-    utc = datetime.fromtimestamp(at.utc_ns / 1e9, tz=UTC)
-    return bench.recording_directory / f"{name}-{utc:%Y%m%dT%H%M%SZ}.h5"
 
 
 def run(

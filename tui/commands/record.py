@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 from rich.live import Live
 
-from daq.acquisition.recorder import recording_path, run
+from daq.acquisition.recorder import run
 from daq.drivers.bench_file import load
 from daq.host_clock import SystemClock
+from daq.recording.storage.names import recording_path
 from tui.output.console import notices, write_json
 from tui.output.formatting import clock_time, roughly, several
 from tui.simulation.host_time import host_time

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.progress import BarColumn, TextColumn
 
-from daq.acquisition.recorder import recording_path
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import shortest_duration
 from daq.drivers.bench_file import load
@@ -22,6 +21,7 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
+from daq.recording.storage.names import recording_path
 from daq.results.decision.limits import judge
 from daq.results.precision import precision
 from daq.results.store import store_results

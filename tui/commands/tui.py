@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from daq.acquisition.before_test.preview import preview
-from daq.acquisition.recorder import recording_path
 from daq.bench.masks.mask_file import masks_named
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
@@ -24,6 +23,7 @@ from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.control import ask
 from daq.recording.reader import Recording
+from daq.recording.storage.names import recording_path
 from daq.results.sources import sources
 from daq.results.store import store_results
 from tui.application.app import HuddleApp

@@ -7,8 +7,10 @@ import errno
 import glob
 import itertools
 import os
+import re
 import sys
 import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daq.errors import RecordingError
@@ -17,6 +19,9 @@ from daq.recording.storage.locking import is_being_written
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from daq.bench.model import Bench
+    from daq.protocols.block import HostTime
 
 PRIVATE = 0o600
 """Permissions of a recording: whoever can read one can stop its recorder."""
@@ -101,3 +106,10 @@ def sync_directory(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def recording_path(bench: Bench, at: HostTime) -> Path:
+    """Return the default path of a recording that starts at this instant."""
+    name = re.sub(r"[^\w.-]+", "-", bench.name).strip("-.") or "recording"
+    utc = datetime.fromtimestamp(at.utc_ns / 1e9, tz=UTC)
+    return bench.recording_directory / f"{name}-{utc:%Y%m%dT%H%M%SZ}.h5"

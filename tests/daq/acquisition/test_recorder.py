@@ -14,7 +14,7 @@ import pytest
 
 from daq.acquisition.block_writer import MAX_EVENTS_PER_SECOND
 from daq.acquisition.connection import CLOSE_TIMEOUT
-from daq.acquisition.recorder import RecorderStatus, record, recording_path
+from daq.acquisition.recorder import RecorderStatus, record
 from daq.errors import (
     DeviceError,
     NoAnswerError,
@@ -28,6 +28,7 @@ from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
+from daq.recording.storage.names import recording_path
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
 from tests.waiting import limit
 

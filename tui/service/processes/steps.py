@@ -13,13 +13,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from daq.acquisition.recorder import recording_path
 from daq.errors import HuddleError, RecordingError
 from daq.protocols.block import HostTime
 from daq.python_process import python_command
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
+from daq.recording.storage.names import recording_path
 from tui.runs.child_log import ChildLog
 from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
 from tui.service.processes.finish import Outcome, Request
