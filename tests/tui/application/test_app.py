@@ -186,7 +186,7 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
     )
     event = replace(now.events[1], sensor=sensors[1], text=f"{sensors[2]} [/dropped]")
     now = replace(now, sensors=status, events=(now.events[0], event))
-    async with app.run_test(size=(200, 100)) as pilot:
+    async with app.run_test(size=(200, 60)) as pilot:
         await app.workers.wait_for_complete()
         messages = (StatusUpdated(now), SnapshotReady(snapshot, SETTINGS))
         await shown(pilot, app, *messages)

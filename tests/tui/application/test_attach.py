@@ -45,7 +45,7 @@ async def until(pilot: Pilot[None], reached: Callable[[], bool]) -> None:
     deadline = time.monotonic() + limit()
     while not reached():
         assert time.monotonic() < deadline, screen_text(pilot.app)
-        await pilot.pause(0.05)
+        await pilot.pause(0.2)
 
 
 async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: Path) -> None:
