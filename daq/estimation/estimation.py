@@ -46,7 +46,7 @@ from daq.estimation.recording_set import (
     is_left,
     open_another,
 )
-from daq.estimation.segment_course import segment_course
+from daq.estimation.segment_course import keep_few, segment_course
 from daq.estimation.segments.clipping import clipped_columns
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import Settings
@@ -197,6 +197,7 @@ class Estimation:
 
         for each in self._passes:
             each.advance(count)
+            keep_few([one.single for one in self._passes])
         seen = self.n_seen
         if seen >= self._next_review:
             if not self._equalisation.is_settled:
@@ -255,10 +256,12 @@ class Estimation:
             self._settle(count)  # before all segments are taken: most of them are taken once
         for each in self._passes:
             each.finish(count, repeat)
+            keep_few([one.single for one in self._passes])
         if not is_exact:  # clocks that are wrong look like responses that differ
             self._equalise_in_rounds(count)
             for each in self._passes:
                 each.advance(count)
+                keep_few([one.single for one in self._passes])
         snapshot = self._snapshot(final=True)
         if not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values()):
             raise NoResultError(self._why_nothing(snapshot), snapshot)

@@ -8,12 +8,26 @@ import numpy as np
 
 from daq.estimation.noise_estimates import responses
 from estimator.diagnostics.stability import SegmentCourse
+from estimator.spectra.segment_spectra import MOST_SEGMENTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.estimation.noise_estimates import Channels
     from daq.estimation.segments.segment_pass import Pass
+    from estimator.spectra.segment_spectra import SegmentSpectra
+
+
+def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:
+    """Keep no more segments of all recordings together than of a single one."""
+    kept = [each for each in spectra if each is not None]
+    every = max((single.every for single in kept), default=1)
+    while len(kept) > 1:
+        for single in kept:
+            single.thin(every)
+        if sum(map(len, kept)) <= max(MOST_SEGMENTS, len(kept)):
+            return
+        every *= 2
 
 
 def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> SegmentCourse | None:

@@ -70,12 +70,23 @@ class SegmentSpectra:
         self._parts.append(some)
         self._n_kept += len(some)
         while self._n_kept > MOST_SEGMENTS:
-            self._parts = [self.values()[::2]]
+            self.thin(2 * self.every)
+
+    def __len__(self) -> int:
+        """Return how many segments are kept."""
+        return self._n_kept
+
+    def thin(self, every: int) -> None:
+        """Keep every `every`-th segment from now on: a multiple of what it is."""
+        if every != self.every:
+            self._parts = [self.values()[:: every // self.every].copy()]
             self._n_kept = len(self._parts[0])
-            self.every *= 2
+            self.every = every
 
     def values(self) -> NDArray[np.complex64]:
         """Return what is kept, shape (n_segments, n_kept, n_channels); not scaled to a density."""
         if not self._parts:
             return np.empty((0, len(self.bins), self._n_channels), np.complex64)
-        return np.concatenate(self._parts)
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0]
