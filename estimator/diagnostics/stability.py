@@ -180,14 +180,16 @@ def stability(
     x *= np.sqrt(fitted / np.mean(np.abs(x) ** 2, axis=0))
     residual = np.matmul(np.matmul(x.swapaxes(0, 1), free.conj()), free.swapaxes(1, 2))
     residual = residual.swapaxes(0, 1)
+    del x  # tens of megabytes
     groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
     out = _disturbed(residual, groups)
     lags = np.abs(bins[:, None] - bins)
     correlation = np.concatenate([[1.0], neighbours, [0.0]])[np.minimum(lags, len(neighbours) + 1)]
     projector = free @ free.conj().swapaxes(1, 2)
     of_parts = _Parts(np.array_split(residual, n_parts), projector, n_effective, correlation)
-    runs = [residual[course.runs == run] for run in np.unique(course.runs)]
-    several = len(runs) > 1 and min(map(len, runs)) >= FEWEST_SEGMENTS
+    numbers, lengths = np.unique(course.runs, return_counts=True)
+    several = len(numbers) > 1 and min(lengths) >= FEWEST_SEGMENTS
+    runs = [residual[course.runs == run] for run in numbers] if several else []
     without = _Parts([residual[~out]], projector, n_effective, correlation)
     excess = without.lack(groups) if out.any() else np.zeros((1, residual.shape[2]))
     return Stability(
