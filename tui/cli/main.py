@@ -202,7 +202,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         writer = sys.modules.get("daq.recording.writer")
         code = ExitCode.DONE if ended.code is None else ended.code
         unsafe = code == ExitCode.TROUBLE or (writer is not None and writer.BROKEN)
-        if unsafe and "h5py" in sys.modules and isinstance(code, int):
+        is_program = arguments is None
+        if is_program and unsafe and "h5py" in sys.modules and isinstance(code, int):
             # HDF5 can crash on exit after an error of the disk; all files of ours are closed.
             with suppress(OSError):
                 sys.stdout.flush()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 
 from daq.archive.execution import carried_out
@@ -103,6 +104,25 @@ def tasks(store: Store, new: Sequence[tuple[str, Path]]) -> list[Task]:
 def content(store: Store) -> dict[str, bytes]:
     """Return all files of an archive."""
     return {path.name: path.read_bytes() for path in store.folder.iterdir()}
+
+
+def assert_same(one: Store, other: Store) -> None:
+    """See that two archives have the same files, and in them the same values to rounding."""
+    assert {p.name for p in one.folder.iterdir()} == {p.name for p in other.folder.iterdir()}
+    for path in one.folder.glob("*.h5"):
+        with h5py.File(path) as first, h5py.File(other.folder / path.name) as second:
+            found: list[str] = []
+            first.visit(found.append)
+            for name in found:
+                if not isinstance(first[name], h5py.Dataset):
+                    continue
+                a, b = first[name][()], second[name][()]
+                if np.issubdtype(np.asarray(a).dtype, np.inexact):
+                    np.testing.assert_allclose(
+                        a, b, rtol=1e-9, atol=1e-12 * np.abs(a).max(initial=0)
+                    )
+                else:
+                    assert np.array_equal(a, b), name
 
 
 def with_reject(settings: Settings) -> Settings:

@@ -22,6 +22,7 @@ from tests.daq.archive.months import (
     HOUR_NS,
     SETTINGS,
     START_NS,
+    assert_same,
     content,
     fill,
     record,
@@ -136,10 +137,10 @@ def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> No
         process.send_signal(signal.SIGKILL)
     result = huddle(folder, "--store", store)
     assert result.exit_code == 0
-    assert content(Store.open(store)) == content(Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+    assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
 
 
-def test_the_workers_of_a_cluster_write_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     store, address = tmp_path / "store", tmp_path / "scheduler.json"
     with ExitStack() as stack:
@@ -163,7 +164,7 @@ def test_the_workers_of_a_cluster_write_the_same_bytes(folder: Path, tmp_path: P
             code, _, said = finish(huddle_command)
     assert code == 0, said
     assert "dashboard: http" in said
-    assert content(Store.open(store)) == content(Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
+    assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
 
 
 def test_figures_show_the_density_and_the_days(folder: Path, tmp_path: Path) -> None:
