@@ -94,11 +94,15 @@ def pytest_configure() -> None:
     """Make tests the same whatever the environment, and however busy the computer.
 
     Commands can be interrupted, even where the tests run in a shell's background. Examples that
-    hypothesis finds are not timed. Compiled modules are kept: the tests start hundreds of
+    hypothesis finds are not timed, and are those of every run, unless HUDDLE_TEST_EXPLORE is set:
+    then it looks for others. Compiled modules are kept: the tests start hundreds of
     processes, and each would compile all that it imports.
     """
     settings.register_profile(
-        "untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+        "untimed",
+        deadline=None,
+        derandomize="HUDDLE_TEST_EXPLORE" not in os.environ,
+        suppress_health_check=[HealthCheck.too_slow],
     )
     settings.load_profile("untimed")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
