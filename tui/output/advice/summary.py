@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 MOST_PAIRS = 10
 """Pairs of sensors in one sentence; five sensors have this many."""
+LEVEL_DEG = 0.1
+"""A rotation may exceed its horizontal part by this, and is still called horizontal."""
 _FAULTS_OF_ONE = (Delay, Gain, NotOrthogonal, ReversedPolarity, SwappedChannels)
 """Faults of one sensor, which appear in each pair with it."""
 
@@ -123,14 +125,15 @@ def _listed(
 
 @_together.register(Rotated)
 def _rotated(*found: Rotated, names: Names) -> str:
-    horizontal = all(math.isfinite(advice.horizontal_deg) for advice in found)
-    pairs = _listed(
-        found, names, lambda each: each.horizontal_deg if horizontal else each.angle_deg, degrees
-    )
-    return (
-        f"Sensors are rotated against each other{' in the horizontal plane' if horizontal else ''} "
-        f"({pairs}): {EFFECT_OF_ROTATION}."
-    )
+    whole = _listed(found, names, lambda each: each.angle_deg, degrees)
+    level = " in the horizontal plane"
+    if not all(math.isfinite(advice.horizontal_deg) for advice in found):
+        text = f" ({whole})"
+    else:
+        horizontal = _listed(found, names, lambda each: each.horizontal_deg, degrees)
+        tilted = any(a.angle_deg - abs(a.horizontal_deg) > LEVEL_DEG for a in found)
+        text = f" ({whole};{level} {horizontal})" if tilted else f"{level} ({horizontal})"
+    return f"Sensors are rotated against each other{text}: {EFFECT_OF_ROTATION}."
 
 
 @_together.register(Gain)

@@ -376,6 +376,17 @@ def test_pairs_of_one_kind_are_one_line() -> None:
     assert line.startswith(
         "Sensors are rotated against each other (a–b 4.120°, a–c 4.120°, b–c 4.120°): no bias"
     )
+    turned = [replace(ROTATED, angle_deg=5.0, horizontal_deg=-4.95, sensors=(0, 1))]
+    tilted = replace(ROTATED, angle_deg=8.5, horizontal_deg=3.0, sensors=(0, 2))
+    (line,) = summarise([*turned, replace(turned[0], sensors=(1, 2))], who)
+    assert line.startswith(
+        "Sensors are rotated against each other in the horizontal plane (a–b −4.950°, b–c −4.950°):"
+    )
+    (line,) = summarise([*turned, tilted], who)
+    assert line.startswith(
+        "Sensors are rotated against each other (a–b 5.000°, a–c 8.500°; in the horizontal plane "
+        "a–b −4.950°, a–c 3.000°): no bias"
+    )
     (line,) = summarise(all_pairs(LEADS), who)
     assert line.startswith("Sensors lag each other (a–b −20 ms, a–c −20 ms, b–c −20 ms): their")
     (line,) = summarise(all_pairs(SKEWED), who)
