@@ -13,14 +13,17 @@ from daq.errors import WrongSettingError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+STANDARD_GRAVITY = 9.80665
+"""In m/s²."""
+
 # unit → (time derivatives of displacement, SI units in one of it)
 _MOTION = {
     "m/s²": (2, 1.0),
     "mm/s²": (2, 1e-3),
-    "g": (2, 9.80665),
-    "mg": (2, 9.80665e-3),
-    "µg": (2, 9.80665e-6),
-    "ng": (2, 9.80665e-9),
+    "g": (2, STANDARD_GRAVITY),
+    "mg": (2, STANDARD_GRAVITY * 1e-3),
+    "µg": (2, STANDARD_GRAVITY * 1e-6),
+    "ng": (2, STANDARD_GRAVITY * 1e-9),
     "Gal": (2, 1e-2),
     "m/s": (1, 1.0),
     "mm/s": (1, 1e-3),
@@ -47,6 +50,12 @@ def canonical(unit: str) -> str:
     if spelled in _MOTION:
         return spelled
     return _SPELLINGS.get(spelled.lower(), spelled)
+
+
+def in_acceleration(unit: str) -> float | None:
+    """Return how many m/s² one of a unit is; None if it is no unit of acceleration."""
+    derivatives, si = _MOTION.get(canonical(unit), (0, 1.0))
+    return si if derivatives == 2 else None
 
 
 def conversion(unit: str, wanted: str, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:

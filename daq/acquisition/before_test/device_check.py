@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from daq.acquisition.before_test.arrivals import arrivals
 from daq.acquisition.connection import patience_of
 from daq.acquisition.device_identity import check_identity, with_owner
 from daq.drivers.epson.driver import identify
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
 
 MIN_SAMPLES = 4
-MIN_BLOCKS, MAX_RATE_ERROR = 3, 0.01
-"""Blocks that a measured rate takes, and its standard error at most, as a fraction of the rate."""
 TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
 TEXT_ROWS, LISTEN, LISTEN_ON = 12, 1.0, 2.5
 """Rows of text to guess a format from; seconds to listen for one, and for the next one."""
@@ -343,7 +342,7 @@ def _check(
         information=information,
         n_samples=len(counts),
         n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
-        measured_rate=arrival_rate(blocks),
+        measured_rate=arrivals(blocks).rate,
         clipped=any(BlockFlag.CLIPPED in block.flags for block in blocks),
         channels=tuple(
             ChannelCheck(
@@ -370,18 +369,3 @@ def _check(
 def _concatenated(parts: Sequence[NDArray[np.int64] | None]) -> NDArray[np.int64] | None:
     known = [part for part in parts if part is not None]
     return np.concatenate(known) if known else None
-
-
-def arrival_rate(blocks: Sequence[Block]) -> float | None:
-    """Return samples per second by the arrival times of blocks, without the first one.
-
-    The first block may have waited in a buffer. None if the others are too few, or arrived too
-    unevenly, as when all of them had waited.
-    """
-    blocks = blocks[1:]
-    if len(blocks) < MIN_BLOCKS:
-        return None
-    samples = np.array([block.end_sample - blocks[0].end_sample for block in blocks])
-    arrived = [block.received.monotonic_ns - blocks[0].received.monotonic_ns for block in blocks]
-    (period, _), cov = np.polyfit(samples, np.array(arrived) * 1e-9, 1, cov=True)
-    return float(1 / period) if 0 < period >= np.sqrt(cov[0, 0]) / MAX_RATE_ERROR else None

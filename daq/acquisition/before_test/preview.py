@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from daq.acquisition.before_test.device_check import arrival_rate
+from daq.acquisition.before_test.arrivals import arrivals
 from daq.acquisition.device_identity import check_identity, with_owner
 from daq.drivers.registry import driver_type
 from daq.errors import DeviceError, WrongDeviceError
@@ -56,6 +56,10 @@ class SensorPreview:
         Host monotonic time of the last one.
     measured_rate : float or None
         Samples per second by the host's clock; None while it is not known.
+    rate_error : float
+        Its standard error, as a fraction of the rate.
+    arrival_scatter : float
+        Standard deviation of the arrival times about even ones, in s.
     is_clipping : bool
         Whether a sample reached the end of the range.
     n_missing : int
@@ -69,6 +73,8 @@ class SensorPreview:
     samples: NDArray[np.float64]
     last_ns: int = 0
     measured_rate: float | None = None
+    rate_error: float = 0.0
+    arrival_scatter: float = 0.0
     is_clipping: bool = False
     n_missing: int = 0
     trouble: str = ""
@@ -101,12 +107,15 @@ class _SensorBuffer:
             none = np.empty((0, len(self.sensor.channels)))
             return SensorPreview(self.sensor, self.information, none, trouble=self.trouble)
         counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
+        arrived = arrivals(blocks)
         return SensorPreview(
             self.sensor,
             self.information,
             counts / [channel.sensitivity for channel in self.sensor.channels],
             last_ns=blocks[-1].received.monotonic_ns,
-            measured_rate=arrival_rate(blocks),
+            measured_rate=arrived.rate,
+            rate_error=arrived.error,
+            arrival_scatter=arrived.scatter,
             is_clipping=any(BlockFlag.CLIPPED in block.flags for block in blocks),
             n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
             trouble=self.trouble,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import threading
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from daq.acquisition.before_test.preview import SensorPreview
 from daq.drivers.interface import DeviceInformation
@@ -15,7 +17,9 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tui.application.app import HuddleApp
+from tui.application.bench_view.sensors import sensors_of_bench
 from tui.application.bench_view.traces import trace
+from tui.application.state import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -126,6 +130,15 @@ async def test_frozen_traces_stay(told: ProgressCallback) -> None:
         await pilot.press("f")
         await shown(pilot, app)
         assert "frozen: f goes on" in screen_text(app)
+
+
+def test_why_a_test_did_not_start_is_on_the_row_of_the_sensor() -> None:
+    failure = "sensor 'B' on /dev/ttyUSB1: busy: another program has it open\nno disk left"
+    screen = Console(width=NARROW[0], file=io.StringIO())
+    screen.print(sensors_of_bench(State("lab", demo_bench(), failure=failure)))
+    assert isinstance(screen.file, io.StringIO)
+    rows = screen.file.getvalue().splitlines()
+    assert [row.split()[0] for row in rows if "▲ busy" in row] == ["B"]
 
 
 def test_a_trace_shows_the_range_of_the_values() -> None:

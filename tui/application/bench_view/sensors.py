@@ -8,7 +8,8 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from daq.acquisition.before_test.preflight import Problem, check_before_test, is_complete
+from daq.acquisition.before_test.findings import Problem
+from daq.acquisition.before_test.preflight import check_before_test, is_complete
 from tui.application.bench_view.traces import trace
 from tui.output.formatting import listed, signed
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.acquisition.before_test.preflight import Finding
+    from daq.acquisition.before_test.findings import Finding
     from daq.acquisition.before_test.preview import SensorPreview
     from tui.application.state import State
 
@@ -34,6 +35,17 @@ ADVICE: Mapping[Problem, str] = {
     Problem.DEAD: "{sensor}.{channel} does not change: nothing is connected, or it is dead",
     Problem.HUM: "{sensor}.{channel} hums: most of its power is at {value:.0f} Hz; check grounding"
     " and shielding",
+    Problem.CLOCK: "{sensor}: its clock is off by {value:+.0f} ppm: correct sampling_rate if that"
+    " stays",
+    Problem.UNEVEN: "{sensor}: samples arrive unevenly, by {value:.2f} s: use a port of its own, no"
+    " hub",
+    Problem.OFFSET: "{sensor} measures {value:.3g} m/s² at rest, expected 9.8 (gravity) or 0: check"
+    " sensitivity and unit",
+    Problem.SWAPPED: "{sensor}: {channel} have traded places: check wiring, or the order of"
+    " channels",
+    Problem.REVERSED: "{sensor}.{channel} is reversed against the other sensors: check its wiring",
+    Problem.REFLECTED: "{sensor}: channels are swapped or reversed, no way to turn it explains its"
+    " motion: check wiring, or the order of channels",
     Problem.ALONE: "{sensor} shares no motion with the other sensors: is it on the same floor?",
 }
 """What is wrong, and what to do."""
@@ -43,16 +55,29 @@ def sensors_of_bench(state: State) -> RenderableType:
     """Return a row per sensor of the bench file."""
     if state.bench is None:
         return Text("This recording has no bench file: it was imported.")
+    titles = ("model", "driver", "port", "channels")
+    failures = {sensor.name: _failure(sensor.name, state.failure) for sensor in state.bench.sensors}
     return _table(
-        ("sensor", "model", "driver", "port", "channels"),
+        ("sensor", *(("start",) if any(failures.values()) else ()), *titles),
         [
             [
-                *map(Text, (sensor.name, sensor.model, sensor.driver, sensor.port)),
+                Text(sensor.name, "bold"),
+                *((Text(failures[sensor.name], BAD),) if any(failures.values()) else ()),
+                *map(Text, (sensor.model, sensor.driver, sensor.port)),
                 Text(" ".join(channel.name for channel in sensor.channels)),
             ]
             for sensor in state.bench.sensors
         ],
     )
+
+
+def _failure(sensor: str, failures: str) -> str:
+    """Return in short why a sensor kept a recording from starting; empty if it did not."""
+    for line in failures.splitlines():
+        about, _, reason = line.partition(": ")
+        if repr(sensor) in about:
+            return f"▲ {reason.partition(';')[0].partition(':')[0]}"
+    return ""
 
 
 def sensor_states(sensors: Sequence[SensorPreview], *, width: int) -> Table:

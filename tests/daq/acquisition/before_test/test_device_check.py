@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.acquisition.before_test.arrivals import arrivals
 from daq.acquisition.before_test.device_check import (
     MODBUS_BAUD_RATES,
     MODBUS_DEVICES,
-    arrival_rate,
     discover,
     probe,
     probe_bench,
@@ -94,7 +94,7 @@ def test_rate_is_told_only_where_blocks_came_evenly(
 ) -> None:
     instants = (HostTime(round(at * 1e9), 0) for at in came)
     counts = np.zeros((25, 3), np.int32)
-    found = arrival_rate([Block("A", 25 * k, counts, at) for k, at in enumerate(instants)])
+    found = arrivals([Block("A", 25 * k, counts, at) for k, at in enumerate(instants)]).rate
     assert found == (None if rate is None else pytest.approx(rate, rel=0.003))
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daq.acquisition.before_test.preflight import Problem, check_before_test, is_complete
+from daq.acquisition.before_test.findings import Problem
+from daq.acquisition.before_test.preflight import check_before_test, is_complete
 from daq.acquisition.before_test.preview import SensorPreview
 from tests.tui.example_snapshot import demo_bench
 
@@ -76,3 +77,56 @@ def test_a_sensor_on_another_floor_is_found_however_late_its_samples_are(late: i
 
 def test_where_no_sensor_shares_motion_none_is_called_alone() -> None:
     assert check_before_test(previews(shared=1e-9)) == ()
+
+
+def test_poor_clocks_and_offsets_are_found_and_prevent_nothing() -> None:
+    a, b, c = previews()
+    found = check_before_test(
+        [
+            replace(a, measured_rate=RATE * 1.004, rate_error=5e-4, arrival_scatter=0.3),
+            replace(b, samples=b.samples + np.array([0.0, 0.0, 9.8]), measured_rate=RATE * 1.004),
+            replace(
+                c,
+                samples=c.samples + np.array([7.0, 0.0, 1.0]),
+                measured_rate=199.9,
+                rate_error=1e-3,
+            ),
+        ]
+    )
+    assert [(f.problem, f.sensor) for f in found] == [
+        (Problem.CLOCK, "A"),
+        (Problem.UNEVEN, "A"),
+        (Problem.CLOCK, "B"),
+        (Problem.OFFSET, "C"),
+    ]
+    assert found[0].value == pytest.approx(4000)
+    assert found[3].value == pytest.approx(50**0.5, abs=0.01)
+    assert not any(f.prevents for f in found)
+
+
+@pytest.mark.parametrize(
+    ("columns", "signs", "problem", "channel"),
+    [
+        ([1, 0, 2], [1, 1, 1], Problem.SWAPPED, "X and Y"),
+        ([0, 2, 1], [1, 1, 1], Problem.SWAPPED, "Y and Z"),
+        ([0, 1, 2], [1, 1, -1], Problem.REVERSED, "Z"),
+        ([0, 1, 2], [-1, -1, 1], None, ""),  # turned by half a turn
+        ([1, 2, 0], [1, 1, 1], None, ""),  # a rotation as well
+    ],
+)
+def test_swapped_and_reversed_channels_are_told_from_turned_sensors(
+    columns: list[int], signs: list[int], problem: Problem | None, channel: str
+) -> None:
+    a, b, c = previews()
+    found = check_before_test([a, replace(b, samples=b.samples[:, columns] * signs), c])
+    wanted = [] if problem is None else [(problem, "B", channel)]
+    assert [(f.problem, f.sensor, f.channel) for f in found] == wanted
+
+
+def test_a_vertical_channel_without_gravity_has_been_swapped() -> None:
+    a, b, c = previews()  # A has directions: Z is up
+    (found,) = check_before_test([replace(a, samples=a.samples + np.array([9.8, 0.1, 0.2])), b, c])
+    assert (found.problem, found.sensor, found.channel) == (Problem.SWAPPED, "A", "Z and X")
+    assert (
+        check_before_test([replace(a, samples=a.samples + np.array([0.3, 0.1, 9.8])), b, c]) == ()
+    )
