@@ -56,16 +56,15 @@ def level(psd: float) -> str:
 def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
     """Return a PSD in dB with half the width of its 95 % interval.
 
-    With both halves where the lower one is larger, as by what the clocks may have added.
+    With both halves where the lower one is larger, as by what the clocks may have added. The
+    upper end alone where the estimate or the lower end is at or below zero.
     """
-    if not (psd > 0 and high > psd):
+    if math.isnan(psd) or not high > max(psd, 0):
         return level(psd)
+    if psd <= 0 or low <= 0:
+        return f"below {level(high)}"
     up = decibels(high) - decibels(psd)
-    if math.isnan(low):
-        return f"{level(psd)} ±{up:.2f}"
-    if low <= 0:  # no lower end in dB
-        return f"{level(psd)} +{up:.2f} −∞"
-    down = decibels(psd) - decibels(low)
+    down = up if math.isnan(low) else decibels(psd) - decibels(low)
     return f"{level(psd)} {f'±{up:.2f}' if down < ONE_SIDED * up else f'+{up:.2f} −{down:.2f}'}"
 
 

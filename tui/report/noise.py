@@ -11,7 +11,7 @@ from daq.results.decision.verdict import Verdict
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from estimator.self_noise.result import Flag
-from tui.output.formatting import ONE_SIDED, span
+from tui.output.formatting import level_with_error, span
 from tui.output.results import flagged
 from tui.output.verdict_text import WORDS, headline, margin, not_judged, what_to_do
 from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS
@@ -194,7 +194,7 @@ def _octave_table(snapshot: Snapshot, settings: Settings) -> Table | None:
         row = [f"{label.sensor}.{label.channel}"]
         for means in columns:
             mean, low, high, _ = _only(means[number])
-            row.append(_level_with_error(mean, low, high))
+            row.append(level_with_error(mean, high, low))
         rows.append(tuple(row))
     header = ("channel", *(span(*band) for band in bands))
     title = f"Mean in wide bands with 95 % interval, dB re 1 ({snapshot.unit})²/Hz"
@@ -211,14 +211,9 @@ def _octaves(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield 2.0**exponent, 2.0 ** min(exponent + step, last)
 
 
-def _level_with_error(mean: float, low: float, high: float) -> str:
-    if not mean > 0:
-        return decibel(mean)
-    if low <= 0:
-        return f"< {decibel(high, 2)}"
-    up, down = decibels(high) - decibels(mean), decibels(mean) - decibels(low)
-    error = f"±{up:.2f}" if down < ONE_SIDED * up else f"+{up:.2f} −{down:.2f}"
-    return f"{decibel(mean, 2)} {error}"
+def _in_the_band(means: BandMeans) -> str:
+    mean, low, high, _ = _only(means)
+    return level_with_error(mean, high, low)
 
 
 def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:
@@ -229,7 +224,7 @@ def _methods_table(snapshot: Snapshot, settings: Settings) -> Table:
     rows = tuple(
         (
             f"{label.sensor}.{label.channel}",
-            *(_level_with_error(*_only(means[number])[:3]) for means in columns),
+            *(_in_the_band(means[number]) for means in columns),
         )
         for number, label in enumerate(snapshot.channels)
     )

@@ -56,7 +56,9 @@ def test_they_add_no_more_than_the_noise_itself_and_nothing_where_unknown() -> N
 def test_tables_show_both_halves_where_the_lower_one_is_wider() -> None:
     assert level_with_error(1.0, 10**0.01, 10**-0.01) == "0.00 ±0.10"
     assert level_with_error(1.0, 10**0.01, 10**-0.03) == "0.00 +0.10 −0.30"
-    assert level_with_error(1.0, 10**0.01, -1.0) == "0.00 +0.10 −∞"
+    assert level_with_error(1.0, 10**0.01, -1.0) == "below 0.10"
+    assert level_with_error(-1.0, 10**0.01, -2.0) == "below 0.10"
+    assert level_with_error(-1.0, -0.5, -2.0) == "below 0"
     table = result_table(made_snapshot(clock_share=0.05), SETTINGS)
     assert "+" in str(next(iter(table.columns[3].cells)))
     table = result_table(made_snapshot(clock_share=0.0001), SETTINGS)

@@ -195,7 +195,7 @@ def _channel_noise(
                 error = decibels(high) - decibels(mean)
                 value += f"±{error:.1f}" if error >= 0.05 else "±<.1"
         elif not math.isnan(mean):
-            value = "below 0"
+            value = f"<{signed(decibels(high), '.1f')}" if high > 0 else "below 0"
     return Text(f"{name} {value}", style)
 
 

@@ -303,9 +303,10 @@ def _nearly_singular(advice: NearlySingular, names: Names) -> Explanation:
 def _weak_motion(advice: WeakMotion, names: Names) -> Explanation:
     del names
     return Explanation(
-        f"At {where(advice)} the motion is weaker than the noise (SNR at most "
-        f"{ratio(advice.snr)}): the spectra are nearly those of the noise, and alignment and "
-        "method have little effect."
+        f"At {where(advice)} the motion that the sensors share is weaker than the rest (SNR at "
+        f"most {ratio(advice.snr)}). If they stand side by side, the rest is noise, and alignment "
+        "and method have little effect. If not, the estimates include motion.",
+        "Check that every sensor stands beside the others and is connected.",
     )
 
 

@@ -250,7 +250,7 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         WeakMotion(level=Level.NOTE, band=BAND, snr=0.3),
-        ("At 2–8 Hz the motion is weaker than the noise (SNR at most 0.3)",),
+        ("At 2–8 Hz the motion that the sensors share is weaker than the rest (SNR at most 0.3)",),
     ),
     (
         MotionLeftIn(level=Level.NOTE, band=BAND, share=0.085, n_effective=20.0),
