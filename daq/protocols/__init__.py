@@ -1,4 +1,4 @@
-"""What devices speak, sans-IO: bytes in, blocks out.
+"""Device protocols, sans-IO: bytes in, blocks out.
 
 No asyncio, no sockets, no clock, no files. Simulated devices share these modules.
 """

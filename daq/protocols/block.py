@@ -1,4 +1,4 @@
-"""Blocks of samples and events, which every protocol yields.
+"""Blocks of samples and events: the output of every protocol.
 
 Theory of operation
 -------------------
@@ -6,10 +6,9 @@ A protocol takes received bytes and the host time at which they arrived, and ret
 :class:`Block` and :class:`Event` objects in order. It reads no clock and opens no port.
 
 ``first_sample`` counts the device's own samples, from 0 at the start of a *session* (one
-connection). Where a block does not begin at the end of the block before, there is a **gap**: the
-device took the samples between them, or should have, and they were not received. If the protocol
-has a counter, the length of a gap is exact; otherwise the block has the flag
-``BlockFlag.MISSING_ESTIMATED``. Gaps are never filled.
+connection). A **gap** separates two blocks if the second does not begin at the end of the first:
+the samples between them were not received. If the protocol has a counter, the length of a gap is
+exact; otherwise the block has the flag ``BlockFlag.MISSING_ESTIMATED``. Gaps are never filled.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class BlockFlag(IntFlag):
     CLIPPED = 1
     """At least one sample reached the end of the range."""
     CLOCK_RESTART = 2
-    """The device's sampling clock restarts here: first block, reset or reconnection."""
+    """The device's sampling clock restarts at this block: first block, reset or reconnection."""
     MISSING_ESTIMATED = 4
     """The number of samples missing before this block is an estimate from host time."""
     DEVICE_UTC = 8
@@ -42,8 +41,8 @@ class BlockFlag(IntFlag):
 class HostTime:
     """One instant on the clocks of the host.
 
-    Clock models use ``monotonic_ns``, which is never stepped. ``utc_ns``, since 1970, is for people
-    to read.
+    Clock models use ``monotonic_ns``, which is never stepped. ``utc_ns``, in ns since 1970, is for
+    display only.
     """
 
     monotonic_ns: int
@@ -65,12 +64,12 @@ class Block:
     received : HostTime
         When the last byte of the block was received.
     device_counter : int or None
-        The device's counter (unwrapped) or time of the first sample; None where it sends none.
+        The device's counter (unwrapped) or time of the first sample; None if it sends neither.
     flags : BlockFlag
     reason : str
-        Why samples are missing before this block; empty if none are. For people.
+        Why samples are missing before this block, as text for display; empty if none are missing.
     instants_ns : int64 ndarray, shape (n_samples,), or None
-        Of polled devices: host monotonic time of each sample, in ns.
+        Host monotonic time of each sample in ns, for polled devices.
     """
 
     sensor: str
@@ -94,16 +93,16 @@ class Block:
 
 
 class EventKind(StrEnum):
-    """What kind of event happened; the values are the strings that a recording holds."""
+    """Kind of an event; recordings store these strings."""
 
     STARTED = "started"
     """The run began."""
     STOPPED = "stopped"
     """The run ended, or a server announced that it shuts down."""
     MARK = "mark"
-    """A person's remark, with the time at which it was made."""
+    """A user's remark and its time."""
     CONNECTED = "connected"
-    """A device was connected, or answers again."""
+    """A device was connected, or replies again."""
     DISCONNECTED = "disconnected"
     """The connection to a device ended."""
     LATE = "late"
@@ -111,23 +110,23 @@ class EventKind(StrEnum):
     STALLED = "stalled"
     """The port is open, but no samples or no replies arrive."""
     REFUSED = "refused"
-    """A device, a stream or a reply is not the one that the bench file names, or says no."""
+    """A device refused a request, or a device, stream or reply contradicts the bench file."""
     RESYNCHRONISED = "resynchronised"
     """Bytes or packets were skipped, lost or repeated; decoding continued after them."""
     CHECKSUM = "checksum"
     """A wrong checksum, or data that cannot be read."""
     RESET = "reset"
-    """The device's counter or clock started again."""
+    """The device's counter or clock restarted."""
     OVERFLOW = "overflow"
-    """A buffer in the device overflowed and samples were lost there."""
+    """A buffer in the device overflowed and lost samples."""
     STATUS = "status"
     """The device, its driver or the recorder reports its condition."""
 
     @classmethod
     def of(cls, text: str) -> EventKind | str:
-        """Return the kind of this name; the text itself where no kind has it.
+        """Return the kind with this value, or the text itself if no kind has it.
 
-        Newer programs and drivers from elsewhere may record kinds that this program does not know.
+        Newer versions and third-party drivers may record kinds that this version does not know.
         """
         try:
             return cls(text)
@@ -143,10 +142,9 @@ class Event:
     ----------
     sensor : str
     kind : EventKind or str
-        A text only where it is none of `EventKind`: newer programs and drivers from elsewhere have
-        their own.
+        A str only if the kind is none of `EventKind`; see `EventKind.of`.
     text : str
-        For people, at most 200 bytes. Programs decide by `kind`, never by this text.
+        For display, at most 200 bytes. Programs decide by `kind`, never by this text.
     received : HostTime
     """
 

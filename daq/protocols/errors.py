@@ -1,13 +1,13 @@
-"""Errors of protocols: of received bytes, and of settings."""
+"""Errors in received bytes and in settings."""
 
 from __future__ import annotations
 
 
 class RemoteProtocolError(ValueError):
-    """The other end sent what its protocol does not allow, and decoding cannot continue.
+    """The other end violated its protocol, and decoding cannot continue.
 
-    The only error that received bytes may raise. Garbage and incomplete frames do not raise it:
-    they are skipped, counted and reported as events.
+    Received bytes raise no other error. Garbage and incomplete frames do not raise it: they are
+    skipped, counted and reported as events.
     """
 
 
@@ -17,9 +17,9 @@ class DeviceSettingError(ValueError):
     Parameters
     ----------
     key : str
-        Of the setting; empty where several do not go together.
+        Key of the setting; empty if several settings conflict.
     expected : str
-        What was expected, and what is wrong.
+        The expected value, and the fault.
     """
 
     def __init__(self, key: str, expected: str) -> None:

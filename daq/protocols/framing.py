@@ -1,4 +1,4 @@
-"""Finding frames of one fixed length in a byte stream, whatever else is in it."""
+"""Frames of one fixed length in a byte stream that may hold other bytes."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ OctetArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 PIECE = 65536
-"""Longest stretch to search at once: bounds the work that garbage can cause."""
+"""Maximum number of bytes per search: bounds the work that garbage can cause."""
 
 
 def find_frames(
     octets: OctetArray, size: int, valid: Callable[[OctetArray], BoolArray]
 ) -> tuple[list[tuple[int, int]], int]:
-    """Find the frames a scan from the first byte on would find.
+    """Return the frames that a scan from the first byte finds.
 
-    The scan takes a valid frame where there is one and else goes on by one byte. It decides each
-    position from the ``size`` bytes that follow, so its result does not depend on how the stream
-    was cut into reads.
+    At each position the scan takes a valid frame if there is one, else advances by one byte. Each
+    decision uses only the next ``size`` bytes, so the result does not depend on how the stream was
+    cut into reads.
 
     Parameters
     ----------
     octets : uint8, shape (n_bytes,)
-        Everything received and not yet consumed; at most ``PIECE`` and a frame at a time.
+        All bytes received and not yet consumed; at most ``PIECE`` bytes and one frame.
     size : int
         Length of a frame in bytes.
     valid : callable
-        Given windows ``(n, size)``, which of them are frames, ``(n,)``.
+        Maps windows, shape (n, size), to whether each is a frame, shape (n,).
 
     Returns
     -------
     runs : list of (offset, n_frames)
-        Frames that follow one another without a byte between.
+        Runs of adjacent frames.
     consumed : int
-        Bytes about which all is decided; fewer than ``size`` are left after them.
+        Number of decided bytes; fewer than ``size`` bytes remain after them.
     """
     n_frames = octets.size // size
     good = valid(octets[: n_frames * size].reshape(n_frames, size))

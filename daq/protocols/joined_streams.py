@@ -1,16 +1,16 @@
-"""Streams of one channel each, joined by time into the samples of a sensor.
+"""Single-channel streams, joined by time into the samples of a sensor.
 
 Theory of operation
 -------------------
 Digitizers of seismometers send each component as a stream of its own, in records that state the UTC
-of their first sample and need not be equally long. :class:`JoinedStreams` lines up the streams of
-one sensor on the grid that these times define and yields what is there in all of them, one column a
-stream. The sampling clock is disciplined by GPS or NTP and stated in every record
-(``BlockFlag.DEVICE_UTC``), so no clock is fitted.
+of their first sample and may differ in length. :class:`JoinedStreams` aligns the streams of one
+sensor on the grid that these times define and yields the samples that all streams have, one column
+per stream. GPS or NTP disciplines the sampling clock and every record states its time
+(``BlockFlag.DEVICE_UTC``), so no clock model is fitted.
 
-A hole in a stream is left open while records may still come that fill it (``awaiting``), then
-becomes a gap, exact because records carry their time. Samples seen twice are dropped. A device
-whose time jumps by more than an hour has had its clock set: its grid starts again
+A hole in a stream stays open while a late record may still fill it (``awaiting``). Then it becomes
+a gap, of exact length because records state their time. Repeated samples are discarded. A jump of
+the device's time by more than an hour means that its clock was set: the grid restarts
 (``BlockFlag.CLOCK_RESTART``).
 """
 
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 _HOUR_NS = 3600 * _NS
 MAX_PENDING = 64
-"""Records that a stream may be ahead of the others, usually."""
+"""Default for the number of records that a stream may be ahead of the others."""
 
 
 class Record(Protocol):
-    """Samples of one stream that follow one another."""
+    """Contiguous samples of one stream."""
 
     @property
     def stream_id(self) -> str:
-        """Which stream."""
+        """ID of the stream."""
         ...
 
     @property
@@ -62,13 +62,13 @@ class Record(Protocol):
 
 @dataclass(slots=True)
 class _Stream:
-    """What of one stream waits for the others: (index of its first sample, samples), in order."""
+    """Pending samples of one stream: (index of the first sample, samples), in order."""
 
     pending: deque[tuple[int, NDArray[Any]]] = field(default_factory=deque)
 
     def add(self, start: int, counts: NDArray[Any], *, taken_to: int | None) -> None:
-        """Put samples in their place; those already there or taken are dropped."""
-        if self.pending and start >= self.pending[-1][0]:  # nearly always
+        """Add samples; discard those already pending or before index ``taken_to``."""
+        if self.pending and start >= self.pending[-1][0]:  # fast path
             tail = self.pending[-1]
             fresh = counts[max(0, tail[0] + len(tail[1]) - start) :]
             if len(fresh):
@@ -84,7 +84,7 @@ class _Stream:
                 self.pending.append((end - len(fresh), fresh))
 
     def skip_to(self, index: int) -> None:
-        """Forget what lies before ``index``."""
+        """Discard samples before ``index``."""
         while self.pending and self.pending[0][0] < index:
             first, samples = self.pending.popleft()
             if first + len(samples) > index:
@@ -97,13 +97,13 @@ class JoinedStreams:
     Parameters
     ----------
     name : str
-        Of the sensor.
+        Name of the sensor.
     stream_ids : tuple of str
-        Of its channels, in their order.
+        Stream of each channel, in the order of the channels.
     full_scale : int or None
-        Counts, peak, from which samples are marked as clipped.
+        Magnitude in counts from which samples are clipped; None disables the test.
     max_pending : int
-        Records that a stream may be ahead of the others.
+        Maximum number of records that a stream may be ahead of the others.
     """
 
     def __init__(
@@ -126,19 +126,19 @@ class JoinedStreams:
 
     @property
     def sampling_rate(self) -> Fraction | None:
-        """As the first block said."""
+        """Sampling rate in Hz of the first block."""
         return self._rate
 
     @property
     def silent(self) -> tuple[str, ...]:
-        """The streams of which nothing has come."""
+        """The streams without any record yet."""
         if self._taken_to is not None:
             return ()
         return tuple(name for name, stream in self._streams.items() if not stream.pending)
 
     @property
     def has_hole(self) -> bool:
-        """Whether all streams have samples that come after others that are missing."""
+        """Whether all streams have samples, but only after missing ones."""
         streams = self._streams.values()
         if self._taken_to is None or not all(stream.pending for stream in streams):
             return False
@@ -146,16 +146,16 @@ class JoinedStreams:
 
     @property
     def is_crowded(self) -> bool:
-        """Whether a stream holds half as many records as it may: a hole must not wait longer."""
+        """Whether a stream has half of ``max_pending`` records: holes must then become gaps."""
         streams = self._streams.values()
         return any(len(stream.pending) > self._max_pending // 2 for stream in streams)
 
     def add(self, block: Record, at: HostTime) -> Iterator[Event]:
-        """Take a block of one of the streams."""
+        """Add a record of one of the streams."""
         if self._rate is None:
             self._rate, self._origin_ns = block.sampling_rate, block.start_ns
         if block.sampling_rate != self._rate:
-            text = f"{block.stream_id} came at {block.sampling_rate} Hz; expected {self._rate} Hz"
+            text = f"{block.stream_id} has {block.sampling_rate} Hz; expected {self._rate} Hz"
             yield Event(self._name, EventKind.REFUSED, text, at)
             return
         index = round((block.start_ns - self._origin_ns) * self._rate / _NS)
@@ -172,12 +172,12 @@ class JoinedStreams:
         stream = self._streams[block.stream_id]
         stream.add(index, block.counts, taken_to=self._taken_to)
         if len(stream.pending) > self._max_pending:
-            text = f"dropped a block of {block.stream_id}: another stream does not come"
+            text = f"dropped a block of {block.stream_id}: another stream sends nothing"
             yield Event(self._name, EventKind.OVERFLOW, text, at)
             stream.pending.popleft()
 
     def _jump(self, index: int, at: HostTime) -> int:
-        """Return by how many samples the device's time has been set, 0 within an hour."""
+        """Return the jump of the device's time in samples; 0 if below an hour."""
         if self._rate is None or self._latest is None:
             return 0
         waited = round((at.monotonic_ns - self._latest[1].monotonic_ns) * self._rate / _NS)
@@ -190,7 +190,7 @@ class JoinedStreams:
         return index - max(self._latest[0] + waited, self._taken_to or 0, *ends)
 
     def take(self, at: HostTime, *, awaiting: bool, reason: str) -> Iterator[Block]:
-        """Yield what all streams have; across a hole only if nothing is awaited."""
+        """Yield the samples that all streams have; beyond a hole only if not ``awaiting``."""
         streams = self._streams.values()
         while streams and all(stream.pending for stream in streams):
             start = max(stream.pending[0][0] for stream in streams)

@@ -1,21 +1,22 @@
-"""From a device's wrapping counter to sample indices, gaps and restarts.
+"""Sample indices, gaps and restarts from a device's wrapping counter.
 
 Theory of operation
 -------------------
-Frames carry a counter that goes up by one each sample, modulo 2**16 or so. Steps other than one
-are a gap, a repetition or a restart of the device, and which of them host time tells: a device
-cannot be ahead of time. With *latest* the index that host time allows at the most,
+Frames have a counter that increases by one per sample, modulo 2**16 or another modulus. Any other
+step is a gap, a repetition or a restart of the device. Host time decides which, because samples
+cannot arrive before they are taken. *Latest* is the largest index that host time allows:
 
-- a step whose end is not past *latest* is a gap, and its length exact; a gap may span whole wraps
-  of the counter, of which host time tells the number;
-- a short step back with no time gone by repeats what was received before: dropped and counted;
-- anything else is a restart: the counter began anew, and only host time says how much is missing.
+- a step to an index up to *latest* is a gap, of exact length; host time gives the number of whole
+  wraps of the counter in the gap;
+- a short step back without elapsed time is a repetition: the frames are dropped and counted;
+- any other step is a restart: the counter was reset, and the number of missing samples is estimated
+  from host time.
 
-*Latest* comes from the earliest arrival seen (arrival is never early), and follows a device clock
-that is off by up to ``CLOCK_TOLERANCE``.
+*Latest* follows from the earliest arrival so far, and tolerates a relative rate error of the
+device's clock of up to ``CLOCK_TOLERANCE``.
 
-A device that went on sampling while nobody could hear it is taken on where it is: whether it did
-:meth:`SampleCounter.expects` tells, again by host time, and how many wraps went by.
+A device may continue to sample while its connection is interrupted.
+:meth:`SampleCounter.expects` tests this by host time, which also gives the number of wraps.
 """
 
 from __future__ import annotations
@@ -31,35 +32,35 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 CLOCK_TOLERANCE = 200e-6
-"""Largest relative rate error of a device's clock that is followed."""
+"""Largest tolerated relative rate error of a device's clock."""
 SLACK = 1.0
-"""How far ahead of the earliest arrival a sample may seem, s: the latency of that arrival."""
+"""Largest latency of the earliest arrival, s: a sample may appear early by this much."""
 REPEATED = 1024
-"""Longest step back, in samples, that is a repetition."""
+"""Longest step back that counts as a repetition, in samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Rows ``start`` to ``stop`` of the frames given, without a gap between them."""
+    """Rows ``start`` to ``stop`` of the given frames, without a gap."""
 
     start: int
     stop: int
     first_sample: int
     counter: int | None = None
-    """The device's counter at ``start``, unwrapped since it last began anew."""
+    """The device's counter at ``start``, unwrapped since its last restart."""
     missing: int = 0
     """Samples missing before the run."""
     restarted: bool = False
-    """The counter began anew: ``missing`` is estimated, and the clock starts anew."""
+    """Whether the counter restarted: ``missing`` is then an estimate, and the clock restarts."""
 
 
 class SampleCounter:
-    """Gives frames their sample index by their counter.
+    """Assigns sample indices to frames by their counter.
 
     Parameters
     ----------
     modulus : int
-        The counter runs from 0 to ``modulus - 1``.
+        The counter counts from 0 to ``modulus - 1``.
     sampling_rate : float
         Counts per second, in Hz.
     """
@@ -67,29 +68,29 @@ class SampleCounter:
     def __init__(self, modulus: int, sampling_rate: float) -> None:
         self.modulus = modulus
         self._rate = sampling_rate
-        self._base = 0  # what to add to an index to get the unwrapped counter
-        self._next = 0  # session index the next frame should have
-        self._count: int | None = None  # counter of the frame before it
-        self._origin = 0.0  # earliest arrival of sample 0, as far as is known, in s
-        self._seen = 0.0  # host time of the read before, in s
+        self._base = 0  # unwrapped counter minus index
+        self._next = 0  # expected session index of the next frame
+        self._count: int | None = None  # counter of the last frame
+        self._origin = 0.0  # earliest known arrival of sample 0, in s
+        self._seen = 0.0  # host time of the last read, in s
         self._resumed = False
 
     def place(self, counters: NDArray[np.integer[Any]], at: HostTime) -> tuple[list[Run], int]:
-        """Give each frame its sample index.
+        """Assign a sample index to each frame.
 
         Parameters
         ----------
         counters : int, shape (n_frames,), n_frames > 0
             The counter of each frame, in the order received.
         at : HostTime
-            When the last of them had been received.
+            Arrival of the last frame.
 
         Returns
         -------
         runs : list of Run
-            In order; frames in none of them repeat others.
+            In order; they contain all frames but repetitions.
         n_repeated : int
-            How many those are.
+            Number of repeated frames.
         """
         counters = counters.astype(np.int64)
         now = at.monotonic_ns * 1e-9
@@ -126,10 +127,10 @@ class SampleCounter:
         return runs, n_repeated
 
     def expects(self, counter: int, at: HostTime) -> bool:
-        """Whether a frame received now goes on with the counting, however many were missed.
+        """Return whether a frame received now continues the count, after any number of lost frames.
 
-        A counter that began anew meanwhile is taken for one that went on with the chance that it
-        stands where it should: twice ``SLACK`` in the time of one wrap.
+        A restarted counter passes by chance with a probability of twice ``SLACK`` divided by the
+        time of one wrap.
         """
         if self._count is None:
             return False
@@ -141,11 +142,14 @@ class SampleCounter:
         return abs(off) <= slack < self.modulus / 4
 
     def resume(self) -> None:
-        """Note that any number may be missing before the next: whole wraps, too."""
+        """Allow any number of missing samples before the next frame, also whole wraps."""
         self._resumed = True
 
     def _index(self, step: int, latest: float) -> tuple[int | None, bool]:
-        """Index of a frame ``step`` counts on, None if it repeats; and whether it is a restart."""
+        """Return the index of a frame ``step`` counts later, and whether it is a restart.
+
+        The index is None for a repetition.
+        """
         if step == 1 and not self._resumed:
             return self._next, False
         index = self._next + (step - 1) % self.modulus

@@ -1,25 +1,23 @@
-"""From the times a device writes beside its samples to sample indices, gaps and repetitions.
+"""Sample indices, gaps and repetitions from the times that a device sends with its samples.
 
 Theory of operation
 -------------------
-The counterpart of :mod:`daq.protocols.sample_counter` for devices that send a time and no counter.
-A time, in sample periods since the first, less the index it should belong to is the *offset* of the
-two: constant but for the slow drift of a clock, which is followed, and for how finely times are
-written. A time
+This is the counterpart of :mod:`daq.protocols.sample_counter` for devices that send a time and no
+counter. The *offset* is a sample's time, in sample periods since the first sample, minus its index.
+The offset is constant except for the drift of the clock, which an average tracks, and for the
+resolution of the times. Each time is one of these:
 
-- that is half a period or more past where the next sample should be says that samples are missing:
-  as many as fit. Where times are written to half a period or finer their number is exact. Where
-  one time stands for many samples, only its first occurrence is looked at, and the number may be
-  wrong by one;
-- that lies before one that came belongs to a sample that is known (a datagram that came twice or
-  too late), and so does a message that repeats the one before to the letter, unless times are
-  coarser than a period. The same time with other samples is of the next: the device's clock is
-  coarser than it writes;
-- that goes on after such earlier ones, which came as their times say and not at once, tells that
-  they were no repetitions: the device's clock was set back, and they are missing;
-- further ahead than host time allows, or long past when nothing else has come for a while, is
-  *doubtful*: damaged on the way, or somebody set the device's clock. The next one tells: if it
-  goes on from there, it was the clock.
+- Half a period or more after the expected time of the next sample: samples are missing. Their
+  number is exact if the resolution is half a period or finer. If many samples have the same time,
+  only the first of them is compared, and the number may be wrong by one.
+- Earlier than a received time: the sample is known (a repeated or late datagram). So is a message
+  identical to the one before, unless the resolution is coarser than a period. The same time with
+  other samples belongs to the next samples: the device's clock is coarser than its format.
+- Later than such earlier times, which arrived at the rate of their times and not in one burst: they
+  were no repetitions. The device's clock was set back, and these samples are missing.
+- Later than host time allows, or far in the past after a pause: *doubtful*. Either the message is
+  damaged or the device's clock was set. If the next time continues from this one, the clock was
+  set.
 """
 
 from __future__ import annotations
@@ -31,29 +29,31 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 CLOCK_TOLERANCE = 200e-6
-"""Largest relative rate error of a device's clock that is followed."""
+"""Largest tolerated relative rate error of a device's clock."""
 SLACK_NS = 1_000_000_000
-"""How far ahead of the earliest arrival a time may seem: the latency of that arrival."""
+"""Largest latency of the earliest arrival, ns: a time may appear early by this much."""
 LATE_NS = 2_000_000_000
-"""Nothing comes later than this after what was sent behind it."""
+"""Largest delay of a message that was overtaken by another, ns."""
 HOUR_NS = 3600 * 10**9
 _COARSE = 2.0
 GAIN = 0.05
-"""Of the average that follows a drifting clock, a message."""
+"""Gain per message of the average that tracks a drifting clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where samples belong.
+    """Position of samples.
 
     Attributes
     ----------
     kind
-        "next": after ``missing`` others; "known": they came before; "doubtful": their time says
-        nothing yet; "reset": the device's clock was set; first come the doubtful ones before these,
-        if there are any, after ``missing`` others; these are to be placed again.
+        "next": after ``missing`` others; "known": already received; "doubtful": not decided yet;
+        "reset": the device's clock was set. After "reset" come ``missing`` samples, then the
+        doubtful samples, if there are any; call :meth:`SampleTimes.place` again for these samples.
+    missing
+        Number of missing samples before these.
     is_exact
-        Whether ``missing`` is.
+        Whether ``missing`` is exact.
     """
 
     kind: Literal["next", "known", "doubtful", "reset"]
@@ -62,7 +62,7 @@ class Place:
 
 
 class SampleTimes:
-    """Places samples by the times a device states.
+    """Assigns positions to samples by the times that a device sends.
 
     Parameters
     ----------
@@ -73,24 +73,24 @@ class SampleTimes:
     def __init__(self, sampling_rate: float) -> None:
         self._rate = sampling_rate
         self._origin_ns: int | None = None  # the time of index 0
-        self._next = 0  # index the next sample should have
-        self._offset: float | None = 0.0  # of times and indices, in periods
+        self._next = 0  # expected index of the next sample
+        self._offset: float | None = 0.0  # in periods; None until a time changes
         self._n_seen = 0
-        self._least_width = 0.0  # in periods, of the times as they turn out
-        self._latest_ns = 0  # the last time that was believed
-        self._at_ns = 0  # when it came
-        self._lag_ns = 0.0  # least time between a sample and its arrival, but for a constant
-        self._doubtful: tuple[int, int, HostTime] | None = None  # time, samples, arrival
-        self._again: tuple[int, int, int] | None = None  # what was known: first time, arrival; last
+        self._least_width = 0.0  # observed resolution of the times, in periods
+        self._latest_ns = 0  # the last accepted time
+        self._at_ns = 0  # its arrival
+        self._lag_ns = 0.0  # smallest arrival minus time so far
+        self._doubtful: tuple[int, int, HostTime] | None = None  # time, n_samples, arrival
+        self._again: tuple[int, int, int] | None = None  # known: first time, its arrival, last time
 
     def missing(self, time_ns: int) -> int:
-        """Return how many samples lie between those known and these."""
+        """Return the number of samples missing before a sample of this time."""
         if self._origin_ns is None or self._offset is None:
             return 0
         return max(0, round(self._ahead(time_ns) - self._offset))
 
     def is_known(self, time_ns: int, at: HostTime, *, resolution_ns: int) -> bool:
-        """Return whether samples of this time came before, or come too late."""
+        """Return whether samples of this time are repeated or too late."""
         if self._origin_ns is None or self._is_doubtful(time_ns, at, resolution_ns):
             return False
         if time_ns > self._latest_ns:
@@ -101,20 +101,20 @@ class SampleTimes:
     def place(
         self, time_ns: int, n_samples: int, at: HostTime, *, resolution_ns: int, alike: bool = False
     ) -> Place:
-        """Place samples.
+        """Return the position of samples.
 
         Parameters
         ----------
         time_ns : int
-            What the device says of the first of them.
+            The device's time of the first sample.
         n_samples : int
-            How many there are.
+            Number of samples.
         at : HostTime
-            When they came.
+            Their arrival.
         resolution_ns : int
-            How finely times are written.
+            Resolution of the time's format.
         alike : bool
-            Whether the message is the one before, to the letter.
+            Whether the message is identical to the one before.
         """
         width = max(self._least_width, resolution_ns * 1e-9 * self._rate)
         if self._origin_ns is None:
@@ -131,12 +131,12 @@ class SampleTimes:
             self._begin(time_ns, at, width=width)
             return Place("reset", n_dropped, is_exact=False)
         if is_same:
-            if width <= 0.5:  # written finely, and coarse all the same
+            if width <= 0.5:  # the clock is coarser than the format
                 self._least_width = _COARSE
                 self._offset = None if self._n_seen == 1 else self._offset
             return self._take(time_ns, n_samples, at, 0, is_exact=True)
         ahead = self._ahead(time_ns)
-        if self._offset is None:  # the first time that says when it began
+        if self._offset is None:  # the first change of the time fixes its phase
             self._offset = ahead
         missing = max(0, round(ahead - self._offset))
         self._n_seen += 1
@@ -169,14 +169,14 @@ class SampleTimes:
             self._again = *self._again[:2], time_ns
 
     def _set_back(self, time_ns: int, at: HostTime) -> int:
-        """Return how many samples were dropped as known that were not, before these."""
+        """Return the number of samples wrongly dropped as known, if the clock was set back."""
         if self._again is None:
             return 0
         first_ns, came_ns, last_ns = self._again
         span_ns, waited_ns = time_ns - first_ns, at.monotonic_ns - came_ns
-        goes_on = 2 * (time_ns - last_ns) <= span_ns  # after two messages at least
-        as_they_say = span_ns <= 2 * waited_ns <= 3 * span_ns
-        return round(span_ns * 1e-9 * self._rate) if goes_on and as_they_say else 0
+        continues = 2 * (time_ns - last_ns) <= span_ns  # after at least two messages
+        in_real_time = span_ns <= 2 * waited_ns <= 3 * span_ns
+        return round(span_ns * 1e-9 * self._rate) if continues and in_real_time else 0
 
     def _least_lag(self, at: HostTime) -> float:
         return self._lag_ns + CLOCK_TOLERANCE * (at.monotonic_ns - self._at_ns)

@@ -263,9 +263,9 @@ async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
                     break
     await asyncio.gather(*filter(None, tasks))
     for said in (
-        "stalled: .*; a reply of unit 7 came, of unit 1 was asked (1 so far)",
-        "checksum: .*; 14 bytes came that are no reply (",
-        "resynchronised: a reply with 1 registers came, as many were not asked for (2 so far)",
+        "stalled: .*; received a reply of unit 7, expected unit 1 (1 so far)",
+        "checksum: .*; received 14 bytes that are no reply (",
+        "resynchronised: received a reply with 1 registers, a number not requested (2 so far)",
         "refused: .* Modbus exception 4 (device failure) .*(2 so far)",
     ):
         pattern = re.escape(said).replace(r"\.\*", ".*")

@@ -101,7 +101,7 @@ class EpsonSession:
         ask_after = None if configuration.is_triggered else ASK_AFTER
         n_frames = round(GATHER * configuration.sampling_rate)
         while True:
-            self._stream.expect(n_frames, configuration.burst.size, begun=self.decoder.begun)
+            self._stream.expect(n_frames, configuration.burst.size, begun=self.decoder.n_pending)
             try:
                 async with asyncio.timeout(ask_after):
                     received, at = await self._stream.read()
@@ -222,7 +222,7 @@ class EpsonDriver:
                     raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
                 if commands.find_reply(heard[0], commands.ID.address) == commands.DEVICE_ID:
                     heard = await _listen(stream, before.decoder)  # to one that streams yet
-                if heard is not None and before.decoder.follows(*heard):
+                if heard is not None and before.decoder.continues(*heard):
                     async with _left_quiet(device, stream):
                         yield EpsonSession(
                             device,
@@ -293,7 +293,7 @@ async def _listen(stream: ByteStream, decoder: BurstDecoder) -> tuple[bytes, Hos
         return None
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(LISTEN):
-            while not decoder.follows(heard, at):
+            while not decoder.continues(heard, at):
                 received, at = await stream.read()
                 heard += received
     return heard, at

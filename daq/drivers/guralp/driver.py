@@ -180,7 +180,7 @@ async def _discover(
                     by_serial.setdefault(serial_number(stream), []).append(stream)
                 for streams in by_serial.values():
                     if len(streams) == n_channels:
-                        heard += link.streams.found(sensor.name, sorted(streams, key=_component))
+                        heard += link.streams.assign(sensor.name, sorted(streams, key=_component))
                         return
     streams_heard = ", ".join(sorted(link.streams.unknown)) or "nothing"
     raise NoAnswerError(

@@ -284,7 +284,7 @@ def _goes_on(
     ]
     if not is_same or before.uptime is None or uptime is None:
         return False
-    return before.decoder.can_go_on and before.uptime.went_on_until(uptime)
+    return before.decoder.can_resume and before.uptime.went_on_until(uptime)
 
 
 DRIVER = LabJackDriver()

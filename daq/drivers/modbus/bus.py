@@ -135,11 +135,11 @@ class _RtuLink:
                     return _Answer(registers, reply.exception, at)
                 if finder.is_damaged:
                     break
-                quiet = bool(finder.instead)
+                quiet = bool(finder.unexpected)
         except TimeoutError:
             pass
-        instead, other_unit = finder.instead, finder.other_unit
-        finder.forget()
+        instead, other_unit = finder.unexpected, finder.other_unit
+        finder.cancel()
         if other_unit == device_id:
             raise RemoteProtocolError(instead)
         if instead and other_unit is None:
@@ -204,8 +204,8 @@ class _TcpLink:
 
     def _instead(self, device_id: int) -> str:
         if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
-            return f"a reply of unit {self._heard[_UNIT]} came, of unit {device_id} was asked"
-        return f"{len(self._heard)} bytes came that are no reply" if self._heard else ""
+            return f"received a reply of unit {self._heard[_UNIT]}, expected unit {device_id}"
+        return f"received {len(self._heard)} bytes that are no reply" if self._heard else ""
 
 
 @dataclass(slots=True)

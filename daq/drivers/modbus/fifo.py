@@ -245,7 +245,7 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
                     f" {int.from_bytes(reply.payload[2:4], 'big')}"
                 )
             return
-        instead = finder.instead or instead
+        instead = finder.unexpected or instead
     raise NoAnswerError(
         f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}:"
         f" {instead or 'nothing came'};"

@@ -2,10 +2,10 @@
 
 Theory of operation
 -------------------
-A whole read is decoded at once: frames are found by length, header, delimiter and checksum
-together, COUNT gives each its sample index, and rows that follow one another become one block. What
-is no frame is skipped, counted, and reported as an event at most once a second; what it cost shows
-as a gap in COUNT. The first block of a session starts at index 0.
+Each read is decoded in one pass. Length, header, delimiter and checksum together identify frames,
+COUNT gives the sample index of each frame, and consecutive frames become one block. Bytes outside
+frames are skipped, counted, and reported as an event at most once a second; the samples lost with
+them appear as a gap in COUNT. The first block of a session starts at index 0.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
     from daq.protocols.epson.commands import BurstFormat
 
 COUNT_MODULUS = 65536
-LEAST_FOLLOWING = 3
-"""Bursts in a row by which a stream is known again."""
+MIN_CONSECUTIVE = 3
+"""Consecutive bursts needed to recognise a stream on a new connection."""
 REPORT_INTERVAL_NS = 1_000_000_000
-"""Least host time between two events of one kind."""
+"""Minimum host time between two events of one kind."""
 _REPORTS = {
     "checksum": (EventKind.CHECKSUM, "frame", "with a wrong checksum"),
     "skipped": (EventKind.RESYNCHRONISED, "byte", "skipped between frames"),
     "repeated": (EventKind.RESYNCHRONISED, "frame", "came twice"),
 }
-"""What is counted, and the event that reports it."""
+"""Counted faults, and the event that reports each."""
 
 
 class BurstDecoder:
@@ -49,13 +49,13 @@ class BurstDecoder:
     sensor : str
         Name for the blocks and events.
     burst : BurstFormat
-        What the device was told to send.
+        Format of the bursts that the device is configured to send.
     fields : sequence of str
-        Which fields become channels, in the order wanted: x, y, z, temperature.
+        Fields that become channels, in order: any of x, y, z, temperature.
     sampling_rate : float
         In Hz.
     full_scale_counts : int
-        Samples of x, y, z at or beyond this are clipped.
+        Samples of x, y, z at or beyond this magnitude are clipped.
     """
 
     def __init__(
@@ -77,36 +77,37 @@ class BurstDecoder:
         self._counter = SampleCounter(COUNT_MODULUS, sampling_rate)
         self._left = b""
         self._started = False
-        self._lost_frames = 0  # without COUNT: frames since the last one that were no frames
+        self._lost_frames = 0  # without COUNT: estimated invalid frames since the last valid one
         self._next = 0  # without COUNT: index of the next frame
         self._error = False
         self._counts = dict.fromkeys(_REPORTS, 0)
         self._reported = dict.fromkeys(self._counts, -REPORT_INTERVAL_NS)
 
     @property
-    def begun(self) -> int:
-        """Bytes of a frame that are here while the rest is on its way."""
+    def n_pending(self) -> int:
+        """Number of bytes of the incomplete last frame."""
         return len(self._left)
 
-    def follows(self, data: bytes, at: HostTime) -> bool:
-        """Whether ``data``, heard on a new connection, is the stream of before, gone on meanwhile.
+    def continues(self, data: bytes, at: HostTime) -> bool:
+        """Whether ``data``, received on a new connection, continues the stream of the old one.
 
-        ``data`` holds bursts of the same format, some in a row, and COUNT stands where host time
-        says it should. Nothing is taken; :meth:`resume` and :meth:`receive` do.
+        This holds if ``data`` has ``MIN_CONSECUTIVE`` consecutive bursts of the same format and
+        COUNT agrees with host time. The data are not consumed: call :meth:`resume`, then
+        :meth:`receive`.
         """
         if not self._started or "count" not in self._burst:
             return False
         runs, _ = find_frames(np.frombuffer(data, np.uint8), self._size, self._valid)
         for offset, length in runs[::-1]:
-            if length >= LEAST_FOLLOWING:
+            if length >= MIN_CONSECUTIVE:
                 frames = np.frombuffer(data, self._dtype, count=length, offset=offset)
-                counters = frames["count"][-LEAST_FOLLOWING:].astype(np.int64)
+                counters = frames["count"][-MIN_CONSECUTIVE:].astype(np.int64)
                 in_order = bool((np.diff(counters) % COUNT_MODULUS == 1).all())
                 return in_order and self._counter.expects(int(counters[-1]), at)
         return False
 
     def resume(self) -> None:
-        """Note that what comes now follows on a new connection."""
+        """Continue the stream on a new connection."""
         self._left = b""
         self._counter.resume()
 
@@ -144,7 +145,7 @@ class BurstDecoder:
         return good
 
     def _note_skipped(self, octets: OctetArray, runs: list[tuple[int, int]], skipped: int) -> None:
-        # A frame in its place with header and delimiter, but not its checksum: changed on the way
+        # A frame where one is due, with header and delimiter but a wrong checksum, was corrupted.
         ends = np.array([0] + [start + length * self._size for start, length in runs])
         ends = ends[ends + self._size <= octets.size]
         looks = (octets[ends] == BURST_HEADER) & (octets[ends + self._size - 1] == DELIMITER)
@@ -159,7 +160,7 @@ class BurstDecoder:
             counters = frames["count"].astype(np.int64)
             runs, repeated = self._counter.place(counters, at)
             self._counts["repeated"] += repeated
-        else:  # the best there is without COUNT: what was skipped stands for frames
+        else:  # without COUNT, the skipped bytes are the only estimate of the missing frames
             lost = self._lost_frames
             runs = [Run(0, frames.size, self._next + lost, missing=lost)]
             self._next, self._lost_frames = runs[0].first_sample + frames.size, 0
@@ -169,7 +170,7 @@ class BurstDecoder:
         found: list[Block | Event] = []
         for run in runs:
             if run.restarted:
-                text = f"COUNT restarted; missing: about {several(run.missing, 'sample')}"
+                text = f"COUNT restarted; about {several(run.missing, 'sample')} missing"
                 found.append(Event(self._sensor, EventKind.RESET, text, at))
             found.append(self._block(run, counts[run.start : run.stop], at))
         return found
@@ -184,7 +185,7 @@ class BurstDecoder:
                 reason = "the device was reset"
             if run.restarted or "count" not in self._burst:
                 flags |= BlockFlag.MISSING_ESTIMATED
-        # the most negative count has no positive twin: compare both ends
+        # np.abs would overflow at the most negative count
         axes = counts[:, self._axes]
         if axes.size and (axes.max() >= self._full_scale or axes.min() <= -self._full_scale):
             flags |= BlockFlag.CLIPPED
@@ -198,7 +199,7 @@ class BurstDecoder:
         changed, self._error = error != self._error, error
         if not changed:
             return []
-        text = "the device reports an error" if error else "the device reports no error any more"
+        text = "the device reports an error" if error else "the device no longer reports an error"
         return [Event(self._sensor, EventKind.STATUS, text, at)]
 
     def _report(self, at: HostTime) -> list[Event]:

@@ -8,12 +8,14 @@ number to 7E; the same bytes ``80 xx 0D`` that ask for a burst in window 0 write
 window 1, so both ends must keep track of the window.
 
 In sampling mode the device sends *bursts*: ``80``, the fields that BURST_CTRL selects (big-endian),
-``0D``; by itself if UART_AUTO is set, else when asked. CHECKSUM is the sum of the 16-bit words
-between header and checksum, modulo 65536. Header and delimiter values also occur inside, so only
-length, header, delimiter and checksum together make a frame (:mod:`daq.protocols.epson.burst`).
+``0D``; spontaneously if UART_AUTO is set, else on request. CHECKSUM is the sum of the 16-bit words
+between header and checksum, modulo 65536. Header and delimiter values also occur inside frames, so
+only length, header, delimiter and checksum together identify one
+(:mod:`daq.protocols.epson.burst`).
 
-Both roles are here: the driver writes commands and reads replies, the simulated device the other
-way round. Source: Seiko Epson, M-A352AD10 data sheet and the logger `esensorlib` 2.1.
+This module has both roles: the driver writes commands and reads replies, the simulated device reads
+commands and writes replies. Source: Seiko Epson, M-A352AD10 data sheet and the logger `esensorlib`
+2.1.
 """
 
 from __future__ import annotations
@@ -62,19 +64,19 @@ PROD_ID = tuple(Register(1, address) for address in (0x6A, 0x6C, 0x6E, 0x70))
 VERSION = Register(1, 0x72)
 SERIAL_NUM = tuple(Register(1, address) for address in (0x74, 0x76, 0x78, 0x7A))
 WINDOW = 0x7E
-"""Address, in every window, that selects the window."""
+"""Address of the window selector, in every window."""
 
 SAMPLING, CONFIGURATION, SLEEP = 1, 2, 3
-"""Written to MODE_CTRL's high byte; bits 11:10 read back one less."""
+"""Values for MODE_CTRL's high byte; bits 11:10 read back one less."""
 FILTER_BUSY = 0x0020
 NOT_READY = 0x0400
 RESET, FLASH_BACKUP, FACTORY = 0x80, 0x08, 0x04
-"""Written to GLOB_CMD's low byte."""
+"""Values for GLOB_CMD's low byte."""
 UART_AUTO, AUTO_START = 0x01, 0x02
 REDUCED_NOISE, TEMPERATURE_STABILISATION = 0x10, 0x04
-"""Bits of SIG_CTRL's low byte, of an M-A352 only; that an M-A370 reads 0 there is assumed."""
+"""Bits of SIG_CTRL's low byte, M-A352 only. Assumed: an M-A370 reads 0."""
 FLAG_ERROR = 0x0001
-"""Bit of FLAG: an error is noted in DIAG_STAT."""
+"""Bit of FLAG: DIAG_STAT holds an error."""
 
 RATES = {1000: 2, 500: 3, 200: 4, 100: 5, 50: 6}
 """Sampling rate in Hz → code in SMPL_CTRL's high byte."""
@@ -99,12 +101,12 @@ USUAL_FILTER = {
     100: "K512_FC16",
     50: "K512_FC9",
 }
-"""Of an M-A352; an M-A370 has at 1000 Hz what is usual at 500 Hz."""
+"""For an M-A352; an M-A370 uses at 1000 Hz the value for 500 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """Ask for the register at an even address of the current window."""
+    """Request for the register at an even address of the current window."""
 
     address: int
 
@@ -115,7 +117,7 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Set one byte of the current window; address 0 in window 0 asks for a burst."""
+    """Command that sets one byte of the current window; address 0 in window 0 requests a burst."""
 
     address: int
     value: int
@@ -126,11 +128,11 @@ class Write:
 
 
 SIZE = 3
-"""Bytes of a command. On a real line each is written by itself, 350 µs after the one before."""
+"""Bytes of a command. A real device needs 350 µs between two commands."""
 
 
 def read(register: Register) -> bytes:
-    """Return the bytes that select the window and ask for a register."""
+    """Return the bytes that select the window and request a register."""
     return Write(WINDOW, register.window).encode() + Read(register.address).encode()
 
 
@@ -141,14 +143,14 @@ def write(register: Register, value: int, *, high: bool = False) -> bytes:
 
 
 def encode_reply(address: int, value: int) -> bytes:
-    """Return a device's answer to :class:`Read`."""
+    """Return a device's reply to :class:`Read`."""
     return bytes((address, value >> 8, value & 0xFF, DELIMITER))
 
 
 def find_reply(received: bytes, address: int) -> int | None:
-    """Return the last complete answer about ``address`` in what was received, or None.
+    """Return the value in the last complete reply for ``address``, or None.
 
-    Bytes around it are a burst's that was on its way.
+    Other bytes are ignored: they belong to bursts sent before the command.
     """
     for start in range(len(received) - 4, -1, -1):
         if received[start] == address and received[start + 3] == DELIMITER:
@@ -157,7 +159,7 @@ def find_reply(received: bytes, address: int) -> int | None:
 
 
 class CommandDecoder:
-    """The device's end: bytes in, commands out. A stray delimiter resynchronises it."""
+    """Decoder of the device: bytes in, commands out. A stray delimiter resynchronises it."""
 
     def __init__(self) -> None:
         self._waiting = bytearray()
@@ -195,7 +197,7 @@ _BIT = {name: bit for name, bit, _ in _FIELDS}
 
 @dataclass(frozen=True, slots=True)
 class BurstFormat:
-    """Which fields a burst has, by the value of BURST_CTRL."""
+    """Fields of a burst, as selected by the value of BURST_CTRL."""
 
     burst_ctrl: int
 
@@ -209,7 +211,7 @@ class BurstFormat:
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """One frame as a packed structure: header, the fields, delimiter."""
+        """Dtype of one frame as a packed structure: header, fields, delimiter."""
         present = [(name, kind) for name, bit, kind in _FIELDS if self.burst_ctrl >> bit & 1]
         return np.dtype([("header", "u1"), *present, ("delimiter", "u1")])
 
@@ -225,9 +227,9 @@ def encode_bursts(burst: BurstFormat, **values: NDArray[np.integer[Any]] | int) 
     Parameters
     ----------
     burst
-        The format; fields it does not have may be given and are left out.
+        The format; values of fields that it lacks are ignored.
     **values
-        A value for all frames, or an array with one for each, of each field but the checksum.
+        For each field except the checksum, one value for all frames or an array with one per frame.
     """
     n_frames = max(np.size(value) for value in values.values())
     frames = np.zeros(n_frames, dtype=burst.dtype)
@@ -242,14 +244,14 @@ def encode_bursts(burst: BurstFormat, **values: NDArray[np.integer[Any]] | int) 
 
 
 def word_sums(octets: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Sum big-endian 16-bit words modulo 65536: octets (n, 2 k) → (n,)."""
+    """Return sums of big-endian 16-bit words modulo 65536: octets (n, 2 k) → (n,)."""
     words = np.ascontiguousarray(octets).view(">u2")
     sums: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
     return sums.astype(np.uint16)
 
 
 def text(values: tuple[int, ...]) -> str:
-    """Return the ASCII text that consecutive registers hold, low byte first."""
+    """Return the ASCII text in consecutive registers, low byte first."""
     octets = b"".join(value.to_bytes(2, "little") for value in values)
     return octets.decode("ascii", "replace").strip("\x00 ")
 

@@ -1,1 +1,1 @@
-"""Güralp: GCF blocks, their streams, and the BRP and Scream links that carry them."""
+"""Güralp: GCF blocks, their streams, and the BRP and Scream links that transport them."""

@@ -6,21 +6,21 @@ The digitizer sends frames (SWA-RFC-BRPR; DM24 operator's guide, section 8.3)::
 
     'G'  sequence u8  size u16  block[size]  checksum u16
 
-big-endian, the checksum being the sum of all bytes before it, 'G' included (the guide says "block
-header and body"; Güralp's own code and the specification count 'G', sequence and size too). Other
-bytes are terminal text. After each frame it waits about 150 ms for six bytes::
+big-endian. The checksum is the sum of all bytes before it, 'G' included (the guide names "block
+header and body"; Güralp's own code and the specification also count 'G', sequence and size). Other
+bytes are terminal text. After each frame the digitizer waits about 150 ms for six bytes::
 
-    01  id[LSB]  control  id[2] id[1] id[MSB]     acknowledged; control 0: whatever the sequence
-    02  id[LSB]  sequence id[2] id[1] id[MSB]     refused: go back to that sequence number
+    01  id[LSB]  control  id[2] id[1] id[MSB]     acknowledged; control 0: any sequence number
+    02  id[LSB]  sequence id[2] id[1] id[MSB]     refused: go back to this sequence number
 
-with the stream ID of the last block that was received, then sends the next frame. It keeps its last
-255 frames: a refusal winds it back, and it goes on from there, so frames come twice.
+with the stream ID of the last received block, then sends the next frame. It keeps its last 255
+frames: after a refusal it repeats all frames from the refused number on, so frames arrive twice.
 
-:class:`Receiver` finds frames in any bytes. A frame with a bad checksum, or a jump of the sequence
-number, is answered by a refusal of the first number that is missing, at most ``ATTEMPTS`` times.
-While one is awaited, ``awaiting`` is true and later blocks are best held back. A number that was
-due before, with a block later than all others (by the date in its header), is of a digitizer that
-was restarted and numbers anew.
+:class:`Receiver` finds frames among any bytes. It answers a frame with a wrong checksum, or a jump
+of the sequence number, by refusing the first missing number, at most ``ATTEMPTS`` times. While a
+missing frame may still arrive, ``awaiting`` is true and later blocks should be held back. A
+digitizer that restarts also restarts its sequence numbers: this is detected by an earlier number
+with a block later than all others (by the date in its header).
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ _MAX_TEXT = 200
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame whose checksum is right."""
+    """A frame with a correct checksum."""
 
     sequence: int
     block: bytes
 
     @property
     def raw_stream_id(self) -> bytes:
-        """The four bytes of the stream ID, as they stand in the block."""
+        """The four bytes of the stream ID, in the order of the block."""
         return self.block[4:8]
 
     @property
     def date(self) -> int:
-        """When the block starts, as a number that grows, whole seconds."""
+        """Start of the block in whole seconds, as a number that only orders blocks."""
         return int.from_bytes(self.block[8:12], "big")
 
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
-    """A frame that stood where one was due, and whose checksum is wrong."""
+    """A frame with a wrong checksum, directly after another frame."""
 
     sequence: int
 
@@ -77,20 +77,20 @@ class Skipped:
 
     n_bytes: int
     start: bytes
-    """The first 200 of them."""
+    """The first 200 of these bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Frames that were given up."""
+    """Missing frames that are no longer awaited."""
 
     sequence: int
     n_frames: int
 
 
 @dataclass(frozen=True, slots=True)
-class Anew:
-    """The digitizer numbers its frames anew: ``sequence`` came where ``due`` was due."""
+class NumberingRestarted:
+    """The digitizer restarted its sequence numbers: ``sequence`` arrived, ``due`` was expected."""
 
     sequence: int
     due: int
@@ -105,7 +105,7 @@ class Reply:
 
 
 def encode_frame(sequence: int, block: bytes) -> bytes:
-    """Frame a block of 16 to 1024 bytes."""
+    """Encode a frame with a block of 16 to 1024 bytes."""
     if not MIN_SIZE <= len(block) <= MAX_SIZE:
         raise ValueError(f"a block of {len(block)} bytes; expected {MIN_SIZE} to {MAX_SIZE}")
     body = struct.pack(">cBH", b"G", sequence % 256, len(block)) + block
@@ -113,7 +113,7 @@ def encode_frame(sequence: int, block: bytes) -> bytes:
 
 
 def encode_reply(reply: Reply) -> bytes:
-    """Write an acknowledgement or a refusal."""
+    """Encode an acknowledgement or a refusal."""
     low, rest = reply.raw_stream_id[3], reply.raw_stream_id[2::-1]
     if reply.sequence is None:
         return bytes((_ACKNOWLEDGE, low, 0)) + rest
@@ -121,7 +121,7 @@ def encode_reply(reply: Reply) -> bytes:
 
 
 def decode_replies(buffer: bytearray) -> list[Reply]:
-    """Take whole replies from the front of ``buffer``; bytes that begin none are dropped."""
+    """Decode and remove complete replies from ``buffer``; discard bytes that begin none."""
     replies: list[Reply] = []
     while True:
         while buffer and buffer[0] not in (_ACKNOWLEDGE, _REFUSE):
@@ -135,11 +135,11 @@ def decode_replies(buffer: bytearray) -> list[Reply]:
 
 
 class _Scanner:
-    """Finds frames in bytes, wherever they are cut."""
+    """Finds frames in bytes that are cut anywhere."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._in_step = False  # a frame is due at the front of the buffer
+        self._in_step = False  # a frame is expected at the front of the buffer
         self._skipped = 0
         self._skipped_start = b""
 
@@ -185,34 +185,36 @@ class _Scanner:
 
 
 class Receiver:
-    """The host's end of the line: frames out, replies to send back.
+    """Decoder of the host: bytes in, frames and replies to the digitizer out.
 
     Parameters
     ----------
     replies : bool
-        Whether the line carries replies to the digitizer. Without them nothing is awaited.
+        Whether the line transmits replies to the digitizer. If not, no missing frame is awaited.
     """
 
     def __init__(self, *, replies: bool = True) -> None:
         self._replies = replies
         self._scanner = _Scanner()
-        self._next: int | None = None  # the sequence number that is due
-        self._missing: deque[int] = deque()  # in the order they were sent
+        self._next: int | None = None  # expected sequence number
+        self._missing: deque[int] = deque()  # sequence numbers, in the order sent
         self._attempts = 0
         self._raw_stream_id: bytes | None = None
-        self._latest = 0  # date of a block
+        self._latest = 0  # latest date of a block
         self._to_send = bytearray()
 
     @property
     def awaiting(self) -> bool:
-        """Whether frames that were refused may still come."""
+        """Whether missing frames may still arrive."""
         return bool(self._missing)
 
-    def receive(self, data: bytes) -> Iterator[Frame | Damaged | Skipped | Lost | Anew]:
-        """Yield what ``data`` completes. Frames sent twice are yielded twice."""
+    def receive(
+        self, data: bytes
+    ) -> Iterator[Frame | Damaged | Skipped | Lost | NumberingRestarted]:
+        """Decode ``data``; yield the completed items. Frames sent twice are yielded twice."""
         for found in self._scanner.receive(data):
             if isinstance(found, Frame):
-                yield from self._numbered_anew(found)
+                yield from self._numbering_restarted(found)
             yield found
             if isinstance(found, Frame):
                 self._raw_stream_id = found.raw_stream_id
@@ -221,16 +223,16 @@ class Receiver:
                 yield from self._refuse(self._missing[0] if self._missing else self._next)
 
     def take_replies(self) -> bytes:
-        """Return what is to be sent to the digitizer, once."""
+        """Return and remove the bytes to send to the digitizer."""
         to_send = bytes(self._to_send)
         self._to_send.clear()
         return to_send if self._replies else b""
 
-    def _numbered_anew(self, frame: Frame) -> Iterator[Anew]:
+    def _numbering_restarted(self, frame: Frame) -> Iterator[NumberingRestarted]:
         due = frame.sequence if self._next is None else self._next
         repeated = (frame.sequence - due) % 256 >= 128 and frame.sequence not in self._missing
         if repeated and frame.date > self._latest:
-            yield Anew(frame.sequence, due)
+            yield NumberingRestarted(frame.sequence, due)
             self._missing.clear()
             self._next = None
         self._latest = max(self._latest, frame.date)
@@ -246,7 +248,7 @@ class Receiver:
             self._missing.remove(sequence)
         if not self._missing:
             self._attempts = 0
-        if not self._missing or repeated:  # wound back, it goes on through all that is missing
+        if not self._missing or repeated:  # a digitizer that went back repeats all missing frames
             self._reply(None)
         else:
             yield from self._refuse(self._missing[0])
@@ -269,20 +271,20 @@ class Receiver:
 
 @dataclass(slots=True)
 class Transmitter:
-    """The digitizer's end of the line: numbers frames, keeps the last ones, winds back."""
+    """Encoder of the digitizer: numbers frames, keeps the last ones, repeats refused ones."""
 
-    _queue: deque[tuple[int, bytes]] = field(default_factory=deque)  # still to be sent
+    _queue: deque[tuple[int, bytes]] = field(default_factory=deque)  # not yet sent
     _sent: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=HISTORY))
     _next: int = 0
     _received: bytearray = field(default_factory=bytearray)
 
     def queue(self, block: bytes) -> None:
-        """Give a block its sequence number and its place in the line."""
+        """Append a block to the queue, with the next sequence number."""
         self._queue.append((self._next, encode_frame(self._next, block)))
         self._next = (self._next + 1) % 256
 
     def take_frame(self) -> bytes | None:
-        """Return the next frame to send, None where there is none."""
+        """Return and remove the next frame to send, or None."""
         if not self._queue:
             return None
         self._sent.append(self._queue.popleft())
@@ -290,17 +292,17 @@ class Transmitter:
 
     @property
     def waiting(self) -> bool:
-        """Whether there is a frame to send."""
+        """Whether a frame is queued."""
         return bool(self._queue)
 
     def clear(self) -> None:
-        """Forget what was to be sent and what was sent; numbering goes on."""
+        """Discard queued and sent frames; sequence numbers continue."""
         self._queue.clear()
         self._sent.clear()
         self._received.clear()
 
     def receive(self, data: bytes) -> bool:
-        """Take replies; return whether the last frame was answered."""
+        """Decode replies; return whether one arrived."""
         self._received += data
         replies = decode_replies(self._received)
         for reply in replies:

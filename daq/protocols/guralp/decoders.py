@@ -1,7 +1,7 @@
-"""GCF of Güralp digitizers over a serial line with block recovery, and from Scream servers.
+"""Decoders of GCF over a serial line with block recovery, and from Scream servers.
 
-What came by either goes to :class:`~daq.protocols.guralp.streams.Streams`, told what is still
-awaited.
+Both pass blocks to :class:`~daq.protocols.guralp.streams.Streams`, and whether missing blocks may
+still arrive.
 """
 
 from __future__ import annotations
@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 
 from daq.protocols.block import Block, Event, EventKind, HostTime
 from daq.protocols.errors import RemoteProtocolError
-from daq.protocols.guralp.brp import MAX_SIZE, Anew, Damaged, Frame, Lost, Receiver, Skipped
+from daq.protocols.guralp.brp import (
+    MAX_SIZE,
+    Damaged,
+    Frame,
+    Lost,
+    NumberingRestarted,
+    Receiver,
+    Skipped,
+)
 from daq.protocols.guralp.gcf import decode_block
 from daq.protocols.guralp.scream import (
     ACKNOWLEDGED,
@@ -25,8 +33,8 @@ from daq.protocols.plural import several
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-MOST_PACKETS = 1024
-"""Packets whose number lies further from what is due are of a server that was restarted."""
+MAX_JUMP = 1024
+"""Largest jump of the packet number; a larger one means that the server restarted."""
 
 
 class SerialDecoder:
@@ -35,9 +43,9 @@ class SerialDecoder:
     Parameters
     ----------
     sensors : mapping of str to sequence of str
-        For each sensor the stream ID of each channel.
+        Stream ID of each channel, by sensor.
     replies : bool
-        Whether blocks are acknowledged and lost ones asked for again.
+        Whether the host acknowledges blocks and requests lost ones again.
     """
 
     def __init__(self, sensors: Mapping[str, Iterable[str]], *, replies: bool = True) -> None:
@@ -46,7 +54,7 @@ class SerialDecoder:
         self._receiver = Receiver(replies=replies)
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes from the line; replies are then to be taken and sent."""
+        """Decode bytes of the line, cut anywhere. Then send :meth:`take_replies`."""
         found: list[Block | Event] = []
         for item in self._receiver.receive(data):
             match item:
@@ -58,19 +66,20 @@ class SerialDecoder:
                     )
                     self.streams.lost("damaged block")
                 case Lost(sequence, n_frames):
-                    text = f"{several(n_frames, 'block')} from number {sequence} did not come again"
+                    text = f"lost {several(n_frames, 'block')} from number {sequence} on"
                     found.append(Event(self._name, EventKind.RESYNCHRONISED, text, at))
                     self.streams.lost("lost block")
-                case Anew(sequence, due):
-                    text = f"the digitizer restarted its numbering: block {sequence}, not {due}"
+                case NumberingRestarted(sequence, due):
+                    text = f"the digitizer restarted: block {sequence}, expected {due}"
                     found.append(Event(self._name, EventKind.RESET, text, at))
                     self.streams.lost("digitizer restarted")
                 case Skipped(n_bytes, start):
-                    found.append(Event(self._name, EventKind.STATUS, _told(n_bytes, start), at))
+                    text = _skipped_text(n_bytes, start)
+                    found.append(Event(self._name, EventKind.STATUS, text, at))
         return found
 
     def take_replies(self) -> bytes:
-        """Return what is to be sent to the digitizer, once."""
+        """Return and remove the bytes to send to the digitizer."""
         return self._receiver.take_replies()
 
     def _frame(self, data: bytes, at: HostTime) -> Iterator[Block | Event]:
@@ -82,25 +91,25 @@ class SerialDecoder:
         yield from self.streams.receive(block, at, awaiting=self._receiver.awaiting)
 
 
-def _told(n_bytes: int, start: bytes) -> str:
+def _skipped_text(n_bytes: int, start: bytes) -> str:
     if sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in start) > 0.9 * len(start):
         return cut("terminal: " + " ".join(start.decode("ascii", "replace").split()))
     if start[:1] == b"G" and len(start) >= 4 and int.from_bytes(start[2:4], "big") > MAX_SIZE:
         size = int.from_bytes(start[2:4], "big")
-        return f"skipped {n_bytes} bytes: a block of {size} bytes announced, at most {MAX_SIZE} fit"
+        return f"skipped {n_bytes} bytes: a block of {size} bytes; expected at most {MAX_SIZE}"
     return f"skipped {n_bytes} bytes that are no block"
 
 
 class ScreamDecoder:
     """GCF from a Scream server: ``receive`` for TCP, ``receive_datagram`` for UDP.
 
-    Packets that were overtaken on the way, or are asked for again by number (``missing``), are put
-    in their place if they come before ``patience`` others: while they are awaited nothing goes out,
-    which must not look like a stall. A number that was due before, with a block later than all
-    others, is of a server that was restarted.
+    Packets may arrive out of order, or again after a request by number (``missing``). A missing
+    packet is awaited until ``patience`` others have arrived. Meanwhile no blocks are returned; the
+    stall detector must allow for this. An earlier number with a block later than all others means
+    that the server restarted.
     """
 
-    MOST_MISSING = 32
+    MAX_MISSING = 32
 
     def __init__(self, sensors: Mapping[str, Iterable[str]], *, patience: int = 2) -> None:
         self.streams = Streams(sensors)
@@ -108,16 +117,16 @@ class ScreamDecoder:
         self._name = only(sensors)
         self._finder = PacketFinder()
         self._next: int | None = None
-        self._latest_ns = 0  # start of a block
-        self._missing: dict[int, int] = {}  # sequence number: how many came since
+        self._latest_ns = 0  # latest start of a block
+        self._missing: dict[int, int] = {}  # sequence number: number of packets since
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Sequence numbers of packets that are still awaited."""
+        """Sequence numbers of missing packets that may still arrive."""
         return tuple(self._missing)
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes of the TCP connection, cut anywhere."""
+        """Decode bytes of the TCP connection, cut anywhere."""
         found: list[Block | Event] = []
         for item in self._finder.receive(data):
             if isinstance(item, Packet):
@@ -131,7 +140,7 @@ class ScreamDecoder:
         return found
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take one UDP packet."""
+        """Decode one UDP packet."""
         text = data[:16].rstrip(b"\0") + b"\0"
         if text == ACKNOWLEDGED:
             return []
@@ -143,7 +152,7 @@ class ScreamDecoder:
             return [Event(self._name, EventKind.RESYNCHRONISED, cut(str(error)), at)]
 
     def not_available(self, sequence: int) -> None:
-        """Note that the server no longer has this packet."""
+        """Stop waiting for a packet that the server no longer has."""
         self._missing.pop(sequence, None)
 
     def _packet(self, packet: Packet, at: HostTime) -> Iterator[Block | Event]:
@@ -153,11 +162,11 @@ class ScreamDecoder:
         start_ns = packet.block.start_ns
         known = sequence in self._missing or start_ns <= self._latest_ns
         self._latest_ns = max(self._latest_ns, start_ns)
-        if min(ahead, 65536 - ahead) > MOST_PACKETS or (ahead >= 32768 and not known):
+        if min(ahead, 65536 - ahead) > MAX_JUMP or (ahead >= 32768 and not known):
             self._missing.clear()
             self._next = (sequence + 1) % 65536
             self.streams.lost("server restarted")
-            text = f"the server restarted its numbering: packet {sequence}, not {due}"
+            text = f"the server restarted: packet {sequence}, expected {due}"
             yield Event(self._name, EventKind.RESET, text, at)
         elif ahead < 32768:
             yield from self._advance(due, ahead, at)
@@ -172,6 +181,6 @@ class ScreamDecoder:
                 self._name, EventKind.RESYNCHRONISED, several(ahead, "packet", "missing"), at
             )
         aged = {number: since + 1 for number, since in self._missing.items()}
-        if ahead <= self.MOST_MISSING:  # more than that is no disorder on the way
+        if ahead <= self.MAX_MISSING:  # packets are not reordered by more
             aged |= {(due + i) % 65536: 0 for i in range(ahead)}
         self._missing = {n: since for n, since in aged.items() if since < self._patience}

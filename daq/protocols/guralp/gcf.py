@@ -10,17 +10,17 @@ A block is at most 1024 bytes, big-endian (Güralp SWA-RFC-GCFR; DM24 operator's
     12 TTL         u8    filter table reference
     13 SPS         u8    sampling rate code, 0 for a block of text
     14 compression u8    low 3 bits: 4 x 8, 2 x 16 or 1 x 32 bit differences per record;
-                         above 250 Hz the rest is the numerator of a fractional start
+                         above 250 Hz, the other bits are the numerator of a fractional start
     15 records     u8    number of 4-byte records
     16 FIC i32, first differences (the first is 0), RIC i32
 
-FIC is the first sample, RIC the last: a block whose differences do not lead from one to the other
-is damaged. Serial links may leave out what is unused after the RIC, and send differences of 3 bytes
-under the code of 32 bits, which only the length gives away. Differences wrap at the width of the
-samples (32 bits, or 24 for 3-byte differences).
+FIC is the first sample, RIC the last: a block is damaged if its differences do not lead from FIC to
+RIC. Serial links may omit the unused bytes after the RIC. They may also send differences of 3 bytes
+with the code for 32 bits; only the length of the block distinguishes the two. Differences wrap at
+the width of the samples (32 bits, or 24 for 3-byte differences).
 
-A leap second is second 86400 of its day. POSIX time has none: it is given the number of the second
-before, and a block that lies across one shows as one second of overlap with the next.
+A leap second is second 86400 of its day. POSIX time has no leap second: it gets the number of the
+second before, and a block that spans one overlaps the next block by one second.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _SPECIAL_RATES: dict[int, tuple[Fraction, int]] = {
 RATES: Mapping[int, tuple[Fraction, int]] = MappingProxyType(
     {code: (Fraction(code), 1) for code in range(1, 251)} | _SPECIAL_RATES
 )
-"""SPS code to (sampling rate in Hz, parts of a second at which a block may start)."""
+"""SPS code to (sampling rate in Hz, denominator of the fractional second of a block's start)."""
 
 _CODES = {rate: code for code, (rate, _) in RATES.items()}
 _WIDTHS: dict[int, Width] = {1: 32, 2: 16, 4: 8}  # compression code: width of a difference
@@ -79,7 +79,7 @@ _CODE_OF_WIDTH: dict[Width, int] = {32: 1, 24: 1, 16: 2, 8: 4}
 
 
 class SystemForm(IntEnum):
-    """How the system ID is packed, and how many characters it has room for."""
+    """Packing of the system ID: determines its maximum number of characters."""
 
     PLAIN = 0
     EXTENDED = 1
@@ -91,10 +91,9 @@ _ID_BITS = {SystemForm.PLAIN: 31, SystemForm.EXTENDED: 26, SystemForm.DOUBLE_EXT
 
 @dataclass(frozen=True, slots=True)
 class SystemId:
-    """The system a block comes from.
+    """System that a block comes from.
 
-    ``gain`` (0, 1, 2, 4 … 64) and ``digitizer`` (the type bit) are carried by the extended forms
-    only.
+    Only the extended forms hold ``gain`` (0, 1, 2, 4 … 64) and ``digitizer`` (the type bit).
     """
 
     text: str
@@ -117,7 +116,7 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True)
 class StatusBlock:
-    """Text a digitizer sends about itself: GPS, clock, mass positions."""
+    """Status text of a digitizer: GPS, clock, mass positions."""
 
     system: SystemId
     stream_id: str
@@ -133,7 +132,7 @@ def encode_id(text: str) -> int:
 
 
 def decode_id(number: int) -> str:
-    """Return the characters of an ID; leading zeros are not kept."""
+    """Return the characters of an ID without leading zeros."""
     characters = ""
     while number or not characters:
         number, digit = divmod(number, 36)
@@ -142,17 +141,17 @@ def decode_id(number: int) -> str:
 
 
 def serial_number(stream_id: str) -> str:
-    """Return the four characters of a stream ID before component and tap; it may lack zeros."""
+    """Return the serial number in a stream ID: up to four characters before component and tap."""
     return stream_id[:-2].rjust(4, "0")
 
 
 def component(stream_id: str) -> str:
-    """Return the character of a stream ID before its last."""
+    """Return the component in a stream ID: its last character but one."""
     return stream_id[-2:-1]
 
 
 def encode_system_id(system: SystemId) -> int:
-    """Pack a system ID in its form."""
+    """Encode a system ID in its form."""
     number = encode_id(system.text)
     if number >> _ID_BITS[system.form]:
         raise ValueError(f"system ID {system.text!r} is too long for form {system.form.name}")
@@ -165,7 +164,7 @@ def encode_system_id(system: SystemId) -> int:
 
 
 def decode_system_id(number: int) -> SystemId:
-    """Unpack a system ID of any form."""
+    """Decode a system ID of any form."""
     if not number >> 31:
         return SystemId(decode_id(number))
     form = SystemForm.DOUBLE_EXTENDED if number >> 30 & 1 else SystemForm.EXTENDED
@@ -175,12 +174,12 @@ def decode_system_id(number: int) -> SystemId:
 
 
 def decode_block(data: bytes) -> SampleBlock | StatusBlock:
-    """Read one block, whole or cut after its RIC.
+    """Decode one block, complete or cut after its RIC.
 
     Raises
     ------
     RemoteProtocolError
-        The block is too short or too long, has an unknown sampling rate or compression, announces
+        If the block is too short or too long, has an unknown sampling rate or compression, declares
         more samples than it holds, or its differences do not lead from FIC to RIC.
     """
     if not HEADER_SIZE <= len(data) <= BLOCK_SIZE:
@@ -220,13 +219,13 @@ def _decode_samples(
         )
     first, last = (int.from_bytes(data[i : i + 4], "big", signed=True) for i in (16, end))
     counts = np.cumsum(_differences(data[20:end], width), dtype=np.int64)
-    counts += first - counts[0]  # the first difference is 0, or means something else
+    counts += first - counts[0]  # a first difference other than 0 has no defined meaning
     modulus = 1 << (24 if width == 24 else 32)
     half = modulus >> 1
     counts = (counts + half) % modulus - half
     if counts[-1] != last or counts[0] != first:
         raise RemoteProtocolError(
-            f"GCF stream {stream_id}: differences lead to {counts[-1]}, the block says {last}"
+            f"GCF stream {stream_id}: differences end at {counts[-1]}; expected {last}, the RIC"
         )
     return counts.astype(np.int32)
 
@@ -241,7 +240,7 @@ def _differences(data: bytes, width: Width) -> NDArray[np.int32]:
 
 
 def narrowest(counts: NDArray[np.int32]) -> Width:
-    """Return the width of the smallest differences that can carry these samples."""
+    """Return the smallest width of differences that can hold these samples."""
     differences = np.diff(counts.astype(np.int64))
     reach = int(np.abs(differences).max(initial=0))
     if reach <= 127 and len(counts) % 4 == 0:
@@ -252,24 +251,23 @@ def narrowest(counts: NDArray[np.int32]) -> Width:
 
 
 def max_samples(width: Width) -> int:
-    """Return how many samples a block of such differences holds."""
+    """Return the maximum number of samples in a block with differences of this width."""
     return 8000 // width if width != 24 else 255
 
 
 def encode_block(block: SampleBlock, *, width: Width | None = None) -> bytes:
-    """Write a block, cut after its RIC (pad with zeros to 1024 bytes for files and networks).
+    """Encode a block, cut after its RIC (pad with zeros to 1024 bytes for files and networks).
 
     Parameters
     ----------
     block : SampleBlock
-        What to write.
     width : 8, 16, 24, 32 or None
-        Bits of a difference; None takes the narrowest of 8, 16 and 32.
+        Bits of a difference; None selects the narrowest possible of 8, 16 and 32.
 
     Raises
     ------
     ValueError
-        The samples do not fit, or the format has no code for the sampling rate or start.
+        If the samples do not fit, or GCF has no code for the sampling rate or start.
     """
     counts = block.counts
     width = width or narrowest(counts)
@@ -297,14 +295,14 @@ def encode_block(block: SampleBlock, *, width: Width | None = None) -> bytes:
 
 
 def _fits(values: NDArray[np.signedinteger], width: Width) -> bool:
-    # Differences of 32 bits wrap, as samples of 24 bits do: these always fit.
+    # Differences wrap at the width of the samples, so any 32-bit difference fits.
     return width == 32 or bool(
         (values >= -1 << (width - 1)).all() and (values < 1 << (width - 1)).all()
     )
 
 
 def encode_status(block: StatusBlock) -> bytes:
-    """Write a block of text, cut after its last record."""
+    """Encode a block of text, cut after its last record."""
     text = block.text.encode("ascii")[: BLOCK_SIZE - HEADER_SIZE]
     records = -(-len(text) // 4)
     head = _header(block.system, block.stream_id, block.start_ns)

@@ -2,11 +2,12 @@
 
 Theory of operation
 -------------------
-A client asks a server (UDP, port 1567) with text in one packet, NUL at its end: ``GCFPING``,
-``GCFSEND:B`` (send, big-endian; to be repeated, or the server stops after a while), ``GCFSTOP``.
-The server says ``GCFACKN``, and ``GCFNOSV`` when it shuts down. Over TCP, on the same port, the
-client sends single bytes: 0xF9 (send over this connection from now on), 0xFC (identify: length,
-text), 0xFE (oldest sequence number: u16), 0xFF and a u16 (that block again, or FF FF FF FF).
+A client sends requests to a server (UDP, port 1567) as text in one packet, ended by NUL:
+``GCFPING``, ``GCFSEND:B`` (send, big-endian; the server stops unless the client repeats it),
+``GCFSTOP``. The server replies ``GCFACKN``, and sends ``GCFNOSV`` when it shuts down. Over TCP, on
+the same port, the client sends single bytes: 0xF9 (send over this connection from now on), 0xFC
+(identify: length, text), 0xFE (oldest sequence number: u16), 0xFF and a u16 (repeat that block;
+FF FF FF FF if it is no longer available).
 
 Every packet holds one block of 1024 bytes and a tail (DM24 operator's guide, section 8.2)::
 
@@ -14,10 +15,12 @@ Every packet holds one block of 1024 bytes and a tail (DM24 operator's guide, se
     version 40: u8 40, u8 byte order, u16 sequence, u8 length, 48 bytes of source     1077 bytes
     version 45: as 40, 60 bytes of source                                             1089 bytes
 
-byte order 1 = big-endian, 2 = little-endian, for block and sequence. Assumed: two bytes of padding
-in version 31, which the guide does not have and Güralp's sources count; the layout of version 45,
-which only its length (Güralp's and SeedLink's sources) and the place of its sequence number
-make known; and the order within a little-endian block, each field and each difference reversed.
+byte order 1 = big-endian, 2 = little-endian, for block and sequence. Assumed:
+
+- two bytes of padding in version 31, as in Güralp's sources; the guide omits them;
+- the layout of version 45, of which only the length (Güralp's and SeedLink's sources) and the
+  position of the sequence number are published;
+- in a little-endian block, each field and each difference is reversed.
 """
 
 from __future__ import annotations
@@ -53,14 +56,14 @@ TCP_AGAIN = b"\xff"
 NOT_AVAILABLE = b"\xff\xff\xff\xff"
 
 _SOURCE_SIZE = {31: 32, 40: 48, 45: 60}
-_PADDING = b"\0\0"  # of version 31
+_PADDING = b"\0\0"  # in version 31
 SIZES = {31: 1063, 40: 1077, 45: 1089}
-"""Bytes of a packet of each version."""
+"""Size of a packet in bytes, by version."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packet:
-    """One packet of a server."""
+    """One packet from a server."""
 
     sequence: int
     source: str
@@ -68,10 +71,10 @@ class Packet:
 
 
 def encode_packet(packet: Packet, *, version: int = 40, width: Width | None = None) -> bytes:
-    """Write a packet, big-endian; ``width`` as in :func:`daq.protocols.guralp.gcf.encode_block`."""
+    """Encode a big-endian packet; ``width`` as in :func:`daq.protocols.guralp.gcf.encode_block`."""
     block = packet.block
     if isinstance(block, SampleBlock):
-        if width == 24:  # only the length tells them from 32 bits, and here it is always 1024
+        if width == 24:  # only the length distinguishes 24 from 32 bits; here it is always 1024
             raise ValueError("no differences of 24 bits over a network")
         body = encode_block(block, width=width)
     else:
@@ -87,12 +90,12 @@ def encode_packet(packet: Packet, *, version: int = 40, width: Width | None = No
 
 
 def decode_packet(data: bytes) -> Packet:
-    """Read one packet.
+    """Decode one packet.
 
     Raises
     ------
     RemoteProtocolError
-        Its version, length or byte order is unknown, or its block is damaged.
+        If its version, length or byte order is unknown, or its block is damaged.
     """
     version = data[BLOCK_SIZE] if len(data) > BLOCK_SIZE else 0
     if len(data) != SIZES.get(version):
@@ -110,7 +113,7 @@ def decode_packet(data: bytes) -> Packet:
 
 
 def swapped(block: bytes) -> bytes:
-    """Turn a little-endian block of 1024 bytes into a big-endian one, or back."""
+    """Return a block of 1024 bytes in the other byte order."""
     out = np.frombuffer(block, np.uint8).copy()
     out[:12] = out[:12].reshape(3, 4)[:, ::-1].reshape(-1)
     sps, compression, records = (int(value) for value in out[13:16])
@@ -123,20 +126,20 @@ def swapped(block: bytes) -> bytes:
 
 
 class PacketFinder:
-    """Finds packets in the bytes of a TCP connection, wherever they are cut."""
+    """Finds packets in the bytes of a TCP connection, cut anywhere."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._skipped = 0
 
     def receive(self, data: bytes) -> Iterator[Packet | int]:
-        """Yield packets, and before one that follows garbage how many bytes were skipped."""
+        """Yield packets, and before a packet after garbage the number of skipped bytes."""
         self._buffer += data
         buffer = bytes(self._buffer)
         tails = np.frombuffer(buffer, np.uint8)[BLOCK_SIZE:]
         starts = np.flatnonzero(np.isin(tails, tuple(SIZES)))
         here = 0
-        undecided = max(0, len(buffer) - BLOCK_SIZE)  # from there on no tail has come
+        undecided = max(0, len(buffer) - BLOCK_SIZE)  # tails of later packets have not arrived
         for start in starts.tolist():
             if start < here:
                 continue
@@ -164,6 +167,6 @@ class PacketFinder:
 
 
 def _plausible(buffer: bytes, start: int) -> bool:
-    """Whether a packet may begin here, as far as a few bytes tell (decoding tells the rest)."""
+    """Return whether a packet may begin at ``start``, from a quick test; decoding decides."""
     compression = buffer[start + 14] & 7
     return compression in (1, 2, 4) and compression * buffer[start + 15] <= 1000

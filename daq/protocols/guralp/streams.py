@@ -1,4 +1,4 @@
-"""Sensors made of GCF streams: the streams of a sensor joined by time, whatever they came by.
+"""GCF streams joined into sensors by time, for every kind of link.
 
 Theory of operation
 -------------------
@@ -6,8 +6,8 @@ A Güralp digitizer sends each component as a stream of its own (``DEMOZ2``, ``D
 :class:`Streams` gives each block to its sensor, where streams are joined by time
 (:mod:`daq.protocols.joined_streams`).
 
-A sensor whose streams are still to be found has none at first. Blocks of streams that are nobody's
-are then kept, until :meth:`Streams.found` says whose they are.
+A sensor whose streams are not yet known starts without streams. Meanwhile, blocks of streams that
+belong to no sensor are kept until :meth:`Streams.assign` assigns their streams.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from daq.protocols.joined_streams import MAX_PENDING, JoinedStreams
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-MOST_KEPT = 1024
-"""Blocks kept while it is not known whose they are."""
+MAX_KEPT = 1024
+"""Maximum number of blocks kept for streams that are not assigned yet."""
 FULL_SCALE_COUNTS = (1 << 23) - 1
-"""Of a 24-bit digitizer."""
+"""Full scale of a 24-bit digitizer, peak."""
 
 
 class Streams:
@@ -34,8 +34,7 @@ class Streams:
     Parameters
     ----------
     sensors : mapping of str to sequence of str
-        For each sensor the stream ID of each channel, in the order of its channels; none where they
-        are still to be found.
+        Stream ID of each channel, by sensor, in the order of the channels; empty if not yet known.
     """
 
     def __init__(self, sensors: Mapping[str, Iterable[str]]) -> None:
@@ -44,28 +43,28 @@ class Streams:
         self._systems: dict[str, str] = {}
         self._owner = {stream: name for name, streams in ids.items() for stream in streams}
         self._unknown: Counter[str] = Counter()
-        self._kept: deque[tuple[SampleBlock, HostTime]] = deque(maxlen=MOST_KEPT)
+        self._kept: deque[tuple[SampleBlock, HostTime]] = deque(maxlen=MAX_KEPT)
         self._searching = not all(ids.values())
         self._name = only(ids)
         self._lost = "block missing"
 
     @property
     def silent(self) -> tuple[str, ...]:
-        """IDs of the streams of which nothing has come yet."""
+        """IDs of the streams without any block yet."""
         return tuple(stream for sensor in self._sensors.values() for stream in sensor.silent)
 
     @property
     def unknown(self) -> frozenset[str]:
-        """Stream IDs that came and belong to no sensor."""
+        """IDs of received streams that belong to no sensor."""
         return frozenset(self._unknown)
 
     @property
     def repeated(self) -> bool:
-        """Whether one of these has come twice, and so all of them once, if equally long."""
+        """Whether one of the `unknown` streams sent two blocks: probably each has sent one."""
         return max(self._unknown.values(), default=0) > 1
 
     def sampling_rate(self, sensor: str) -> float | None:
-        """Return the sampling rate of a sensor in Hz, once a block has said it."""
+        """Return the sampling rate of a sensor in Hz, or None before its first block."""
         rate = self._sensors[sensor].sampling_rate
         return None if rate is None else float(rate)
 
@@ -74,17 +73,20 @@ class Streams:
         return tuple(stream for stream, owner in self._owner.items() if owner == sensor)
 
     def system(self, sensor: str) -> str:
-        """Return the system ID a sensor's first block carried."""
+        """Return the system ID in a sensor's first block."""
         return self._systems.get(sensor, "")
 
     def lost(self, reason: str) -> None:
-        """Note why samples may be missing from now on."""
+        """Set the reason for gaps from now on."""
         self._lost = reason
 
     def receive(
         self, block: SampleBlock | StatusBlock, at: HostTime, *, awaiting: bool = False
     ) -> Iterator[Block | Event]:
-        """Take one block; yield what it completes."""
+        """Add one block; yield the completed blocks and events.
+
+        ``awaiting`` is whether missing blocks may still arrive.
+        """
         if isinstance(block, StatusBlock):
             yield from self._status(block, at)
         elif block.stream_id in self._owner:
@@ -100,8 +102,8 @@ class Streams:
         for sensor in self._sensors.values():
             yield from sensor.take(at, awaiting=awaiting, reason=self._lost)
 
-    def found(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[Block | Event]:
-        """Give a sensor its streams; yield what has come of them, up to a hole."""
+    def assign(self, sensor: str, stream_ids: Iterable[str]) -> Iterator[Block | Event]:
+        """Assign streams to a sensor; yield the blocks received of them, up to the first hole."""
         ids = tuple(stream_ids)
         own = self._sensors[sensor] = _joined(sensor, ids)
         self._owner |= dict.fromkeys(ids, sensor)
@@ -117,7 +119,8 @@ class Streams:
             yield self._nobodys(stream_id, kept[-1][1])
 
     def _nobodys(self, stream_id: str, at: HostTime) -> Event:
-        return Event(self._name, EventKind.REFUSED, f"stream {stream_id} is of no sensor here", at)
+        text = f"stream {stream_id} belongs to no sensor of this port"
+        return Event(self._name, EventKind.REFUSED, text, at)
 
     def _status(self, block: StatusBlock, at: HostTime) -> Iterator[Event]:
         serial = serial_number(block.stream_id)
@@ -134,11 +137,11 @@ def _joined(sensor: str, stream_ids: tuple[str, ...]) -> JoinedStreams:
 
 
 def cut(text: str) -> str:
-    """Return as much of a text as an event holds."""
+    """Return a text, shortened to the maximum length of an event."""
     return text.encode()[:200].decode(errors="ignore")
 
 
 def only(names: Iterable[str]) -> str:
-    """Return the one name of events that concern the port; none if several sensors share it."""
+    """Return the sensor name for events of the port; empty if several sensors share the port."""
     first, *others = (*names, "")
     return first if len(others) <= 1 else ""

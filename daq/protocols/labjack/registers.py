@@ -2,17 +2,18 @@
 
 Theory of operation
 -------------------
-One flat map of 16-bit registers, big-endian, read by functions 3 and 4, written by 6 and 16
-(T-series datasheet, "Protocol details"). Function 76, "Modbus feedback", does several at once::
+The device has one flat map of 16-bit registers, big-endian, read by functions 3 and 4, written by 6
+and 16 (T-series datasheet, "Protocol details"). Function 76, "Modbus feedback", combines several
+reads and writes::
 
     request   ... unit 76 { 00 address u16 registers u8 | 01 address u16 registers u8 values }*
-    reply     ... unit 76 values of the reads, one after the other
+    reply     ... unit 76 values of the reads, in order
     refusal   ... unit CC exception u8        register 55000 then holds the reason
 
 The T7 keeps its calibration in internal flash from 0x3C4000: for the high-speed converter at gain
 1, 10, 100 and 1000, then for the high-resolution one, {positive slope, negative slope, centre,
-offset} as FLOAT32. Streams come from the high-speed converter. The T8 keeps such a set for each of
-its eight inputs and eleven ranges, from 64 bytes after 0x687000 (T-series datasheet 20.0.2:
+offset} as FLOAT32. Streams use the high-speed converter. The T8 keeps such a set for each of its
+eight inputs and eleven ranges, from 64 bytes after 0x687000 (T-series datasheet 20.0.2:
 ``ain[input][range]``).
 """
 
@@ -49,7 +50,7 @@ STREAM_TRIGGER_INDEX = 4024
 STREAM_START_TIME_STAMP = 4026
 STREAM_SCANLIST = 4100  # + 2 k
 STREAM_SCANRATE_HZ_ACTUAL = 4494
-"""Of a T8, from the start of the stream on."""
+"""Actual scan rate of a T8; valid after the stream starts."""
 STREAM_DATA_CR = 4500
 STREAM_DATA_CAPTURE_16 = 4899
 STREAM_ENABLE = 4990
@@ -87,21 +88,24 @@ def ain(number: int) -> int:
 
 
 def actual_scan_rate(wanted: float) -> float:
-    """Return the scan rate a T7 makes of ``wanted`` (Hz): its interval is a multiple of 100 ns."""
+    """Return the scan rate of a T7 that is set to ``wanted``, in Hz.
+
+    Its scan interval is a multiple of 100 ns.
+    """
     return 1e7 / max(1, round(1e7 / wanted)) if wanted > 152.588 else _slow_rate(wanted)
 
 
 def actual_t8_scan_rate(wanted: float) -> float:
-    """Return the scan rate a simulated T8 makes of ``wanted``, in Hz: 40 MHz divided.
+    """Return the scan rate of a simulated T8 that is set to ``wanted``, in Hz: 40 MHz divided.
 
-    What divides a T8's clock is not published; a driver reads the rate and assumes nothing.
+    The clock divider of a real T8 is not published; the driver reads the actual rate.
     """
     return CORE_HZ / max(1, round(CORE_HZ / wanted))
 
 
 def _slow_rate(wanted: float) -> float:
-    # The 16-bit interval counter runs at 10 MHz, halved until the interval fits: assumed, the
-    # datasheet gives only the limit 10 MHz / 65536 = 152.588 Hz.
+    # Assumed: the 16-bit interval counter runs at 10 MHz, halved until the interval fits. The
+    # datasheet states only the limit 10 MHz / 65536 = 152.588 Hz.
     step = 1e-7
     while round(1 / (wanted * step)) > 65535:
         step *= 2
@@ -140,23 +144,23 @@ class Adu:
 
 
 def encode_adu(adu: Adu) -> bytes:
-    """Frame a message for Modbus TCP."""
+    """Encode a message for Modbus TCP."""
     return _MBAP.pack(adu.transaction, 0, len(adu.pdu) + 1, adu.unit) + adu.pdu
 
 
 class AduFinder:
-    """Cuts the bytes of a Modbus TCP connection into messages."""
+    """Decodes the bytes of a Modbus TCP connection into messages."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def receive(self, data: bytes) -> list[Adu]:
-        """Take bytes, return whole messages.
+        """Decode bytes, cut anywhere; return the completed messages.
 
         Raises
         ------
         RemoteProtocolError
-            The other end does not speak Modbus TCP, or announces a message longer than any.
+            If the bytes are not Modbus TCP, or declare a message above the maximum length.
         """
         self._buffer += data
         found: list[Adu] = []
@@ -165,7 +169,7 @@ class AduFinder:
             if protocol or not 2 <= length <= _MAX_PDU + 1:
                 self._buffer.clear()
                 raise RemoteProtocolError(
-                    f"no Modbus TCP: protocol {protocol}, length {length}; expected 0 and 2 to"
+                    f"not Modbus TCP: protocol {protocol}, length {length}; expected 0 and 2 to"
                     f" {_MAX_PDU + 1}"
                 )
             if len(self._buffer) < 6 + length:
@@ -176,7 +180,7 @@ class AduFinder:
 
 
 def encode_feedback(commands: Sequence[Command]) -> bytes:
-    """Write the request of function 76."""
+    """Encode a request of function 76."""
     pdu = bytes((FEEDBACK,))
     for command in commands:
         if isinstance(command, Read):
@@ -188,12 +192,12 @@ def encode_feedback(commands: Sequence[Command]) -> bytes:
 
 
 def decode_feedback(pdu: bytes) -> list[Command]:
-    """Read the request of function 76.
+    """Decode a request of function 76.
 
     Raises
     ------
     RemoteProtocolError
-        A command is cut, or neither a read nor a write.
+        If a command is incomplete, or neither a read nor a write.
     """
     commands: list[Command] = []
     at = 1
@@ -219,7 +223,7 @@ def feedback_values(pdu: bytes, expected_bytes: int) -> bytes:
     Raises
     ------
     RemoteProtocolError
-        It is a refusal, the reply to something else, or of another length.
+        If the reply is a refusal, has another function, or has another length.
     """
     if len(pdu) == 2 and pdu[0] == FEEDBACK | 0x80:
         raise RemoteProtocolError(f"the device refused a feedback frame (exception {pdu[1]})")
@@ -236,7 +240,7 @@ def feedback_values(pdu: bytes, expected_bytes: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """How the counts of one range become volts."""
+    """Conversion from counts of one range to volts."""
 
     positive_slope: float = 3.158058e-4
     negative_slope: float = -3.158058e-4
@@ -250,35 +254,34 @@ class Calibration:
 
 
 GAINS = {10.0: 1, 1.0: 10, 0.1: 100, 0.01: 1000}
-"""Gain of each range in volts."""
+"""Gain by range in volts, peak."""
 
 
 T8_RANGES = (11.0, 9.6, 4.8, 2.4, 1.2, 0.6, 0.3, 0.15, 0.075, 0.036, 0.018)
-"""In volts, peak; in the order of the T8's calibration."""
+"""Ranges in volts, peak, in the order of the T8's calibration."""
 T8_SPANS = (11.0, 9.768, 4.884, 2.442, 1.221, 0.611, 0.305, 0.153, 0.076, 0.038, 0.019)
-"""What the converter spans in each of them, in volts, peak (T-series datasheet 20.0.2)."""
+"""Span of the converter in each range, in volts, peak (T-series datasheet 20.0.2)."""
 T8_INPUTS = 8
-_SET = 4  # values of a calibration
+_SET = 4  # values per calibration
 
 
 def t8_calibration_address(number: int, range_: float) -> int:
-    """Return where the flash of a T8 holds the calibration of an input in a range."""
+    """Return the flash address of a T8's calibration of an input in a range."""
     index = number * len(T8_RANGES) + T8_RANGES.index(range_)
     return T8_CALIBRATION_ADDRESS + T8_CALIBRATION_HEADER + 4 * _SET * index
 
 
 def nominal_t8_calibrations() -> tuple[Calibration, ...]:
-    """Return the calibration of every input and range of a T8 as if it had no errors.
+    """Return the nominal calibration of every input and range of a T8.
 
-    That a stream holds the upper 16 bits of the converter's 24, and 0 V is in their middle, is
-    assumed.
+    Assumed: a stream holds the upper 16 of the converter's 24 bits, with 0 V in their middle.
     """
     at_input = tuple(Calibration(span / 32768, -span / 32768, 32768.0, -span) for span in T8_SPANS)
     return at_input * T8_INPUTS
 
 
 def encode_t8_calibrations(calibrations: Sequence[Calibration]) -> bytes:
-    """Write the flash of a T8, from its header to the last input."""
+    """Encode the flash of a T8, from its header to the last input."""
     sets = [
         struct.pack(f">{_SET}f", one.positive_slope, one.negative_slope, one.center, one.offset)
         for one in calibrations
@@ -287,7 +290,7 @@ def encode_t8_calibrations(calibrations: Sequence[Calibration]) -> bytes:
 
 
 def decode_calibration(flash: bytes) -> Calibration:
-    """Read one calibration of four values."""
+    """Decode one calibration of four values."""
     if len(flash) != 4 * _SET:
         raise RemoteProtocolError(f"{len(flash)} bytes of calibration; expected {4 * _SET}")
     return Calibration(*struct.unpack(f">{_SET}f", flash))
@@ -303,7 +306,7 @@ def nominal_calibrations() -> tuple[Calibration, ...]:
 
 
 def encode_calibrations(calibrations: Sequence[Calibration]) -> bytes:
-    """Write the flash of a T7: eight calibrations, and nominal values for what is not analog."""
+    """Encode the flash of a T7: eight calibrations, then nominal values for the rest."""
     values = [
         value
         for one in calibrations
@@ -314,7 +317,7 @@ def encode_calibrations(calibrations: Sequence[Calibration]) -> bytes:
 
 
 def decode_calibrations(flash: bytes) -> tuple[Calibration, ...]:
-    """Read the eight calibrations of a T7 from its flash."""
+    """Decode the eight calibrations of a T7 from its flash."""
     if len(flash) < 4 * 32:
         raise RemoteProtocolError(f"{len(flash)} bytes of calibration; expected 128 or more")
     values = np.frombuffer(flash[: 4 * 32], ">f4").reshape(8, 4).tolist()

@@ -1,4 +1,4 @@
-"""LabJack T7 and T8 streams: scans of a list of channels, spontaneous or asked for.
+"""LabJack T7 and T8 streams: scans of a list of channels, spontaneous or on request.
 
 Theory of operation
 -------------------
@@ -8,29 +8,30 @@ over TCP port 702 (T-series datasheet 3.2.4), big-endian::
     transaction u16, protocol u16 = 0, length u16 = 10 + 2 N, unit u8 = 1, function u8 = 76,
     type u8 = 16, reserved u8, backlog u16 (bytes), status u16, information u16, N samples u16
 
-In command-response mode register 4500 is read: N u16, backlog, status, information, samples.
-Samples go round the scan list without regard to packets; N is at most 512.
+In command-response mode the host reads register 4500: N u16, backlog, status, information, samples.
+Samples cycle through the scan list; a scan may span two packets. N is at most 512.
 
 ===== ==================== =====================================================================
-2940  auto-recovery         the buffer overflowed; what comes is what was in it, valid
+2940  auto-recovery         the buffer overflowed; the samples in it are valid
 2941  end of auto-recovery  ``information`` scans were skipped; one scan of 0xFFFF, one of these,
-                            stands between old and new samples
+                            separates old and new samples
 2942  scan overlap          fatal: the rate is too high for the scan list
-2943  recovery overflow     fatal: more scans were skipped than can be counted
-2944  burst complete        the wanted number of scans was made
+2943  recovery overflow     fatal: more scans were skipped than the device can count
+2944  burst complete        the requested number of scans was taken
 2945  buffer full           fatal, without auto-recovery
 ===== ==================== =====================================================================
 
-With CORE_TIMER and STREAM_DATA_CAPTURE_16 (its upper half) leading the scan list every scan carries
-the 40 MHz clock that makes the scan rate: gaps are then counted by it, and blocks carry it as
-``device_counter``, unwrapped (it wraps every 107 s). Where the stream is started anew, after a
-fatal status or on another connection, :meth:`StreamDecoder.restart` is to be called: the clock runs
-on, the scans begin anew. The clock then tells how many are missing, to the nearest scan, and host
-time how often it wrapped; one that is not where host time says it should be began anew too, and
-what is missing is estimated.
+If the scan list begins with CORE_TIMER and STREAM_DATA_CAPTURE_16 (its upper half), every scan
+holds the 40 MHz timer from which the scan rate is derived. Gaps are then counted by the timer, and
+blocks have it as ``device_counter``, unwrapped (it wraps every 107 s).
 
-That the scan of 0xFFFF counts among the skipped is what the U3's guide says; the T-series datasheet
-does not. Either way ``information`` scans are missing in its place.
+After a fatal status or on a new connection the stream is restarted: call
+:meth:`StreamDecoder.restart`. The timer continues, but scans start again. The number of missing
+scans then follows from the timer, to the nearest scan, and the number of its wraps from host time.
+If the timer contradicts host time, it was reset as well, and the number is an estimate.
+
+The U3's guide counts the scan of 0xFFFF among the skipped ones; the T-series datasheet does not say
+so. Either way, ``information`` scans are missing in its place.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ FATAL = {
 }
 DUMMY = 0xFFFF
 REPEATED = 2
-"""How far behind the last scan repeated scans may be, s; beyond, the timer was set anew."""
+"""Maximum age in s of repeated scans against the last scan; if older, the timer was reset."""
 MAX_SAMPLES = 512
 MAX_CR_SAMPLES = 251
 TIMER_ADDRESSES = (CORE_TIMER, STREAM_DATA_CAPTURE_16)
@@ -73,13 +74,13 @@ _HEADER = struct.Struct(">HHHBBBBHHH")
 _CR_HEADER = struct.Struct(">HHHH")
 _MARK = bytes((FEEDBACK, 16))
 _WRAP = 1 << 32
-MOST_DOUBT = 40.0
-"""Of host time beyond which it does not tell the wraps of the timer any more, s."""
+MAX_UNCERTAINTY = 40.0
+"""Largest uncertainty of host time, in s, that still determines the timer's number of wraps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packet:
-    """What one packet or one read of register 4500 holds; ``samples`` is uint16."""
+    """Content of one packet or of one read of register 4500; ``samples`` is uint16."""
 
     samples: NDArray[np.uint16]
     backlog: int = 0
@@ -89,7 +90,7 @@ class Packet:
 
 
 def encode_packet(packet: Packet) -> bytes:
-    """Write a spontaneous packet."""
+    """Encode a spontaneous packet."""
     n_samples = len(packet.samples)
     if n_samples > MAX_SAMPLES:
         raise ValueError(f"{n_samples} samples; a packet holds {MAX_SAMPLES}")
@@ -105,7 +106,7 @@ def encode_packet(packet: Packet) -> bytes:
 
 
 def encode_response(packet: Packet, *, n_registers: int) -> bytes:
-    """Write what register 4500 reads as, zeros after the samples."""
+    """Encode the content of register 4500, with zeros after the samples."""
     n_samples = len(packet.samples)
     if n_samples + 4 > n_registers:
         raise ValueError(f"{n_samples} samples in {n_registers} registers; four are the header")
@@ -116,31 +117,31 @@ def encode_response(packet: Packet, *, n_registers: int) -> bytes:
 
 
 def decode_response(values: bytes) -> Packet:
-    """Read what register 4500 holds.
+    """Decode the content of register 4500.
 
     Raises
     ------
     RemoteProtocolError
-        More samples are announced than there are.
+        If it declares more samples than it holds.
     """
     if len(values) < _CR_HEADER.size:
         raise RemoteProtocolError(f"{len(values)} bytes of stream; expected 8 or more")
     n_samples, backlog, status, information = _CR_HEADER.unpack_from(values)
     if _CR_HEADER.size + 2 * n_samples > len(values):
-        raise RemoteProtocolError(f"{n_samples} samples announced in {len(values)} bytes")
+        raise RemoteProtocolError(f"{n_samples} samples declared in {len(values)} bytes")
     samples = np.frombuffer(values, ">u2", n_samples, _CR_HEADER.size).astype(np.uint16)
     return Packet(samples, backlog, status, information)
 
 
 class PacketFinder:
-    """Finds packets in the bytes of port 702, wherever they are cut."""
+    """Finds packets in the bytes of port 702, cut anywhere."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._skipped = 0
 
     def receive(self, data: bytes) -> list[Packet | int]:
-        """Return packets, and before one that follows garbage how many bytes were skipped."""
+        """Return packets, and before a packet after garbage the number of skipped bytes."""
         self._buffer += data
         buffer = bytes(self._buffer)
         found: list[Packet | int] = []
@@ -178,17 +179,17 @@ class PacketFinder:
 
 
 class StreamDecoder:
-    """Scans into blocks of the sensors that share the digitizer.
+    """Decoder of scans into blocks of the sensors that share the digitizer.
 
     Parameters
     ----------
     sensors : mapping of str to sequence of int
-        For each sensor the address of each channel, as they stand in ``scan_list``.
+        Address of each channel, by sensor; all are in ``scan_list``.
     scan_list : sequence of int
-        The addresses the device scans. If it begins with CORE_TIMER and STREAM_DATA_CAPTURE_16,
-        blocks carry the device's clock.
+        The addresses that the device scans. If the list begins with CORE_TIMER and
+        STREAM_DATA_CAPTURE_16, blocks have the timer as ``device_counter``.
     scan_rate : float
-        As read back from the device, in Hz.
+        Actual scan rate, read from the device, in Hz.
     """
 
     def __init__(
@@ -198,41 +199,41 @@ class StreamDecoder:
             name: np.array([list(scan_list).index(address) for address in addresses])
             for name, addresses in sensors.items()
         }
-        self._name = next(iter(sensors)) if len(sensors) == 1 else ""  # of events of the port
+        self._name = next(iter(sensors)) if len(sensors) == 1 else ""  # for events of the port
         self._n_columns = len(scan_list)
         self._timed = tuple(scan_list[:2]) == TIMER_ADDRESSES
         self._rate = scan_rate
-        self._ticks = CORE_HZ / scan_rate  # a whole number of a T7
+        self._ticks = CORE_HZ / scan_rate  # an integer for a T7
         self._finder = PacketFinder()
-        self._next_row = self._end_row = 0  # expected, as far as is known; after the last scan
+        self._next_row = self._end_row = 0  # expected index; index after the last scan
         self._flags = BlockFlag.CLOCK_RESTART
         self._reason = ""
-        self._timer: int | None = None  # unwrapped, of the last scan
-        self._timer_row = 0  # its row
+        self._timer: int | None = None  # of the last timed scan, unwrapped
+        self._timer_row = 0  # index of that scan
         self._latest: HostTime | None = None
         self._begin()
 
     def _begin(self) -> None:
-        self._carry = np.empty(0, np.uint16)  # of a scan that goes on in the next packet
-        self._offset = 0  # samples to drop until a scan begins
+        self._carry = np.empty(0, np.uint16)  # the incomplete last scan
+        self._offset = 0  # samples to drop before the next scan begins
         self._transactions: SampleCounter | None = None
         self._packet_size = 0
         self.recovers = False
-        """Whether the device said last that its buffer has overflowed, and that it will go on."""
-        self._newest: int | None = None  # timer of the last scan that came
-        self._newest_ns = 0  # when it did
+        """Whether the last packet reported auto-recovery: the buffer overflowed."""
+        self._newest: int | None = None  # timer of the last received scan
+        self._newest_ns = 0  # host time of its arrival
         self.fatal: int | None = None
-        """The status that ended the stream, if one did."""
+        """The status that ended the stream, or None."""
         self.complete = False
-        """Whether a burst has come to its end."""
+        """Whether the burst is complete."""
 
     @property
-    def can_go_on(self) -> bool:
-        """Whether there is a timer by which scans of another stream can be placed after these."""
+    def can_resume(self) -> bool:
+        """Whether the scans of a restarted stream can be placed by the timer."""
         return self._timer is not None
 
     def restart(self) -> None:
-        """Note that the stream was started anew, on this connection or another."""
+        """Expect a restarted stream, on this connection or another."""
         reason = FATAL.get(self.fatal or 0, "stream restarted")
         self._finder = PacketFinder()
         self._begin()
@@ -240,7 +241,7 @@ class StreamDecoder:
         self._reason = reason
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes of port 702, cut anywhere."""
+        """Decode bytes of port 702, cut anywhere."""
         found: list[Block | Event] = []
         rows: list[NDArray[np.uint16]] = []
         for item in self._finder.receive(data):
@@ -255,7 +256,7 @@ class StreamDecoder:
         return found + self._blocks(rows, at)
 
     def receive_response(self, packet: Packet, at: HostTime) -> list[Block | Event]:
-        """Take what register 4500 held."""
+        """Decode the content of register 4500."""
         rows: list[NDArray[np.uint16]] = []
         found = self._packet(packet, rows, at)
         return found + self._blocks(rows, at)
@@ -263,7 +264,7 @@ class StreamDecoder:
     def _packet(
         self, packet: Packet, rows: list[NDArray[np.uint16]], at: HostTime
     ) -> list[Block | Event]:
-        """Add the scans of a packet to ``rows``; return what had to be said before them."""
+        """Append the scans of a packet to ``rows``; return the blocks and events before them."""
         found: list[Block | Event] = []
         if self.fatal is not None or self.complete:
             return found
@@ -284,7 +285,7 @@ class StreamDecoder:
             )
         self.recovers = packet.status == AUTO_RECOVER_ACTIVE
         scans = self._scans(packet.samples)
-        if packet.status != AUTO_RECOVER_END:  # which may begin with a scan of 0xFFFF
+        if packet.status != AUTO_RECOVER_END:  # such a packet may begin with a scan of 0xFFFF
             scans = scans[self._n_repeated(scans, at) :]
         if packet.status == AUTO_RECOVER_END:
             before, scans = self._around_dummy(scans)
@@ -298,7 +299,7 @@ class StreamDecoder:
             self.fatal = packet.status
             text = f"{FATAL[packet.status]} ({packet.status})"
             found.append(Event(self._name, EventKind.OVERFLOW, text, at))
-            if DUMMY in scans[-1:]:  # incomplete when the stream broke off
+            if DUMMY in scans[-1:]:  # incomplete when the stream ended
                 scans = scans[:-1]
         elif packet.status == BURST_COMPLETE:
             self.complete = True
@@ -308,18 +309,18 @@ class StreamDecoder:
         return found
 
     def _lost_packets(self, packet: Packet, at: HostTime) -> int | None:
-        """Return how many packets are missing before this one; None if it came before."""
+        """Return the number of packets missing before this one; None if it is a repetition."""
         if packet.transaction is None:
             return 0
         if self._transactions is None:
-            if packet.status == AUTO_RECOVER_ACTIVE:  # it may not be full
+            if packet.status == AUTO_RECOVER_ACTIVE:  # it may not be full, so the rate is unknown
                 return 0
             packet_rate = self._rate * self._n_columns / max(1, len(packet.samples))
             self._transactions = SampleCounter(65536, packet_rate)
         runs, n_repeated = self._transactions.place(np.array([packet.transaction]), at)
         if n_repeated:
             return None
-        # a number that host time does not allow is none that was counted to
+        # A number that contradicts host time is invalid.
         return 0 if runs[0].restarted else runs[0].missing
 
     def _skip_samples(self, n_samples: int) -> None:
@@ -346,7 +347,7 @@ class StreamDecoder:
         return scans[:at], scans[at + 1 :]
 
     def _blocks(self, rows: list[NDArray[np.uint16]], at: HostTime) -> list[Block | Event]:
-        """Make the scans gathered so far into a block for each sensor."""
+        """Return one block per sensor with the scans in ``rows``, and clear ``rows``."""
         scans = np.concatenate(rows) if rows else np.empty((0, self._n_columns), np.uint16)
         rows.clear()
         if not len(scans):
@@ -366,15 +367,15 @@ class StreamDecoder:
         return blocks
 
     def _n_repeated(self, scans: NDArray[np.uint16], at: HostTime) -> int:
-        """Return how many scans lead that the timer says came before, when their packet did."""
+        """Return the number of leading scans that repeat earlier ones, by the timer."""
         if not self._timed or not len(scans):
             return 0
         first, last = _timer(scans[0]), _timer(scans[-1])
         before, before_ns, n_repeated = self._newest, self._newest_ns, 0
-        # The timer may jitter; what is off by more is no timer.
+        # The timer jitters by less than half a scan; otherwise these are not timer values.
         if abs((last - first) % _WRAP - (len(scans) - 1) * self._ticks) < self._ticks / 2:
             self._newest, self._newest_ns = last, at.monotonic_ns
-        if before is not None and (at.monotonic_ns - before_ns) * 1e-9 < MOST_DOUBT:
+        if before is not None and (at.monotonic_ns - before_ns) * 1e-9 < MAX_UNCERTAINTY:
             behind = (before - first) % _WRAP
             if behind < REPEATED * CORE_HZ:
                 n_repeated = min(round(behind / self._ticks) + 1, len(scans))
@@ -383,9 +384,9 @@ class StreamDecoder:
         return n_repeated
 
     def _place(self, scans: NDArray[np.uint16], at: HostTime) -> int | None:
-        """Put the scans in their place by timer or host time; return the timer of the first."""
+        """Set the index of the scans by timer or host time; return the timer of the first."""
         n_scans = len(scans)
-        doubt = 0.0  # of host time, s; none, where it is not asked
+        doubt = 0.0  # uncertainty of host time in s; 0 if host time is not used
         if self._flags & BlockFlag.MISSING_ESTIMATED and self._latest is not None:
             elapsed = (at.monotonic_ns - self._latest.monotonic_ns) * 1e-9
             self._next_row += max(0, round(elapsed * self._rate) - n_scans)
@@ -394,13 +395,13 @@ class StreamDecoder:
             return None
         first, last = _timer(scans[0]), _timer(scans[-1])
         if abs((last - first) % _WRAP - (n_scans - 1) * self._ticks) > n_scans * self._ticks / 2:
-            return None  # samples were lost on the way: what stands there is no timer
+            return None  # samples were lost: these columns are not the timer
         counter = first
         if self._timer is not None:
-            # What is known to be missing tells the number of wraps, the timer then the rest.
+            # The expected index gives the number of wraps; the timer gives the exact index.
             expected = self._timer + (self._next_row - self._timer_row) * self._ticks
             counter += _WRAP * round((expected - first) / _WRAP)
-            if not doubt or abs(counter - expected) <= doubt * CORE_HZ <= MOST_DOUBT * CORE_HZ:
+            if not doubt or abs(counter - expected) <= doubt * CORE_HZ <= MAX_UNCERTAINTY * CORE_HZ:
                 steps = round((counter - self._timer) / self._ticks)
                 self._next_row = max(self._timer_row + steps, self._end_row)
                 self._flags &= ~BlockFlag.MISSING_ESTIMATED

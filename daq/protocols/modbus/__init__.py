@@ -1,1 +1,1 @@
-"""Modbus: RTU frames, readings in registers, block FIFOs."""
+"""Modbus: RTU frames, samples in registers, block FIFOs."""

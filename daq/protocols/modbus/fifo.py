@@ -2,21 +2,23 @@
 
 Theory of operation
 -------------------
-Input register 0x02 holds how many words wait in the device's FIFO. A read of 1 + N registers from
-there returns a header and takes N words out: samples of the channels in turn (i16), N a multiple of
-the channels, at most 123. What the header says differs between public clients: the level when it
-was read (``"size"``), or what is left after this read (``"left"``). Holding register 0x01 is the
-sampling rate in Hz.
+Input register 0x02 holds the level: the number of words in the device's FIFO. A read of 1 + N
+registers from there returns a header and removes N words: samples of the channels in turn (i16), N
+a multiple of the number of channels, at most 123. Public clients disagree on the header: the level
+before this read (``"size"``), or after it (``"left"``). Holding register 0x01 is the sampling rate
+in Hz.
 
-There is neither counter nor time: samples are numbered as they come, and their time is the arrival
-of a read that left less than one more in the FIFO. What waits when sampling starts is stale and
-thrown away. A level at the FIFO's capacity means that the device has dropped samples; that it drops
-the newest, not the oldest, is assumed: the gap is put behind what waits then, its length estimated
-from host time. Fewer words than are known to wait, and zeros behind them, tell that the device was
-restarted (with ``"size"``; with ``"left"`` it is not noticed). If there is more than zeros, the
-header is what is left, whatever was said: nothing is thrown away. A reply that does not arrive may
-have taken N words with it: whether it did, the next level tells, since the device makes samples at
-a known rate meanwhile.
+The device sends neither counter nor time. Samples are numbered in order of arrival; their time is
+the arrival of a read that leaves less than one further read in the FIFO. Words in the FIFO when
+sampling starts are stale and discarded.
+
+- A level at the FIFO's capacity means that the device dropped samples. Assumed: it drops the
+  newest, so the gap follows the words in the FIFO. Its length is estimated from host time.
+- A level below the known number of words, with zeros behind the words, means that the device
+  restarted (``"size"`` only; with ``"left"`` a restart is not detected). If other values than zeros
+  follow, the header must be the level after the read, and no words are discarded.
+- A lost reply may have removed N words. The next level decides, because the device samples at a
+  known rate.
 """
 
 from __future__ import annotations
@@ -37,33 +39,33 @@ RATE_REGISTER = 0x01
 FIFO_REGISTER = 0x02
 MAX_WORDS = 123
 READ_OVERHEAD = 15
-"""Bytes on the line for each read but for its words: the request, and of the reply the rest."""
+"""Bytes on the line per read, without the words of the reply."""
 BLOCK_SAMPLES = 1024
-"""A block is handed over when the FIFO is read up, or when it has grown to this."""
+"""A block is complete when the FIFO is empty, or when the block has this many samples."""
 
 Header = Literal["size", "left"]
 
 
 class FifoDecoder:
-    """Asks for what waits in the FIFO and numbers the samples.
+    """Client of a FIFO: requests out, replies in, blocks out.
 
-    Send :meth:`request`, hand what comes to :meth:`receive` until ``waiting`` is false, or call
-    :meth:`timed_out`; pause while ``level`` is low.
+    Send :meth:`request`, pass the received bytes to :meth:`receive` until ``waiting`` is false, or
+    call :meth:`timed_out`; pause while ``level`` is low.
 
     Parameters
     ----------
     sensor : str
         Name of the sensor.
     sampling_rate : float
-        Of the device, in Hz.
+        Sampling rate of the device, in Hz.
     n_channels : int
-        Channels in the FIFO, in turn.
+        Number of channels in the FIFO.
     header : "size" or "left"
-        What the first register of a read means.
+        Meaning of the first register of a read: level before or after it.
     unit : int
         Address of the device.
     capacity : int or None
-        Words the FIFO holds, where known.
+        Capacity of the FIFO in words, if known.
     """
 
     def __init__(
@@ -83,12 +85,12 @@ class FifoDecoder:
         self._unit = unit
         self._capacity = capacity
         self._finder = ReplyFinder()
-        self._asked = 0  # words asked for
-        self._doubtful = 0  # words that an unanswered read may have taken
+        self._asked = 0  # words requested
+        self._doubtful = 0  # words that an unanswered read may have removed
         self._n_unanswered = self._n_refused = 0
         self._started = False
         self._next = 0
-        self._caught_up = (0, 0)  # sample that followed when the FIFO was last read up, and when
+        self._caught_up = (0, 0)  # when the FIFO was last empty: index of the next sample, time
         self._full: deque[tuple[int, int]] = deque()  # words before each gap, index after it
         self._last: HostTime | None = None
         self._rows: list[NDArray[np.int16]] = []
@@ -96,46 +98,46 @@ class FifoDecoder:
         self._flags = BlockFlag.CLOCK_RESTART
         self._reason = ""
         self.level = 0
-        """Words known to wait."""
+        """Number of words known to be in the FIFO."""
 
     @property
     def started(self) -> bool:
-        """Whether the FIFO has been read up once, so that what comes is recorded."""
+        """Whether the FIFO has been emptied once; later samples are recorded."""
         return self._started
 
     @property
     def waiting(self) -> bool:
-        """Whether a reply is outstanding."""
+        """Whether a reply is pending."""
         return self._finder.waiting
 
     @property
     def is_damaged(self) -> bool:
-        """Whether the outstanding reply came, damaged."""
+        """Whether the pending reply arrived damaged."""
         return self._finder.is_damaged
 
     def request(self) -> bytes:
-        """Return the next request: for the level, with all the samples known to wait."""
+        """Return the next request: for the level and the samples known to be in the FIFO."""
         most = MAX_WORDS // self._n_channels * self._n_channels
         self._asked = min(self.level // self._n_channels * self._n_channels, most)
-        if self._doubtful:  # first the level: it tells what became of them
+        if self._doubtful:  # the level alone decides whether these words were removed
             self._asked = 0
         request = rtu.read_request(self._unit, FIFO_REGISTER, 1 + self._asked)
         self._finder.expect(request)
         return request
 
     def timed_out(self, at: HostTime) -> list[Block | Event]:
-        """Note that no reply came."""
-        instead = self._finder.instead
-        self._finder.forget()
+        """End the wait for a reply."""
+        other = self._finder.unexpected
+        self._finder.cancel()
         self._doubtful += self._asked
         self._n_unanswered += 1
-        text = f"no reply to a read: {instead or 'nothing came'} ({self._n_unanswered} so far)"
+        text = f"no reply to a read: {other or 'nothing received'} ({self._n_unanswered} so far)"
         return [
-            Event(self._sensor, EventKind.RESYNCHRONISED if instead else EventKind.STATUS, text, at)
+            Event(self._sensor, EventKind.RESYNCHRONISED if other else EventKind.STATUS, text, at)
         ]
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes of the line."""
+        """Decode bytes of the line, cut anywhere."""
         reply = self._finder.receive(data)
         if reply is None:
             return []
@@ -150,13 +152,13 @@ class FifoDecoder:
         found = self._resolve_doubt(level, at)
         if self._capacity is not None and level >= self._capacity and self._started:
             if not self._full:
-                text = f"{level} words wait: the FIFO is full and samples were dropped"
+                text = f"{level} words in the FIFO: it is full and samples were dropped"
                 found.append(Event(self._sensor, EventKind.OVERFLOW, text, at))
             index, since = self._caught_up
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
         words = registers[1:].view(np.int16)
-        if level < self._asked and not words[level:].any():  # the rest of what came is nothing
+        if level < self._asked and not words[level:].any():  # zeros behind the words
             words = words[: level // self._n_channels * self._n_channels]
             found += self._emptied(level, at)
         self.level = max(0, level - self._asked)
@@ -165,10 +167,10 @@ class FifoDecoder:
         return found
 
     def _emptied(self, level: int, at: HostTime) -> list[Block | Event]:
-        """Note that fewer words wait than were known to: the device was restarted."""
+        """Handle a restart of the device: fewer words in the FIFO than known."""
         if not self._started:
             return []
-        text = f"{level} words wait where {self._asked} did: the device was restarted"
+        text = f"{level} words in the FIFO, expected {self._asked}: the device was restarted"
         found = [*self._hand_over(at), Event(self._sensor, EventKind.RESET, text, at)]
         index, since = self._caught_up
         index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
@@ -179,7 +181,7 @@ class FifoDecoder:
 
     def _take(self, words: NDArray[np.int16], at: HostTime) -> list[Block | Event]:
         caught_up = self.level < MAX_WORDS
-        if not self._started:  # what waits is stale
+        if not self._started:  # these words are stale
             self._started = caught_up
             self._caught_up = (self.level // self._n_channels, at.monotonic_ns)
             return []
@@ -218,12 +220,12 @@ class FifoDecoder:
         return Block(self._sensor, first, counts, at, flags=flags, reason=reason)
 
     def _resolve_doubt(self, level: int, at: HostTime) -> list[Block | Event]:
-        """Find out by the level whether reads that were not answered took samples out."""
+        """Decide by the level whether unanswered reads removed samples."""
         doubtful, self._doubtful = self._doubtful, 0
         if not doubtful or self._last is None or not self._started:
             return []
         found = self._hand_over(self._last)
-        self._flags |= BlockFlag.MISSING_ESTIMATED  # also where none are: host time may mislead
+        self._flags |= BlockFlag.MISSING_ESTIMATED  # also for 0 missing: host time is uncertain
         made = (at.monotonic_ns - self._last.monotonic_ns) * 1e-9 * self._rate * self._n_channels
         if self.level + made - level > doubtful / 2:
             self._skip_to(self._next + doubtful // self._n_channels, "lost reply")

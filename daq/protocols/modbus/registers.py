@@ -1,17 +1,16 @@
-"""Readings in Modbus registers: where they are, what they mean, and when they were taken.
+"""Samples in Modbus registers: addresses, data types, and times.
 
 Theory of operation
 -------------------
-A device is asked again and again for the registers that hold all channels and, where there are
-such, a counter and a time: in one request, so that they belong together, or in several where one
-reply would not hold them, or where a device refuses the registers that lie between. What came is
-one sample, taken at its own instant: at the device's time if it tells one, else halfway between
-first request and last reply. Rows are gathered and decoded together. Index and nominal rate only
-number the samples; the instants say when they were taken, and where two are more than ``GAP``
-periods apart samples are missing between. A reply whose counter or time is that of the one before
-is the same reading again, and dropped.
+The host polls the registers that hold all channels and, if the device has them, a counter and a
+time. One request keeps the values consistent; several are needed if one reply cannot hold them, or
+if the device refuses the registers between them. Each poll is one *reading*, that is one sample.
+Its instant is the device's time if the device sends one, else halfway between first request and
+last reply. Readings are collected and decoded together. Index and nominal rate only number the
+samples; the instants are their times. Samples are missing between two instants more than ``GAP``
+periods apart. A reading with the counter or time of the reading before repeats it, and is dropped.
 
-Both roles are here: the simulated device encodes with the same map.
+The simulated device encodes with the same map.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ DataType: TypeAlias = Literal[
 WordOrder: TypeAlias = Literal["big", "little"]
 TimeFormat: TypeAlias = Literal["witmotion", "uint32-s", "uint32-ms", "uint32-us", "uint64-ns"]
 
-MOST_REGISTERS = 125
-"""In one Modbus reply."""
+MAX_REGISTERS = 125
+"""Maximum number of registers in one Modbus reply."""
 N_ADDRESSES = 65536
 GATHER = 0.25
-"""Samples of so much host time make a block, s."""
+"""Host time per block, s."""
 GAP = 2.5
-"""Periods between two readings that are a gap: polls jitter, so that one reading may slip."""
+"""Minimum gap, in sample periods: polls jitter, so that one reading may be late."""
 JUMP_NS = 1_000_000_000
-"""A step of the device's time against the host's that is no latency."""
+"""Step of the device's time against host time, in ns, above any latency."""
 DRIFT = 200e-6
 """Largest relative rate error of a device's time."""
 
@@ -64,7 +63,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     "labjack-ain": {"device_id": 1, "function": 4, "address": 0, "data_type": "float32"},
 }
-"""What a preset's settings are; those given beside it go before."""
+"""Settings of each preset; explicit settings override them."""
 
 WITMOTION_UNLOCK = (0x69, 0xB588)
 WITMOTION_RATE = 0x03
@@ -74,10 +73,10 @@ WITMOTION_RATES = {10.0: 6, 50.0: 8, 100.0: 9, 200.0: 0x0B}
 
 @dataclass(frozen=True, slots=True)
 class RegisterMap:
-    """Where the readings of one sensor are.
+    """Addresses and data types of the readings of one sensor.
 
-    ``word_order`` says which register of a longer value comes first: that with its most
-    significant word (``"big"``) or its least; within a register the bytes are big-endian.
+    ``word_order`` is the order of the registers of one value: most significant word first
+    (``"big"``) or last. Within a register the bytes are big-endian.
     """
 
     function: int
@@ -85,26 +84,26 @@ class RegisterMap:
     data_type: DataType = "int16"
     word_order: WordOrder = "big"
     counter_address: int | None = None
-    """Of a 16-bit counter that changes with each reading."""
+    """Address of a 16-bit counter that changes with each sample of the device."""
     time_address: int | None = None
     time_format: TimeFormat = "uint32-ms"
 
     @classmethod
     def of(cls, settings: Mapping[str, Any], n_channels: int) -> RegisterMap:
-        """Return the map that settings as in a bench file describe.
+        """Return the map for settings of a bench file.
 
         Parameters
         ----------
         settings
-            ``preset`` and keys of this class; ``address`` of the first channel where the channels
-            follow one another, or ``addresses``.
+            ``preset`` and keys of this class; ``address`` of the first channel if the channels
+            are contiguous, or ``addresses``.
         n_channels
-            Of the sensor.
+            Number of channels of the sensor.
 
         Raises
         ------
-        ValueError
-            Saying what was expected.
+        DeviceSettingError
+            If a setting is wrong.
         """
         given = {key: value for key, value in settings.items() if value is not None}
         chosen = {**PRESETS.get(given.get("preset", ""), {}), **given}
@@ -115,7 +114,7 @@ class RegisterMap:
         elif "address" in chosen:
             addresses = tuple(chosen["address"] + words * k for k in range(n_channels))
         else:
-            raise DeviceSettingError("address", "is missing; expected that of the first channel")
+            raise DeviceSettingError("address", "is missing; expected the first channel's address")
         if len(addresses) != n_channels:
             raise DeviceSettingError(
                 "addresses", f"{len(addresses)} given; expected {n_channels}, one a channel"
@@ -155,28 +154,28 @@ class RegisterMap:
 
     @property
     def needed(self) -> tuple[int, ...]:
-        """Addresses of all registers that mean something, rising: the columns of a reading."""
+        """Addresses of all used registers, ascending: the columns of a reading."""
         return tuple(sorted({a + k for a, words in self._extents for k in range(words)}))
 
     def reads(self, *, apart: bool = False) -> tuple[tuple[int, int], ...]:
-        """Return what to ask for: first address and number of registers of each request.
+        """Return first address and number of registers of each request.
 
-        As few as can be, each of at most ``MOST_REGISTERS`` and each value in one; ``apart``
-        without any register that is not needed.
+        The requests are as few as possible, of at most ``MAX_REGISTERS`` each, and split no value.
+        With ``apart`` they also contain no unused register.
         """
         reads: list[tuple[int, int]] = []
         for address, words in sorted(self._extents):
             first, count = reads[-1] if reads else (address, 0)
             end = max(first + count, address + words)
             joins = address <= first + count or not apart
-            if reads and joins and end - first <= MOST_REGISTERS:
+            if reads and joins and end - first <= MAX_REGISTERS:
                 reads[-1] = (first, end - first)
             else:
                 reads.append((address, words))
         return tuple(reads)
 
     def __str__(self) -> str:
-        """Say which registers are read."""
+        """Return the ranges of registers to read."""
         return ", ".join(f"{first} to {first + count - 1}" for first, count in self.reads())
 
     def counts(self, registers: NDArray[np.uint16]) -> CountsArray:
@@ -191,7 +190,7 @@ class RegisterMap:
         return registers[:, self.needed.index(self.counter_address)].astype(np.int64)
 
     def times_ns(self, registers: NDArray[np.uint16]) -> NDArray[np.int64] | None:
-        """Return the device's time of each reading in ns since an epoch of its own, (n,)."""
+        """Return the device's time of each reading in ns since a device-specific epoch, (n,)."""
         if self.time_address is None:
             return None
         start = self.needed.index(self.time_address)
@@ -211,9 +210,9 @@ class RegisterMap:
         return values
 
     def encode(self, counts: NDArray[Any], *, counter: int = 0, time_ns: int = 0) -> dict[int, int]:
-        """Return the registers of one reading by address: what a device holds.
+        """Return the registers of one reading by address.
 
-        Counts beyond what the data type holds stand at its end.
+        Counts beyond the range of the data type are clipped to its ends.
         """
         kind = self.dtype
         if kind.kind != "f":
@@ -238,7 +237,7 @@ class RegisterMap:
 
 
 def _witmotion_ns(words: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return UTC ns of YYMM, DDHH, MMSS, ms: the first named is the low byte."""
+    """Return UTC in ns from words YYMM, DDHH, MMSS, ms; YY, DD and MM are low bytes."""
     low, high = words & 0xFF, words >> 8
     months = (low[:, 0] + 30) * 12 + high[:, 0] - 1
     days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + low[:, 1] - 1
@@ -258,16 +257,16 @@ def _witmotion_words(time_ns: int) -> list[int]:
 
 
 class RegisterDecoder:
-    """Replies in, blocks out.
+    """Decoder: readings in, blocks out.
 
     Parameters
     ----------
     sensor : str
         Name for the blocks and events.
     registers : RegisterMap
-        What is read.
+        Map of the readings.
     sampling_rate : float
-        How often it is read, in Hz.
+        Nominal poll rate, in Hz.
     """
 
     def __init__(self, sensor: str, registers: RegisterMap, *, sampling_rate: float) -> None:
@@ -278,26 +277,26 @@ class RegisterDecoder:
         self._rows: list[Sequence[int]] = []
         self._sent: list[int] = []
         self._received: list[int] = []
-        self._at: HostTime | None = None  # when the last of them came
+        self._at: HostTime | None = None  # arrival of the last reading
         self._next = 0
         self._last_instant: int | None = None
         self._last_key: int | None = None
-        self._lag = 0.0  # host's time less the device's, at the least latency
+        self._lag = 0.0  # host time minus device time at the smallest latency
         self._lag_at = 0
 
     def receive(
         self, registers: Sequence[int], sent: HostTime, at: HostTime
     ) -> list[Block | Event]:
-        """Take the registers the map needs; ``sent`` is when the first were asked for.
+        """Add one reading: the registers of `RegisterMap.needed`; ``sent`` is the first request.
 
         Raises
         ------
         RemoteProtocolError
-            It does not hold as many registers as were asked for.
+            If the number of registers is wrong.
         """
         n_needed = len(self._map.needed)
         if len(registers) != n_needed:
-            raise RemoteProtocolError(f"{n_needed} registers needed, {len(registers)} came")
+            raise RemoteProtocolError(f"{len(registers)} registers; expected {n_needed}")
         self._rows.append(registers)
         self._sent.append(sent.monotonic_ns)
         self._received.append(at.monotonic_ns)
@@ -305,7 +304,7 @@ class RegisterDecoder:
         return self.flush() if len(self._rows) >= self._gather else []
 
     def flush(self) -> list[Block | Event]:
-        """Return what has been gathered."""
+        """Decode the collected readings."""
         at = self._at
         if not self._rows or at is None:
             return []
@@ -353,7 +352,7 @@ class RegisterDecoder:
         at: HostTime,
     ) -> list[Block | Event]:
         before = instants[0] - round(self._period_ns)
-        if self._last_instant is not None:  # instants are the host's, also where a clock restarts
+        if self._last_instant is not None:  # on host time, also if the clock restarts
             before = np.int64(self._last_instant)
         steps = np.diff(instants, prepend=before) / self._period_ns
         missing = np.where(steps > GAP, np.rint(steps) - 1, 0).astype(np.int64)

@@ -2,10 +2,10 @@
 
 Theory of operation
 -------------------
-A frame is ``unit u8, function u8, …, CRC u16`` (little-endian), told from the next by a silence of
-3.5 characters, which no USB adapter passes on. So the length comes from the content: a client knows
-which reply it waits for, a server the lengths of requests, and the CRC says whether it was right.
-Whatever does not fit is skipped byte by byte.
+A frame is ``unit u8, function u8, …, CRC u16`` (little-endian). The standard separates frames by a
+silence of 3.5 characters, but USB adapters do not preserve it. The length therefore follows from
+the content: a client knows the expected reply, a server the lengths of requests, and the CRC
+confirms the frame. Other bytes are skipped one by one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ EXCEPTIONS = {
 
 @cache
 def _tables() -> NDArray[np.uint16]:
-    """CRC of every byte followed by 0 to 255 zeros, shape (256, 256): the CRC is linear."""
+    """Return the CRC of every byte followed by 0 to 255 zeros, shape (256, 256).
+
+    The CRC is linear, so the CRC of a frame is the XOR of one entry per byte.
+    """
     table = np.arange(256)
     for _ in range(8):
         table = (table >> 1) ^ (table & 1) * 0xA001
@@ -51,53 +54,53 @@ def _tables() -> NDArray[np.uint16]:
 def crc(frame: bytes) -> int:
     """Return the CRC-16 of 2 to 256 bytes."""
     octets = np.frombuffer(frame, np.uint8).copy()
-    octets[:2] ^= 0xFF  # the same as starting from 0xFFFF
+    octets[:2] ^= 0xFF  # equivalent to the initial value 0xFFFF
     places = np.arange(len(octets) - 1, -1, -1)
     return int(np.bitwise_xor.reduce(_tables()[places, octets]))
 
 
 def encode(unit: int, pdu: bytes) -> bytes:
-    """Frame a request or reply."""
+    """Encode the frame of a request or reply."""
     frame = bytes((unit,)) + pdu
     return frame + struct.pack("<H", crc(frame))
 
 
 def is_whole(frame: bytes) -> bool:
-    """Whether the last two bytes are the CRC of the others."""
+    """Return whether the last two bytes are the CRC of the others."""
     return len(frame) >= 4 and crc(frame[:-2]) == int.from_bytes(frame[-2:], "little")
 
 
 def read_request(unit: int, address: int, n_registers: int, *, function: int = READ_INPUT) -> bytes:
-    """Ask for registers."""
+    """Encode a request to read registers."""
     return encode(unit, struct.pack(">BHH", function, address, n_registers))
 
 
 def write_request(unit: int, address: int, value: int) -> bytes:
-    """Write one register; the reply is the same."""
+    """Encode a request to write one register; the reply has the same bytes."""
     return encode(unit, struct.pack(">BHH", WRITE_SINGLE, address, value))
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply: the bytes after the function code, or the exception it carries."""
+    """A reply: the bytes after the function code, or an exception."""
 
     payload: bytes
     exception: int | None = None
 
     @property
     def registers(self) -> NDArray[np.uint16]:
-        """Values of a reply to a read request, uint16, shape (n_registers,)."""
+        """Register values in the reply to a read request, uint16, shape (n_registers,)."""
         return np.frombuffer(self.payload[1:], ">u2").astype(np.uint16)
 
 
 class ReplyFinder:
-    """The client's end: finds the reply to the one request that is waited for.
+    """Decoder of the client: finds the reply to the pending request.
 
     Parameters
     ----------
     echo : bool
-        Whether the adapter is known to send back what is written. Otherwise it is recognised by the
-        first request to read that comes back.
+        Whether the adapter is known to echo sent bytes. Otherwise an echo is detected when the
+        first read request is received back.
     """
 
     def __init__(self, *, echo: bool = False) -> None:
@@ -110,7 +113,7 @@ class ReplyFinder:
         self._heard = bytearray()
 
     def expect(self, request: bytes) -> None:
-        """Wait for the reply to ``request``; whatever came before is forgotten."""
+        """Expect the reply to ``request``; discard the bytes received before."""
         self._buffer.clear()
         self._heard.clear()
         self._request = request
@@ -120,32 +123,32 @@ class ReplyFinder:
 
     @property
     def is_damaged(self) -> bool:
-        """Whether as many bytes as the reply has came, and are not the reply."""
+        """Whether as many bytes as the expected reply has were received, but not the reply."""
         return self.waiting and len(self._heard) == self._size
 
     @property
     def other_unit(self) -> int | None:
-        """Unit of an undamaged message that came and is no reply to the request; None if none."""
+        """Unit of a valid message that is no reply to the request; None without such a message."""
         frame = _find_message(bytes(self._heard))
         return None if frame is None else frame[0]
 
     @property
     def waiting(self) -> bool:
-        """Whether a reply is waited for."""
+        """Whether a reply is pending."""
         return self._size > 0
 
     @property
-    def instead(self) -> str:
-        """What came since the request and was not its reply, in words; empty if nothing did."""
+    def unexpected(self) -> str:
+        """Description of bytes since the request that are not its reply; empty without bytes."""
         return describe(bytes(self._heard), self._unit)
 
-    def forget(self) -> None:
-        """Wait no longer."""
+    def cancel(self) -> None:
+        """Stop waiting for the reply."""
         self._size = 0
         self._buffer.clear()
 
     def receive(self, received: bytes) -> Reply | None:
-        """Take bytes; return the reply once it is whole."""
+        """Decode bytes, cut anywhere; return the reply once it is complete."""
         if not self.waiting:
             return None
         self._buffer += received
@@ -168,7 +171,7 @@ class ReplyFinder:
                 if len(frame) < size:
                     break
                 if is_whole(frame) and self._fits(frame):
-                    self.forget()
+                    self.cancel()
                     if function & 0x80:
                         return Reply(b"", frame[2])
                     return Reply(frame[2:-2])
@@ -179,7 +182,7 @@ class ReplyFinder:
         return None
 
     def _drop_echo(self) -> bool:
-        """Take an echo of the request off the bytes received; return False while it may go on."""
+        """Remove an echo of the request; return False while the echo may be incomplete."""
         request = self._request
         if not request or not (self.echo or self._function in (READ_HOLDING, READ_INPUT)):
             return True
@@ -193,22 +196,22 @@ class ReplyFinder:
         return True
 
     def _fits(self, frame: bytes) -> bool:
-        """Whether the byte count of a reply with registers is the one that was asked for."""
+        """Return whether the byte count of a reply with registers fits the frame."""
         if frame[1] not in (READ_HOLDING, READ_INPUT):
             return True
         return frame[2] == len(frame) - 5
 
 
 def describe(heard: bytes, unit: int) -> str:
-    """Say what bytes are that came instead of a reply of ``unit``; empty if there are none."""
+    """Describe bytes received instead of a reply of ``unit``; return "" without bytes."""
     frame = _find_message(heard)
     if frame is None:
-        return f"{len(heard)} bytes came that are no reply" if heard else ""
+        return f"received {len(heard)} bytes that are no reply" if heard else ""
     if frame[0] != unit:
-        return f"a reply of unit {frame[0]} came, of unit {unit} was asked"
+        return f"received a reply of unit {frame[0]}, expected unit {unit}"
     if len(frame) > 8 or frame[1] in (READ_HOLDING, READ_INPUT):
-        return f"a reply with {frame[2] // 2} registers came, as many were not asked for"
-    return f"a reply to function {frame[1] & 0x7F} came, which was not asked for"
+        return f"received a reply with {frame[2] // 2} registers, a number not requested"
+    return f"received a reply to function {frame[1] & 0x7F}, which was not requested"
 
 
 def _find_message(heard: bytes) -> bytes | None:
@@ -228,25 +231,25 @@ def _find_message(heard: bytes) -> bytes | None:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request, as a server receives it."""
+    """A request received by a server."""
 
     function: int
     address: int
     value: int
-    """Number of registers, or the value to write to one."""
+    """Number of registers, or the value to write to one register."""
     values: bytes = b""
-    """What is to be written to several."""
+    """Values to write to several registers."""
 
 
 class RequestFinder:
-    """The server's end: finds the requests to one unit."""
+    """Decoder of the server: finds the requests to one unit."""
 
     def __init__(self, unit: int) -> None:
         self._unit = unit
         self._buffer = bytearray()
 
     def receive(self, received: bytes) -> list[Request]:
-        """Take bytes; return whole requests."""
+        """Decode bytes, cut anywhere; return the completed requests."""
         self._buffer += received
         found: list[Request] = []
         while len(self._buffer) >= 8:
@@ -265,11 +268,11 @@ class RequestFinder:
 
 
 def encode_registers(unit: int, function: int, values: NDArray[np.uint16]) -> bytes:
-    """Answer a read request."""
+    """Encode the reply to a read request."""
     data = values.astype(">u2").tobytes()
     return encode(unit, bytes((function, len(data))) + data)
 
 
 def encode_exception(unit: int, function: int, exception: int) -> bytes:
-    """Refuse a request."""
+    """Encode the refusal of a request."""
     return encode(unit, bytes((function | 0x80, exception)))

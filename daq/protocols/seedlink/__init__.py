@@ -1,1 +1,1 @@
-"""SeedLink 3 and 4: packets, miniSEED records, and the streams of sensors."""
+"""SeedLink 3 and 4: packets, miniSEED records, streams of sensors."""

@@ -2,15 +2,14 @@
 
 Theory of operation
 -------------------
-Each record holds samples of one channel and the UTC of the first. Which streams belong to a sensor
-its *selection* says, patterns for location and channel codes; which streams there are is learned
-from the records, which are kept until then. The streams of a sensor are joined by time
-(:mod:`daq.protocols.joined_streams`).
+Each record holds samples of one channel and the UTC of the first. The *selection* of a sensor,
+patterns for location and channel codes, determines its streams. The available streams are known
+only from received records, which are kept until the streams of the sensor are decided. The streams
+of a sensor are joined by time (:mod:`daq.protocols.joined_streams`).
 
-Records come late, and out of order between channels. A hole in all streams of a sensor waits
-``hold`` seconds for a late record, then becomes a gap of exact length. The same decoder goes on
-over connections: :attr:`SeedLinkDecoder.last` says after which packet of each station, and
-samples that come again are dropped.
+Records arrive late, and out of order between channels. A hole in all streams of a sensor stays open
+for ``hold`` seconds, then becomes a gap of exact length. The decoder continues over reconnections:
+:attr:`SeedLinkDecoder.last` has the last packet of each station, and repeated samples are dropped.
 """
 
 from __future__ import annotations
@@ -35,25 +34,24 @@ if TYPE_CHECKING:
     from daq.protocols.seedlink.records import WaveRecord
 
 COMPONENTS = "ZNE123UVWXY"
-"""Last characters of channel codes, in the order in which a pattern's channels are taken."""
+"""Last characters of channel codes, in the order of the channels that match one pattern."""
 MAX_KEPT = 4096
-"""Records kept while it is not known which streams a sensor has, and of one stream while others
-have not come as far."""
+"""Maximum number of records kept while a sensor's streams are not decided, and number of records
+that one stream may then be ahead of the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which streams a sensor has.
+    """Selection of the streams of a sensor.
 
     Attributes
     ----------
     network, station : str
         Codes.
     patterns : tuple of (location, channel)
-        ``?`` stands for any character, ``*`` for any location. One for each channel, or one for all
-        of them.
+        One per channel, or one for all channels. ``?`` matches any character, ``*`` any location.
     n_channels : int
-        Of the sensor.
+        Number of channels of the sensor.
     """
 
     network: str
@@ -63,22 +61,22 @@ class Selection:
 
     @property
     def station_id(self) -> str:
-        """As in packets of version 4."""
+        """Station ID as in packets of version 4."""
         return f"{self.network}_{self.station}"
 
     def matches(self, record: WaveRecord) -> bool:
-        """Whether a record is of a stream that may be the sensor's."""
+        """Return whether the stream of a record matches the selection."""
         if (record.network, record.station) != (self.network, self.station):
             return False
         return any(_fits(record.location, record.channel, pattern) for pattern in self.patterns)
 
     def streams(self, heard: Counter[str]) -> tuple[str, ...] | None:
-        """Return the stream of each channel, None as long as that is not clear.
+        """Return the stream of each channel, or None while it is not decided.
 
         Parameters
         ----------
         heard : Counter of str
-            Stream IDs that match, with the number of records.
+            Number of records by matching stream ID.
         """
         if len(self.patterns) == self.n_channels:
             chosen = [[s for s in heard if _id_fits(s, one)] for one in self.patterns]
@@ -105,7 +103,7 @@ def _component(stream_id: str) -> tuple[int, str]:
 
 
 class _Sensor:
-    """One sensor: its streams once they are known, until then its records."""
+    """One sensor: its streams if decided, else its kept records."""
 
     def __init__(self, name: str, selection: Selection, dtype: np.dtype[np.generic]) -> None:
         self.name = name
@@ -116,10 +114,10 @@ class _Sensor:
         self.kept: list[tuple[WaveRecord, HostTime]] = []
         self._dtype = dtype
         self._refused: set[str] = set()
-        self._hole_ns: int | None = None  # when the hole was noticed
+        self._hole_ns: int | None = None  # host time at which the hole was detected
 
     def add(self, record: WaveRecord, at: HostTime, *, hold: float) -> Iterator[Block | Event]:
-        """Take a record of this sensor's station; yield what it completes."""
+        """Add a record of this sensor's station; yield the completed blocks and events."""
         if record.counts.dtype.kind != self._dtype.kind:
             yield from self._refuse(record, at)
             return
@@ -144,7 +142,7 @@ class _Sensor:
         if record.stream_id not in self.streams:
             if record.stream_id not in self._refused:
                 self._refused.add(record.stream_id)
-                text = f"stream {record.stream_id} is of no channel of this sensor"
+                text = f"stream {record.stream_id} belongs to no channel of this sensor"
                 yield Event(self.name, EventKind.REFUSED, text, at)
             return
         yield from joined.add(record, at)
@@ -153,7 +151,7 @@ class _Sensor:
     def _awaits(self, joined: JoinedStreams, at: HostTime, hold: float) -> bool:
         if not joined.has_hole:
             self._hole_ns = None
-            return True  # samples that follow one another need not wait; a hole behind them does
+            return True  # contiguous samples do not wait, but a hole behind them stays open
         if self._hole_ns is None:
             self._hole_ns = at.monotonic_ns
         return not joined.is_crowded and at.monotonic_ns - self._hole_ns < hold * 1e9
@@ -162,23 +160,23 @@ class _Sensor:
         if record.stream_id not in self._refused:
             self._refused.add(record.stream_id)
             text = (
-                f"stream {record.stream_id} has samples of type {record.counts.dtype}, expected"
+                f"stream {record.stream_id} has samples of type {record.counts.dtype}; expected"
                 f" {self._dtype}: set settings.samples"
             )
             yield Event(self.name, EventKind.REFUSED, text, at)
 
 
 class SeedLinkDecoder:
-    """Packets of one server into blocks.
+    """Decoder of the packets of one server into blocks.
 
     Parameters
     ----------
     selections : mapping of str to Selection
-        For each sensor.
+        Selection of each sensor.
     dtypes : mapping of str to dtype
         Type of the counts of each sensor.
     hold : float
-        Seconds that a hole waits for a late record.
+        Time in s for which a hole stays open for a late record.
     """
 
     def __init__(
@@ -196,34 +194,34 @@ class SeedLinkDecoder:
         self._n_unreadable = 0
         self._name = next(iter(selections)) if len(selections) == 1 else ""
         self.last: dict[str, tuple[int, int]] = {}
-        """Number of the last packet of each station, by ``NET_STA``, and UTC of its first sample in
+        """Last packet of each station, by ``NET_STA``: its number, UTC of its first sample in
         ns."""
 
     def begin(self, version: Version) -> None:
-        """Begin with the packets of a new connection."""
+        """Start decoding the packets of a new connection."""
         self._finder = PacketFinder(version)
 
     @property
     def silent(self) -> tuple[str, ...]:
-        """Names of sensors of which not all streams have been heard."""
+        """Names of the sensors whose streams have not all been received."""
         return tuple(name for name, one in self._sensors.items() if one.joined is None)
 
     def heard(self, sensor: str) -> tuple[str, ...]:
-        """Return the streams heard that may be a sensor's."""
+        """Return the received streams that match a sensor's selection."""
         return tuple(sorted(self._sensors[sensor].heard))
 
     def streams(self, sensor: str) -> tuple[str, ...]:
-        """Return the stream of each channel of a sensor; none until they are known."""
+        """Return the stream of each channel of a sensor; empty until decided."""
         return self._sensors[sensor].streams
 
     def sampling_rate(self, sensor: str) -> float | None:
-        """Return the sampling rate of a sensor in Hz, once it is known."""
+        """Return the sampling rate of a sensor in Hz, or None before its first record."""
         joined = self._sensors[sensor].joined
         rate = None if joined is None else joined.sampling_rate
         return None if rate is None else float(rate)
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes after the handshake, cut anywhere."""
+        """Decode bytes after the handshake, cut anywhere."""
         found: list[Block | Event] = []
         for packet in self._finder.receive(data):
             found += self._packet(packet, at)

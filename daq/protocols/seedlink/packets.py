@@ -2,23 +2,24 @@
 
 Theory of operation
 -------------------
-A client sends commands, lines that end in CR LF, over TCP (port 18000, usually). ``HELLO`` is
-answered by two lines, the first with the versions that the server speaks; then for each station
-``STATION``, ``SELECT`` and ``DATA`` are each answered by ``OK`` or ``ERROR``. After ``END`` packets
-flow until the connection is closed. Version 3 (SeisComP, "SeedLink" 2 to 3.3)::
+A client sends commands, lines that end in CR LF, over TCP (port 18000, usually). The server replies
+to ``HELLO`` with two lines, the first with its protocol versions. Then the client sends
+``STATION``, ``SELECT`` and ``DATA`` for each station; the server replies ``OK`` or ``ERROR`` to
+each. After ``END`` the server sends packets until the connection is closed. Version 3 (SeisComP,
+"SeedLink" 2 to 3.3)::
 
     SL  sequence, 6 hexadecimal digits  miniSEED 2 record of 512 bytes
-    SLINFO  * or blank                  the same, with what INFO asked for
+    SLINFO  * or blank                  miniSEED 2 record of 512 bytes, in reply to INFO
 
 Version 4 (FDSN, 2023), little-endian::
 
     SE  format u8  subformat u8  payload length u32  sequence u64  id length u8  station id  payload
 
-Sequence numbers count the packets of a station. ``DATA n`` begins with packet n, or with the oldest
-that the server still has: a client that asks for the one after the last that it got loses nothing
-for as long as the server keeps its packets. In version 3 they have 24 bits. ``DATA n time``
-gives the time of packet n - 1 as well: a server that has restarted and counts from 1 again (as
-ringserver does after a crash) goes on from that time.
+Sequence numbers count the packets of a station, in version 3 with 24 bits. ``DATA n`` begins with
+packet n, or with the oldest that the server still has. A client that requests the packet after its
+last one therefore loses no packet that the server still keeps. ``DATA n time`` also states the time
+of packet n - 1: a server that restarted and counts from 1 again (as ringserver does after a crash)
+continues from that time.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from daq.protocols.errors import RemoteProtocolError
 
 Version: TypeAlias = Literal[3, 4]
 WRAP = 1 << 24
-"""Of sequence numbers in version 3."""
+"""Modulus of sequence numbers in version 3."""
 RECORD_SIZE = 512
 MAX_PAYLOAD = 1 << 20
-"""Bytes of a payload, beyond which what came is no packet."""
+"""Maximum length of a payload in bytes; longer ones are not packets."""
 LINE_END = b"\r\n"
 _HEADER_3 = 8
 _HEADER_4 = struct.Struct("<2sBBIQB")
@@ -51,11 +52,11 @@ class Packet:
     Attributes
     ----------
     sequence : int or None
-        None of an answer to INFO.
+        None for a reply to INFO.
     payload : bytes
         A miniSEED record.
     station : str
-        ``NET_STA`` in version 4; empty in version 3, where the record says it.
+        ``NET_STA`` in version 4; empty in version 3, where only the record has it.
     is_miniseed : bool
         Whether the payload is a miniSEED record.
     """
@@ -67,19 +68,19 @@ class Packet:
 
 
 def speaks_version_4(hello: str) -> bool:
-    """Whether the first line of the answer to HELLO offers version 4."""
+    """Return whether the first line of the reply to HELLO offers version 4."""
     return any(major == "4" for major, _ in _VERSIONS.findall(hello))
 
 
 def station_command(version: Version, network: str, station: str) -> str:
-    """Return the command that chooses a station."""
+    """Return the command that selects a station."""
     return f"STATION {network}_{station}" if version == 4 else f"STATION {station} {network}"
 
 
 def select_command(version: Version, location: str, channel: str) -> str:
-    """Return the command that selects channels; ``?`` stands for any character.
+    """Return the command that selects channels.
 
-    ``location`` is ``*`` for any.
+    ``?`` matches any character; the location ``*`` matches any location.
     """
     if version == 4:
         codes = "_".join(channel) if len(channel) == 3 else channel
@@ -88,13 +89,13 @@ def select_command(version: Version, location: str, channel: str) -> str:
 
 
 def data_command(version: Version, last: tuple[int, int] | None) -> str:
-    """Return the command that asks for the packets after one, or for those to come.
+    """Return the command that requests the packets after ``last``, or only new packets.
 
     Parameters
     ----------
     last : (int, int) or None
-        Sequence number of the last packet that came, and UTC of its first sample in ns. A server
-        whose numbers began again finds by this time where to go on.
+        Sequence number of the last received packet, and UTC of its first sample in ns. A server
+        that restarted its numbers uses the time.
     """
     if last is None:
         return "DATA"
@@ -106,7 +107,7 @@ def data_command(version: Version, last: tuple[int, int] | None) -> str:
 
 
 def encode_packet(packet: Packet, version: Version) -> bytes:
-    """Write a packet."""
+    """Encode a packet."""
     if version == 4:
         name = packet.station.encode()
         kind = ord("3") if packet.payload[:2] == b"MS" else ord("2")
@@ -118,19 +119,19 @@ def encode_packet(packet: Packet, version: Version) -> bytes:
 
 
 class PacketFinder:
-    """Cuts the bytes of a connection into packets."""
+    """Decodes the bytes of a connection into packets."""
 
     def __init__(self, version: Version) -> None:
         self._version = version
         self._buffer = bytearray()
 
     def receive(self, data: bytes) -> list[Packet]:
-        """Take bytes; return whole packets.
+        """Decode bytes, cut anywhere; return the completed packets.
 
         Raises
         ------
         RemoteProtocolError
-            What came is no packet. Over TCP nothing is lost, so nothing after it can be trusted.
+            If the bytes are no packet. TCP loses no bytes, so the connection is then unusable.
         """
         self._buffer += data
         found: list[Packet] = []

@@ -13,7 +13,7 @@ from daq.protocols.seedlink.packets import RECORD_SIZE
 
 try:
     from pymseed import MiniSEEDError, MS3Record, nslc2sourceid, sourceid2nslc
-except ImportError as error:  # an extra
+except ImportError as error:  # an optional dependency
     raise ImportError(
         "SeedLink needs pymseed, which is not installed; run: pip install 'huddle-bench[seedlink]'"
     ) from error
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     SampleArray: TypeAlias = NDArray[np.int32] | NDArray[np.float32] | NDArray[np.float64]
 
 TEXT, STEIM_2 = 0, 11
-"""Encodings of miniSEED."""
+"""miniSEED encodings."""
 _MAX_DENOMINATOR = 100_000
-"""Of sampling rates: records hold them as a float, or as a factor and a multiplier."""
+"""Of sampling rates: records have them as a float, or as a factor and a multiplier."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,12 +60,12 @@ class WaveRecord:
 
 
 def decode_record(payload: bytes) -> WaveRecord | None:
-    """Read a miniSEED record; None if it holds no samples, such as a log.
+    """Decode a miniSEED record; return None if it holds no samples, such as a log.
 
     Raises
     ------
     RemoteProtocolError
-        It cannot be read.
+        If the record is invalid.
     """
     try:
         record = MS3Record.parse(payload, unpack_data=True)
@@ -73,7 +73,7 @@ def decode_record(payload: bytes) -> WaveRecord | None:
             return None
         codes = sourceid2nslc(record.sourceid)
         rate = Fraction(record.samprate).limit_denominator(_MAX_DENOMINATOR)
-        counts: Any = np.array(record.np_datasamples)  # the record's own memory goes with it
+        counts: Any = np.array(record.np_datasamples)  # a copy: the record owns the memory
     except (MiniSEEDError, ValueError, OverflowError) as error:
         raise RemoteProtocolError(f"a miniSEED record that cannot be read: {error}") from error
     if rate <= 0 or not len(counts):
@@ -82,7 +82,7 @@ def decode_record(payload: bytes) -> WaveRecord | None:
 
 
 def encode_record(record: WaveRecord) -> list[bytes]:
-    """Write samples as miniSEED 2 records of 512 bytes, Steim 2; int32 only."""
+    """Encode samples as miniSEED 2 records of 512 bytes, Steim 2; int32 only."""
     made = MS3Record(reclen=RECORD_SIZE, encoding=STEIM_2)
     made.formatversion = 2
     made.sourceid = nslc2sourceid(record.network, record.station, record.location, record.channel)
@@ -92,7 +92,7 @@ def encode_record(record: WaveRecord) -> list[bytes]:
 
 
 def encode_log(text: str) -> bytes:
-    """Write a miniSEED 2 record of text, as version 3 answers INFO with."""
+    """Encode a miniSEED 2 record of text, as in version 3's reply to INFO."""
     made = MS3Record(reclen=RECORD_SIZE, encoding=TEXT)
     made.formatversion = 2
     made.sourceid = nslc2sourceid("SL", "INFO", "", "INF")

@@ -1,1 +1,1 @@
-"""Delimited text: the format of a row, its decoder, packets put in order."""
+"""Delimited text: formats, decoder, guessed formats, order of packets."""

@@ -1,30 +1,30 @@
-"""Delimited text: a line a sample, or a packet of many samples of one channel.
+"""Decoder of delimited text: one line per sample, or packets of many samples of one channel.
 
 Theory of operation
 -------------------
-Bytes are cut at the terminator, and each piece, without white space at its ends, is one *message*:
-``prefix``, fields with the delimiter between, ``suffix``, and with a checksum ``*hh``, the XOR of
-all characters between the prefix and the asterisk in hexadecimal (NMEA 0183). Fields may be padded
-with spaces or quoted. Four layouts:
+The terminator separates *messages*; white space around a message is removed. A message is
+``prefix``, fields separated by the delimiter, ``suffix``, and optionally a checksum ``*hh``: the
+XOR, in hexadecimal, of all characters between the prefix and the asterisk (NMEA 0183). Fields may
+be padded with spaces or quoted. Four layouts:
 
 row
     ``LILY,2013/06/24 23:22:00,-236.026,  25.666,194.25, 26.01,11.96,N9655``
-    One sample of every channel; ``columns`` says in which fields. A row may carry a time, or a
-    counter that goes up by one.
+    One sample of every channel, in the fields ``columns``. A row may have a time, or a counter that
+    increases by one.
 labelled
-    ``t:1200 X:-12 Y:40 Z:16384``: as a row, each field with its name.
+    ``t:1200 X:-12 Y:40 Z:16384``: like a row, but each field has a name.
 json
-    ``{"t": 1200, "acc": [-12, 40, 16384]}``: as a row; names are ``t``, ``acc.0`` and so on.
+    ``{"t": 1200, "acc": [-12, 40, 16384]}``: like a row; names are ``t``, ``acc.0`` and so on.
 channel
     ``{'EHZ', 1582315130.292, 14168, 14927, …}``
-    The channel, the time of the first sample in seconds since 1970, then samples. Packets of one
-    time belong together (Raspberry Shake datacast; UDP, so packets get lost, come twice, and
-    overtake each other: :mod:`daq.protocols.text.packet_order`).
+    The channel, the time of the first sample in seconds since 1970, then samples. Packets with
+    the same time belong together (Raspberry Shake datacast over UDP: packets are lost, repeated and
+    reordered; see :mod:`daq.protocols.text.packet_order`).
 
-A counter places samples exactly (:mod:`daq.protocols.sample_counter`), and so does a time that is
-written finely enough (:mod:`daq.protocols.sample_times`): rows that come twice are dropped and
-counted, missing ones are a gap. With neither, a message that cannot be read is known to be one that
-is missing, and bytes that were lost altogether are not noticed.
+A counter gives the exact index of a sample (:mod:`daq.protocols.sample_counter`), and so does a
+time of sufficient resolution (:mod:`daq.protocols.sample_times`): repeated rows are dropped and
+counted, missing rows become a gap. With neither, an unreadable message counts as one missing
+sample, and lost bytes are not detected.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _FIRST_ROWS = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """A row as it was read."""
+    """A decoded row."""
 
     counts: NDArray[Any]
     message: bytes
@@ -72,18 +72,18 @@ class _Row:
 
 
 class TextDecoder:
-    """Messages into blocks of one sensor.
+    """Decoder of messages into blocks of one sensor.
 
     Parameters
     ----------
     sensor : str
         Name of the sensor.
     format_ : TextFormat
-        How the device writes.
+        Format of the messages.
     sampling_rate : float
         In Hz.
     joins : bool
-        Whether the device may be sending already, so that the first message may lack its start.
+        Whether the device may already be sending, so that the first message may lack its start.
     """
 
     def __init__(
@@ -100,25 +100,25 @@ class TextDecoder:
         self._times = SampleTimes(sampling_rate)
         self._packets = Packets(format_.channel_names)
         self._doubtful: Group | None = None
-        self._latest = b""  # the last row that was taken
+        self._latest = b""  # the last accepted row
         self._n_known = self._n_unreadable = self._n_given_up = 0
-        self._finest_ns: int | None = None  # how finely times are written
+        self._finest_ns: int | None = None  # resolution of the times
         self._delimiter = format_.delimiter.strip() or None  # None: any white space
         if "\t" in format_.delimiter:
             self._delimiter = "\t"
         self.first_rows: list[bytes] = []
-        """The first messages, as long as none of them could be read."""
+        """The first messages, while none of them was readable."""
         self._has_read = False
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take bytes of a line or connection, cut anywhere."""
+        """Decode bytes of a line or connection, cut anywhere."""
         messages = self._finder.receive(data)
         if self._joins and messages:
             messages, self._joins = messages[1:], False
         return [*self._given_up(self._finder, at), *self._messages(messages, at)]
 
     def receive_datagram(self, data: bytes, at: HostTime) -> list[Block | Event]:
-        """Take one datagram: whole messages, with or without a terminator at the end."""
+        """Decode one datagram: complete messages, the last with or without a terminator."""
         finder = MessageFinder(self._format.terminator.encode())
         messages = finder.receive(data + self._format.terminator.encode())
         return [*self._given_up(finder, at), *self._messages(messages, at)]
@@ -129,8 +129,8 @@ class TextDecoder:
             self._n_given_up += 1
             self._unreadable()
             text = (
-                f"{MAX_MESSAGE} bytes without {self._format.terminator!r}: given up to the next one"
-                f" ({self._n_given_up} so far); is the terminator right?"
+                f"{MAX_MESSAGE} bytes without the terminator {self._format.terminator!r}: dropped"
+                f" ({self._n_given_up} so far); check settings.terminator"
             )
             yield Event(self._sensor, EventKind.RESYNCHRONISED, _cut(text), at)
 
@@ -161,14 +161,14 @@ class TextDecoder:
         found += self._rows(rows, at)
         if self._n_known > n_known:
             what = "packets" if self._format.layout == "channel" else "rows"
-            text = f"{self._n_known - n_known} {what} came again or too late and were dropped"
+            text = f"dropped {self._n_known - n_known} {what} that were repeated or too late"
             found.append(
                 Event(self._sensor, EventKind.STATUS, f"{text} ({self._n_known} so far)", at)
             )
         return found
 
     def _split(self, message: bytes) -> list[str] | None:
-        """Return the fields of a message, None if it is another kind."""
+        """Return the fields of a message, or None if it has another tag."""
         format_ = self._format
         text = message.decode("ascii", "replace")
         if format_.layout in {"labelled", "json"}:
@@ -207,7 +207,7 @@ class TextDecoder:
         return _Row(values, message, counter, time_ns, resolution_ns)
 
     def _time(self, text: str) -> tuple[int, int]:
-        """Return a time and how finely times are written: zeros at an end may be left out."""
+        """Return a time and the resolution of the times: trailing zeros may be omitted."""
         time_ns, resolution_ns = decode_time(text, self._format)
         self._finest_ns = min(resolution_ns, self._finest_ns or resolution_ns)
         return time_ns, self._finest_ns
@@ -239,7 +239,7 @@ class TextDecoder:
             yield self._block(counts[run.start : run.stop], device, at)
 
     def _unreadable(self) -> None:
-        """Count a message that could not be read, where nothing else tells that it is missing."""
+        """Count an unreadable message as missing, if neither a counter nor a time shows this."""
         format_ = self._format
         if format_.layout != "channel" and format_.counter_column is format_.time_column is None:
             self._skip(1, "unreadable row", is_exact=False)
@@ -265,10 +265,10 @@ class TextDecoder:
         for text in self._packets.dropped(at):
             yield Event(self._sensor, EventKind.OVERFLOW, _cut(text), at)
 
-    # --- placed by their time ----------------------------------------------------------------
+    # --- positions by time -------------------------------------------------------------------
 
     def _timed(self, groups: Iterable[tuple[Group, bytes]]) -> Iterator[Block | Event]:
-        """Yield what follows one another together; with each row comes its message."""
+        """Yield blocks of contiguous groups; each group comes with its message."""
         together: list[Group] = []
         for group, message in groups:
             place = self._place(group, alike=bool(message) and message == self._latest)
@@ -281,7 +281,7 @@ class TextDecoder:
             if place.kind == "reset":
                 yield from self._restarted(place, group.received)
                 place = self._place(group)
-            elif self._doubtful is not None:  # what came after tells that it was damaged
+            elif self._doubtful is not None:  # the next message shows that it was damaged
                 yield self._out_of_time(self._doubtful, group.received)
             self._doubtful = group if place.kind == "doubtful" else None
             if place.kind == "next":
@@ -307,7 +307,7 @@ class TextDecoder:
             yield self._block(counts, groups[0].time_ns, groups[-1].received)
 
     def _restarted(self, place: Place, at: HostTime) -> Iterator[Block | Event]:
-        """Yield what had to wait until it was clear that the device's clock was set."""
+        """Yield the doubtful group after the device's clock was found to be set."""
         yield Event(self._sensor, EventKind.RESET, "the device's clock was set", at)
         self._flags |= BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
         self._skip(place.missing, "clock set", is_exact=False)
@@ -318,8 +318,8 @@ class TextDecoder:
     def _out_of_time(self, group: Group, at: HostTime) -> Event:
         self._n_unreadable += 1
         text = (
-            f"{len(group.counts)} samples with a time that is not between those of the others"
-            f" were dropped ({self._n_unreadable} unreadable so far)"
+            f"dropped {len(group.counts)} samples whose time contradicts those of the others"
+            f" ({self._n_unreadable} unreadable so far)"
         )
         return Event(self._sensor, EventKind.CHECKSUM, text, at)
 
@@ -340,7 +340,7 @@ class TextDecoder:
 
 
 def _by_key(fields: list[str], format_: TextFormat) -> dict[int | str, str]:
-    """Return the fields of a row by their number or name."""
+    """Return the fields of a row by number or name."""
     if format_.layout == "labelled":
         return {name: value for name, value in LABELLED.findall(fields[0])}  # noqa: C416 -- keys of either type
     if format_.layout == "json":

@@ -1,6 +1,6 @@
-"""How a device writes its samples as text: formats, presets, encoders, and the cutting of bytes.
+"""Formats of samples as text: settings, presets, encoders, and separation of messages.
 
-See :mod:`daq.protocols.text.decoder` for what messages are made of.
+:mod:`daq.protocols.text.decoder` describes the messages.
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 MAX_MESSAGE = 16_384
-"""Bytes without a terminator after which a message is given up."""
+"""Maximum length of a message in bytes; a longer one is dropped."""
 _NS = 1_000_000_000
 SINCE_START = {"millis": 1_000_000, "micros": 1000}
-"""Units, in ns, of times that count since the device was started."""
+"""Units, in ns, of times since the start of the device."""
 _EPOCH = datetime.fromtimestamp(0, UTC)
 _LATEST_S = 9e9  # in ns it still fits 64 bits
 
 
 @dataclass(frozen=True, slots=True)
 class TextFormat:
-    """How a device writes its samples.
+    """Format of the samples of a device.
 
     Attributes
     ----------
     columns : tuple of int
-        Field of each channel, counted from 0, the tag included (layout "row").
+        Field of each channel, counted from 0, including the tag (layout "row").
     channel_names : tuple of str
-        As in the messages, in the order of the channels (the other layouts). In layout "json" a
+        Names in the messages, in the order of the channels (the other layouts). In layout "json" a
         name may be a path, such as ``acceleration.0``.
     time_column, time_format : int, str or None, str
-        Field of the time, by its number or its name: seconds since 1970 (``"epoch"``), as
-        ``strptime`` has it, in UTC, or ms or µs since the device was started (``"millis"``,
+        Field of the time, by number or name, and its format: seconds since 1970 (``"epoch"``), a
+        format of ``strptime`` in UTC, or ms or µs since the start of the device (``"millis"``,
         ``"micros"``).
     counter_column, counter_modulus : int, str or None, int
-        Field of a counter that goes up by one a row and starts again at the modulus.
+        Field of a counter that increases by one per row, modulo ``counter_modulus``.
     decimal_comma : bool
         Whether numbers are written ``1,5``.
     hexadecimal_bits : int or None
-        Of samples in hexadecimal, two's complement.
+        Number of bits of samples in hexadecimal, two's complement; None for decimal samples.
     tag : str
-        What the first field must be; rows of other tags are skipped.
+        Required value of the first field; rows with other values are skipped.
     whole : bool
-        Whether samples are whole numbers (int32 counts) or not (float64).
+        Whether samples are integers (int32 counts) or not (float64).
     device_time : bool
-        Whether the device's time is to be trusted more than arrival (NTP, GPS).
+        Whether the device's time is more accurate than the arrival (NTP, GPS).
     """
 
     layout: Literal["row", "labelled", "json", "channel"] = "row"
@@ -76,7 +76,7 @@ class TextFormat:
 
     @property
     def channel_keys(self) -> tuple[int, ...] | tuple[str, ...]:
-        """Field of each channel: its number in layout "row", its name in the others."""
+        """Field of each channel: a number in layout "row", a name in the others."""
         return self.columns if self.layout == "row" else self.channel_names
 
     @property
@@ -92,11 +92,11 @@ RASPBERRY_SHAKE = TextFormat(
     channel_names=("EHZ",),
     whole=True,
 )
-"""Its times are NTP's, rounded to 1 ms: good for gaps, too coarse to be the clock."""
+"""Its times are from NTP, rounded to 1 ms: precise enough for gaps, too coarse for the clock."""
 LILY = TextFormat(
     tag="LILY", columns=(2, 3), time_column=1, time_format="%Y/%m/%d %H:%M:%S", terminator="\r\n"
 )
-"""Tilt X and Y in µrad; then azimuth, temperature, supply, serial number."""
+"""Fields: tilt X and Y in µrad; then azimuth, temperature, supply voltage, serial number."""
 
 
 def nmea_checksum(text: str) -> int:
@@ -105,7 +105,7 @@ def nmea_checksum(text: str) -> int:
 
 
 def encode_fields(fields: Sequence[str], format_: TextFormat) -> bytes:
-    """Write one message."""
+    """Encode one message."""
     body = format_.delimiter.join(fields) + format_.suffix
     if format_.nmea_checksum:
         body += f"*{nmea_checksum(body):02X}"
@@ -117,14 +117,14 @@ LABELLED = re.compile(r"([A-Za-z_]\w*)\s*[:=]\s*([^\s,;]+)")
 
 
 def read_number(text: str) -> float:
-    """Read a decimal number; raises ValueError."""
-    if "_" in text:  # which Python allows
+    """Parse a decimal number; raise ValueError if it is none."""
+    if "_" in text:  # float() accepts underscores
         raise ValueError(text)
     return float(text)
 
 
 def read_hexadecimal(text: str, n_bits: int) -> float:
-    """Read a hexadecimal number in two's complement; raises ValueError."""
+    """Parse a hexadecimal number in two's complement; raise ValueError if it is none."""
     value = int(text, 16)
     if "_" in text or not 0 <= value < 1 << n_bits:
         raise ValueError(text)
@@ -132,12 +132,12 @@ def read_hexadecimal(text: str, n_bits: int) -> float:
 
 
 def flatten(value: object, path: str = "") -> dict[str, str]:
-    """Return the numbers and texts in a JSON object by their path.
+    """Return the numbers and texts in a JSON object by path.
 
     Raises
     ------
     TypeError
-        It is no object.
+        If ``value`` is no object.
     """
     if isinstance(value, dict):
         inner = value.items()
@@ -154,7 +154,7 @@ def flatten(value: object, path: str = "") -> dict[str, str]:
 
 
 def encode_row(values: Mapping[int | str, str], format_: TextFormat) -> bytes:
-    """Write one row of layout "row", "labelled" or "json", from the text of each field."""
+    """Encode one row of layout "row", "labelled" or "json", from the text of each field."""
     if format_.layout == "row":
         return encode_fields(
             [values.get(n, "0") for n in range(1 + max(k for k in values if isinstance(k, int)))],
@@ -166,7 +166,7 @@ def encode_row(values: Mapping[int | str, str], format_: TextFormat) -> bytes:
 
 
 def encode_time(utc_ns: int, format_: TextFormat) -> str:
-    """Write a time as the format has it; ``utc_ns`` since the start for those that count it."""
+    """Return a time in this format; ``utc_ns`` is since the start for "millis" and "micros"."""
     if format_.time_format in SINCE_START:
         return str(utc_ns // SINCE_START[format_.time_format] % (1 << 32))
     if format_.time_format == "epoch":
@@ -175,12 +175,12 @@ def encode_time(utc_ns: int, format_: TextFormat) -> str:
 
 
 def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
-    """Read a time; return it and how finely it is written, both in ns.
+    """Parse a time; return the time and its resolution, both in ns.
 
     Raises
     ------
     ValueError, OverflowError
-        It is none.
+        If ``text`` is no time.
     """
     if format_.time_format in SINCE_START:
         resolution_ns = SINCE_START[format_.time_format]
@@ -197,10 +197,10 @@ def decode_time(text: str, format_: TextFormat) -> tuple[int, int]:
 
 
 def is_readable(time_format: str) -> bool:
-    """Whether a format, as ``strptime`` has it, gives date and time to the minute at least."""
+    """Return whether a format of ``strptime`` has the date and the time, at least to the minute."""
     instant = datetime(2026, 11, 21, 13, 14, 15, 161_718, UTC)
     try:
-        found = datetime.strptime(instant.strftime(time_format), time_format)  # noqa: DTZ007 -- UTC by now
+        found = datetime.strptime(instant.strftime(time_format), time_format)  # noqa: DTZ007 -- always UTC
     except ValueError:
         return False
     return found.replace(second=0, microsecond=0, tzinfo=UTC) == instant.replace(
@@ -211,26 +211,23 @@ def is_readable(time_format: str) -> bool:
 def _instant(text: str, time_format: str) -> datetime:
     try:
         return datetime.strptime(text, time_format)  # noqa: DTZ007 -- the caller knows the zone
-    except ValueError:  # a leap second has a second 60, which here is the next minute's first
+    except ValueError:  # second 60, a leap second, is read as the first of the next minute
         minute = datetime.strptime(text, time_format.replace("%S", "60"))  # noqa: DTZ007
         return minute + timedelta(minutes=1)
 
 
 class MessageFinder:
-    """Cuts bytes into messages, wherever they come apart."""
+    """Separates bytes, cut anywhere, into messages."""
 
     def __init__(self, terminator: bytes) -> None:
         self._terminator = terminator
         self._buffer = bytearray()
         self._too_long = False
         self.n_given_up = 0
-        """Messages that went on for more than ``MAX_MESSAGE`` bytes."""
+        """Number of messages dropped because they exceed ``MAX_MESSAGE`` bytes."""
 
     def receive(self, received: bytes) -> list[bytes]:
-        """Take bytes; return whole messages, without white space around them.
-
-        Of one that was given up nothing is returned.
-        """
+        """Decode bytes; return the completed messages, without white space around them."""
         self._buffer += received
         *pieces, rest = bytes(self._buffer).split(self._terminator)
         if self._too_long and pieces:

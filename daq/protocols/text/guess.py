@@ -1,7 +1,7 @@
-"""Guesses the format of text from a few of its rows, as settings of the bench file.
+"""Guesses the format of text from a few rows, as settings of the bench file.
 
-A guess is what a person would try first: it is shown, not used. Rows of one device have the same
-fields, so only what holds for all rows counts.
+A guess is only shown to the user, not used. Rows of one device have the same fields, so a property
+must hold for all rows.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _TIME_FORMATS = (
     "%Y/%m/%d %H:%M:%S",
 )
 _EPOCHS = (1e9, 4e9)
-"""Seconds since 1970 of the present and some time around it."""
+"""Plausible range of present times, in seconds since 1970."""
 
 
 def guess_settings(rows: Sequence[bytes]) -> dict[str, Any] | None:
-    """Return settings of the text driver that fit rows; None if none do.
+    """Return settings of the text driver that fit rows, or None.
 
     Parameters
     ----------
     rows : sequence of bytes
-        Whole lines without their ends, in the order in which they came.
+        Complete lines without terminators, in order of arrival.
     """
     texts = [row.decode("ascii", "replace").strip() for row in rows]
     texts = [text for text in texts if text]
@@ -103,7 +103,7 @@ def _delimited(texts: Sequence[str]) -> dict[str, Any] | None:
 
 
 def _columns(columns: dict[int, list[str]], delimiter: str) -> dict[str, Any] | None:
-    """Return which columns of rows are channels, and how numbers are written."""
+    """Return the settings for the columns of channels and the format of numbers."""
     settings: dict[str, Any] = {}
     first = columns[0]
     if len(set(first)) == 1 and not _are_numbers(first) and first[0]:
@@ -126,7 +126,7 @@ def _columns(columns: dict[int, list[str]], delimiter: str) -> dict[str, Any] | 
 
 
 def _special(columns: dict[Any, list[str]]) -> dict[str, Any]:
-    """Return the columns of a time and of a counter."""
+    """Return the settings for the columns of a time and of a counter."""
     found: dict[str, Any] = {}
     for key, values in columns.items():
         if "time_column" not in found and (format_ := _time_format(values)):
@@ -137,7 +137,7 @@ def _special(columns: dict[Any, list[str]]) -> dict[str, Any]:
 
 
 def _time_format(values: Sequence[str]) -> str:
-    """Return the format of times, empty if the values are none."""
+    """Return the format of times; empty if the values are no times."""
     for format_ in _TIME_FORMATS:
         if _all(partial(_read_time, format_), values):
             return format_
@@ -157,7 +157,7 @@ def _time_format(values: Sequence[str]) -> str:
 
 
 def _read_time(format_: str, value: str) -> None:
-    datetime.strptime(value, format_)  # noqa: DTZ007 -- whether it can be read
+    datetime.strptime(value, format_)  # noqa: DTZ007 -- only tests the format
 
 
 def _all(read: Callable[[str], object], values: Sequence[str]) -> bool:

@@ -1,8 +1,8 @@
-"""Packets of one channel each, put together by their time, in the order of their times.
+"""Single-channel packets grouped by their time, in order of time.
 
-Datagrams are lost, come twice, and overtake one another. What is next in time goes out as soon as
-it is whole; what leaves a hole before it, or is not whole, waits until ``PATIENCE`` later ones are
-whole: then what is missing was lost on the way.
+Datagrams are lost, repeated and reordered. A group of packets with the same time is yielded as soon
+as it is complete and next in time. A group that is incomplete, or follows a hole, waits until
+``PATIENCE`` later groups are complete: then the missing packets count as lost.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 PATIENCE = 2
 MAX_WAITING = 64
-"""Times of which packets may wait for others."""
+"""Maximum number of waiting groups."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Samples of all channels that one time was stated for: (n_samples, n_channels)."""
+    """Samples of all channels with one time; ``counts`` has shape (n_samples, n_channels)."""
 
     time_ns: int
     counts: NDArray[Any]
@@ -41,7 +41,7 @@ class Group:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Packets of one time."""
+    """An incomplete or early group: packets with one time."""
 
     time_ns: int
     resolution_ns: int
@@ -53,23 +53,23 @@ _TIME = attrgetter("time_ns")
 
 
 class Packets:
-    """Packets that wait for others.
+    """Packets waiting for the others of their group.
 
     Parameters
     ----------
     names : sequence of str
-        Of the channels, in the order of the columns.
+        Names of the channels, in the order of the columns.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
         self._waiting: list[_Waiting] = []  # in order of time
-        self._last: HostTime | None = None  # arrival of the last that went out
+        self._last: HostTime | None = None  # arrival of the last yielded group
 
     def add(
         self, name: str, values: NDArray[Any], time_ns: int, at: HostTime, resolution_ns: int
     ) -> int:
-        """Take a packet; return how many that repeats."""
+        """Add a packet; return 1 if it is a repetition, else 0."""
         index = bisect_left(self._waiting, time_ns, key=_TIME)
         if index < len(self._waiting) and self._waiting[index].time_ns == time_ns:
             one = self._waiting[index]
@@ -82,7 +82,10 @@ class Packets:
         return 0
 
     def ready(self, times: SampleTimes) -> Iterator[Group]:
-        """Yield what can go out; ``times`` is to have placed it before the next is asked for."""
+        """Yield the groups that need not wait.
+
+        The caller must place each group with ``times`` before it requests the next one.
+        """
         while self._waiting:
             first = self._waiting[0]
             in_turn = self._is_whole(first) and not times.missing(first.time_ns)
@@ -93,25 +96,24 @@ class Packets:
                 yield self._group(first)
 
     def dropped(self, at: HostTime) -> list[str]:
-        """Forget what waits too long; say what it was.
+        """Drop groups that wait too long; return a text for each.
 
-        That is where a channel does not come at all, and where a time is wrong, so that its packet
-        is never next while others go on.
+        This happens if a channel never arrives, or if a wrong time is never next.
         """
-        said = []
+        texts = []
         if len(self._waiting) > MAX_WAITING:
             silent = set(self._names) - set(self._waiting.pop(0).packets)
-            said.append(f"packets dropped: nothing comes of {', '.join(sorted(silent))}")
+            texts.append(f"packets dropped: no packets of {', '.join(sorted(silent))}")
         last = self._last
-        if last is not None and last.monotonic_ns == at.monotonic_ns:  # others go on
+        if last is not None and last.monotonic_ns == at.monotonic_ns:  # others still arrive
             stale = [
                 w for w in self._waiting if at.monotonic_ns - w.received.monotonic_ns > LATE_NS
             ]
             for one in stale:
                 self._waiting.remove(one)
                 n_packets = len(one.packets)
-                said.append(f"{n_packets} packets dropped: their time is not that of the others")
-        return said
+                texts.append(f"{n_packets} packets dropped: their time contradicts the others")
+        return texts
 
     def _is_whole(self, one: _Waiting) -> bool:
         return len(one.packets) == len(self._names)

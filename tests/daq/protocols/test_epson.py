@@ -238,7 +238,7 @@ def test_a_stream_that_went_on_unheard_is_taken_on(missing: int, late: float) ->
     one.receive(frames(0, 200) + frames(200, 1)[:11], at(1))
     heard = frames(200 + missing, 4)[5:]
     now = at(1 + (missing + 4) / RATE * 1.0001 + late)
-    assert one.follows(heard, now)
+    assert one.continues(heard, now)
     one.resume()
     found = one.receive(heard, now)
     assert list(samples(found)) == list(range(201 + missing, 204 + missing))
@@ -260,24 +260,24 @@ def test_a_stream_that_went_on_unheard_is_taken_on(missing: int, late: float) ->
 def test_a_stream_that_is_not_that_of_before_is_not_taken_on(heard: bytes, seconds: float) -> None:
     one = decoder()
     one.receive(frames(0, 200), at(1))
-    assert not one.follows(heard, at(seconds))
+    assert not one.continues(heard, at(seconds))
 
 
 def test_nothing_follows_where_nothing_was() -> None:
-    assert not decoder().follows(frames(0, 20), at(1))
+    assert not decoder().continues(frames(0, 20), at(1))
     other = BurstFormat.of("x", "y", "z", "checksum")
     uncounted = BurstDecoder(
         "A", other, fields=("x", "y", "z"), sampling_rate=RATE, full_scale_counts=2**27
     )
     line = commands.encode_bursts(other, x=np.arange(20), y=0, z=0)
     assert uncounted.receive(line, at(0.1))
-    assert not uncounted.follows(line, at(0.2))
+    assert not uncounted.continues(line, at(0.2))
 
 
 @given(st.binary(max_size=300))
 def test_anything_may_be_heard(heard: bytes) -> None:
     one = decoder()
     one.receive(frames(0, 20), at(0.1))
-    one.follows(heard, at(9))
+    one.continues(heard, at(9))
     one.resume()
     assert len(samples(one.receive(bytes(24) + frames(2000, 20), at(10.1)))) == 20

@@ -83,7 +83,7 @@ def test_replies_that_are_not_ours() -> None:
     assert finder.receive(other_unit) is None
     assert finder.receive(short) is None
     assert finder.waiting
-    assert finder.instead == "a reply of unit 2 came, of unit 1 was asked"
+    assert finder.unexpected == "received a reply of unit 2, expected unit 1"
     refusal = finder.receive(rtu.encode_exception(1, 4, 2))
     assert refusal is not None
     assert refusal.exception == 2
@@ -92,19 +92,22 @@ def test_replies_that_are_not_ours() -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        (b"", "nothing came"),
-        (bytes(7), "7 bytes came that are no reply"),
-        (b"\x01\x04\xff" + bytes(30), "33 bytes came that are no reply"),  # a length never filled
+        (b"", "nothing received"),
+        (bytes(7), "received 7 bytes that are no reply"),
+        (
+            b"\x01\x04\xff" + bytes(30),
+            "received 33 bytes that are no reply",
+        ),  # a length never filled
         (
             b"?" + rtu.encode_registers(5, 4, np.arange(4, dtype=np.uint16)),
-            "a reply of unit 5 came, of unit 1 was asked",
+            "received a reply of unit 5, expected unit 1",
         ),
         (
             rtu.encode_registers(1, 4, np.arange(3, dtype=np.uint16)),
-            "a reply with 3 registers came, as many were not asked for",
+            "received a reply with 3 registers, a number not requested",
         ),
-        (rtu.write_request(1, 1, 7812), "a reply to function 6 came, which was not asked for"),
-        (rtu.encode_exception(1, 3, 2), "a reply to function 3 came, which was not asked for"),
+        (rtu.write_request(1, 1, 7812), "received a reply to function 6, which was not requested"),
+        (rtu.encode_exception(1, 3, 2), "received a reply to function 3, which was not requested"),
     ],
 )
 def test_what_came_instead_is_named_and_counted(line: bytes, said: str) -> None:
@@ -125,7 +128,7 @@ def test_any_bytes_on_either_end(data: bytes) -> None:
     finder.expect(rtu.read_request(1, 2, 125))
     finder.receive(data)
     assert len(finder._buffer) <= 255 + 1  # noqa: SLF001 -- memory stays bounded
-    assert isinstance(finder.instead, str)
+    assert isinstance(finder.unexpected, str)
     server = RequestFinder(1)
     server.receive(data)
     assert len(server._buffer) <= rtu.MAX_FRAME  # noqa: SLF001 -- memory stays bounded
@@ -302,7 +305,7 @@ def test_a_fifo_that_was_emptied_gives_no_samples_that_were_none() -> None:
     (event,) = (item for item in found if isinstance(item, Event))
     assert (event.kind, event.text) == (
         "reset",
-        "12 words wait where 24 did: the device was restarted",
+        "12 words in the FIFO, expected 24: the device was restarted",
     )
 
 

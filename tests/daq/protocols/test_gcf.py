@@ -136,8 +136,8 @@ def test_leap_second_has_the_number_of_the_second_before() -> None:
         (14, 0, "compression 0"),
         (15, 255, "samples of"),
         (15, 0, "samples of"),
-        (23 + 8, 99, "differences lead to"),
-        (19, 99, "differences lead to"),
+        (23 + 8, 99, "differences end at"),
+        (19, 99, "differences end at"),
     ],
 )
 def test_damage_is_named(at: int, value: int, said: str) -> None:

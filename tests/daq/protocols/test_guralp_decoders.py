@@ -167,7 +167,7 @@ def test_a_digitizer_that_was_restarted_numbers_anew(due: int) -> None:
     counts, blocks_found, events = joined(found)
     np.testing.assert_array_equal(counts, expected(0, 6000))
     assert not any(block.reason for block in blocks_found)
-    said = f"the digitizer restarted its numbering: block 0, not {due}"
+    said = f"the digitizer restarted: block 0, expected {due}"
     assert [e.text for e in events if e.kind == "reset"] == [said]
 
 
@@ -210,7 +210,7 @@ def test_terminal_text_and_noise_between_frames() -> None:
     assert [e.text for e in events] == [
         "terminal: GURALP DM24 G>",
         "skipped 72 bytes that are no block",
-        "skipped 4 bytes: a block of 65535 bytes announced, at most 1024 fit",
+        "skipped 4 bytes: a block of 65535 bytes; expected at most 1024",
     ]
 
 
@@ -245,8 +245,10 @@ def test_streams_that_are_found_have_all_their_blocks_and_others_are_named() -> 
     for block in sent[: 3 * len(names)]:
         assert list(streams.receive(block, AT, awaiting=True)) == []
     assert streams.repeated
-    found = list(streams.found("A", STREAMS))
-    assert [i.text for i in found if isinstance(i, Event)] == ["stream OTHRZ2 is of no sensor here"]
+    found = list(streams.assign("A", STREAMS))
+    assert [i.text for i in found if isinstance(i, Event)] == [
+        "stream OTHRZ2 belongs to no sensor of this port"
+    ]
     for block in sent[3 * len(names) :]:  # a block that was asked for again
         found += streams.receive(block, AT, awaiting=True)
     blocks = [item for item in found if isinstance(item, Block)]
@@ -470,5 +472,5 @@ def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
         if number == 20_012:
             assert decoder.missing == (20_009,)
     _, _, events = joined(found)
-    said = f"the server restarted its numbering: packet 20000, not {before + 45}"
+    said = f"the server restarted: packet 20000, expected {before + 45}"
     assert [e.text for e in events if e.kind == "reset"] == [said]

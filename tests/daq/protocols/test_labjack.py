@@ -308,7 +308,7 @@ def test_messages_cut_anywhere(step: int) -> None:
 
 @pytest.mark.parametrize("line", [b"GET / HTTP/1.1\r\n", b"\0\0\0\0\xff\xff\1", b"\0\0\0\0\0\1\1"])
 def test_what_is_no_modbus_is_named(line: bytes) -> None:
-    with pytest.raises(RemoteProtocolError, match="no Modbus TCP"):
+    with pytest.raises(RemoteProtocolError, match="not Modbus TCP"):
         AduFinder().receive(line)
 
 

@@ -155,8 +155,8 @@ def test_packets_that_come_twice_and_overtake_one_another() -> None:
     index, rows, events = split(found)
     assert index == list(range(1000))
     assert rows == [[i, 1000 + i, 2000 + i] for i in range(1000)]
-    assert f"({n_again} so far)" in [e.text for e in events if "came again" in e.text][-1]
-    assert any("their time is not that of the others" in e.text for e in events)
+    assert f"({n_again} so far)" in [e.text for e in events if "repeated" in e.text][-1]
+    assert any("their time contradicts the others" in e.text for e in events)
 
 
 def rows_at(times: list[float], arrivals: list[float], rate: float) -> list[Block | Event]:
@@ -419,7 +419,7 @@ def test_memory_stays_bounded() -> None:
     found = [x for _ in range(50) for x in decoder.receive(b"1," * 20_000, at(0))]
     (event,) = found
     assert isinstance(event, Event)
-    assert "16384 bytes without '\\n': given up to the next one (1 so far)" in event.text
+    assert "without the terminator '\\n': dropped (1 so far)" in event.text
     assert len(decoder._finder._buffer) <= text_format.MAX_MESSAGE  # noqa: SLF001 -- the claim
     index, rows, events = split(decoder.receive(b"1\n1,2,3\n", at(0)))
     assert (index, rows, len(events)) == ([1], [[1, 2, 3]], 0)

@@ -240,12 +240,12 @@ async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() 
         await far.arrived(1)  # it is told to begin
         size = configuration.burst.size
         far.send(sent[cut : cut + 5 * size])  # its first frame lacks its start
-        assert ((await reading).n_samples, decoder.begun) == (4, cut)
+        assert ((await reading).n_samples, decoder.n_pending) == (4, cut)
         reading = asyncio.create_task(block())
         far.send(sent[cut + 5 * size : 10 * size])
         async with asyncio.timeout(30):  # the driver loses its own patience sooner
             second = await reading
-        assert (second.first_sample, second.n_samples, decoder.begun) == (4, 5, 0)
+        assert (second.first_sample, second.n_samples, decoder.n_pending) == (4, 5, 0)
 
 
 async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience(
