@@ -1,11 +1,12 @@
 """A service under fire: SIGKILL to it, its recorders and estimates, and a clock that is set.
 
-``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS] [RATE]`` runs a
-simulated bench at RATE (default 20) times real time by a schedule of ten minutes, until so many
+``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS] [RATE] [CALM]`` runs
+a simulated bench at RATE (default 20) times real time by a schedule of ten minutes, until so many
 kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, with so many steps
-of the clock. Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and
-how memory and descriptors of the service went. The clock begins an hour before clocks change in
-Berlin.
+of the clock. One kill of the service in three is a restart by SIGTERM. In the last CALM seconds
+(default 0) the service itself is left alone, so that its memory can be followed. Cables are pulled
+meanwhile. It prints what came of every due run, what is wrong, and how memory and descriptors of
+the service went. The clock begins an hour before clocks change in Berlin.
 """
 
 from __future__ import annotations
@@ -85,7 +86,8 @@ class Soak:
         self.clock = FastClock.create(folder / "clock", shows=BEGIN, rate=rate)
         self.rng = np.random.default_rng(seed)
         self.kills: Counter[str] = Counter()
-        self.usage: list[tuple[float, float, float]] = []
+        self.usage: list[tuple[float, ...]] = []
+        self._n_started = 0
         self._log = (folder / "service.log").open("ab")
         self._service: subprocess.Popen[bytes] | None = None
         self._since = 0.0
@@ -98,18 +100,22 @@ class Soak:
                 [*command, str(self.bench), str(self.folder / "clock")], stderr=self._log
             )
             self._since = time.monotonic()
+            self._n_started += 1
 
-    def kill(self) -> None:
+    def kill(self, *, spare_service: bool = False) -> None:
         """Kill one of the processes, of a kind that is drawn by lot."""
         found = {kind: pids for kind, pids in processes(self.folder).items() if pids}
-        if "service" in found and (not self._has_planned() or self.rng.random() < 0.5):
+        if "service" in found and (
+            spare_service or not self._has_planned() or self.rng.random() < 0.5
+        ):
             del found["service"]  # most kills would strike a service that only starts
         if not found:
             return
         kind = str(self.rng.choice(sorted(found)))
+        is_restart = kind == "service" and self.rng.random() < 1 / 3
         with suppress(ProcessLookupError):
-            os.kill(found[kind][0], signal.SIGKILL)
-            self.kills[kind] += 1
+            os.kill(found[kind][0], signal.SIGTERM if is_restart else signal.SIGKILL)
+            self.kills["restart" if is_restart else kind] += 1
         if kind == "service" and self._service is not None:
             self._service.wait()
 
@@ -121,15 +127,18 @@ class Soak:
         return False
 
     def measure(self) -> None:
-        """Note memory (MB) and descriptors of the service, once it has warmed up."""
-        pid = self._service.pid if self._service is not None else 0
+        """Note memory (MB) and descriptors of the service every ten seconds, once it is warm."""
+        now, last = time.monotonic(), self.usage[-1][0] if self.usage else 0.0
+        if self._service is None or min(now - self._since - 50.0, now - last) < 10.0:
+            return
+        pid = self._service.pid
         with suppress(OSError, AttributeError):
             status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
             memory = int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1e3  # type: ignore[index]
             n_open = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-            last = self.usage[-1][0] if self.usage else 0.0
-            if min(time.monotonic() - self._since - 50.0, time.monotonic() - last) > 10.0:
-                self.usage.append((time.monotonic(), memory, n_open))
+            found = processes(self.folder)
+            has = [float(bool(found[kind])) for kind in ("recorder", "estimate")]
+            self.usage.append((now, memory, n_open, self._n_started, *has, os.getloadavg()[0]))
 
     def finish(self) -> None:
         """Let what is unfinished end, then stop the service."""
@@ -177,14 +186,27 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
 
 
-def slope(usage: list[tuple[float, float, float]], column: int) -> str:
-    """Return the trend per hour with its standard error, of values ten seconds apart."""
-    if len(usage) < 10:
-        return "too short"
+def slope(usage: list[tuple[float, ...]], column: int) -> str:
+    """Return the trend per hour within processes, with its standard error.
+
+    Each process has a level of its own; a recorder and an estimate that run have theirs. The error
+    allows for residuals that are correlated over five minutes (Newey and West 1987).
+    """
     values = np.array(usage)
+    if len(values) < 60:
+        return "too short"
     t, y = (values[:, 0] - values[0, 0]) / 3600, values[:, column]
-    (gradient, _), covariance = np.polyfit(t, y, 1, cov=True)
-    return f"{gradient:+.2f} ± {np.sqrt(covariance[0, 0]):.2f} an hour, mean {y.mean():.1f}"
+    levels = values[:, 3:4] == np.unique(values[:, 3])
+    matrix = np.column_stack([t, levels, values[:, 4:6]])
+    inverse = np.linalg.pinv(matrix.T @ matrix)
+    scores = matrix * (y - matrix @ (inverse @ matrix.T @ y))[:, None]
+    middle = scores.T @ scores
+    for lag in range(1, 31):
+        product = scores[lag:].T @ scores[:-lag]
+        middle += (1 - lag / 31) * (product + product.T)
+    gradient = (inverse @ matrix.T @ y)[0]
+    error = np.sqrt((inverse @ middle @ inverse)[0, 0])
+    return f"{gradient:+.2f} ± {error:.2f} an hour, {y.min():.0f} to {y.max():.0f}"
 
 
 def main() -> int:
@@ -194,6 +216,7 @@ def main() -> int:
     interval = float(sys.argv[3]) if len(sys.argv) > 3 else 4.0
     n_steps = int(sys.argv[4]) if len(sys.argv) > 4 else 0
     rate = float(sys.argv[5]) if len(sys.argv) > 5 else RATE
+    calm = float(sys.argv[6]) if len(sys.argv) > 6 else 0.0
     text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory(prefix="huddle-soak-") as name:
         folder = Path(name)
@@ -214,7 +237,7 @@ def main() -> int:
                 soak.keep_alive()
                 soak.measure()
                 if n_kills and time.monotonic() > next_kill:
-                    soak.kill()
+                    soak.kill(spare_service=time.monotonic() > begin + seconds - calm)
                     next_kill = time.monotonic() + float(soak.rng.exponential(interval))
                 if steps and time.monotonic() > steps[0]:
                     steps.pop(0)
@@ -229,6 +252,9 @@ def main() -> int:
         print("of several parts", sum(len(run.parts) > 1 for run in runs))
         print("reasons", Counter(re.sub(r"\d+", "N", run.reason)[:100] for run in runs))
         print("memory in MB", slope(soak.usage, 1), "; descriptors", slope(soak.usage, 2))
+        if soak.usage:
+            load = np.array(soak.usage)[:, 6]
+            print(f"load of the computer {load.mean():.1f}, at most {load.max():.1f}")
         print(
             "log",
             Counter(
