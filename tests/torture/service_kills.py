@@ -1,16 +1,18 @@
-"""A service under fire: SIGKILL to it, its recorders and estimates, and a clock that is set.
+"""A service under fire: SIGKILL to it and to all it starts, and a clock that is set.
 
 ``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS] [RATE] [CALM]`` runs
 a simulated bench at RATE (default 20) times real time by a schedule of ten minutes, until so many
 kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, with so many steps
 of the clock. One kill of the service in three is a restart by SIGTERM. In the last CALM seconds
-(default 0) the service itself is left alone, so that its memory can be followed. Cables are pulled
-meanwhile. It prints what came of every due run, what is wrong, and how memory and descriptors of
+(default 0) the service itself is left alone, so that its memory can be followed. One kill in five
+strikes a ``huddle repair`` or ``huddle report`` that someone starts on a recording of the service.
+Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and descriptors of
 the service went. The clock begins an hour before clocks change in Berlin.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -33,6 +35,8 @@ from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
 from daq.drivers.bench_file import load, parse
 from daq.errors import HuddleError
+from daq.python_process import python_command
+from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.storage.journal import journal_path
 from tests.torture.service_program import FastClock
@@ -49,6 +53,7 @@ ENTRY = ScheduledRun(
     name="ten", cron="*/10 * * * *", time_zone="Europe/Berlin", duration=240.0, when_busy="queue"
 )
 KINDS = {"service": "service_program", "recorder": "tui record", "estimate": "processes.finish"}
+COMMANDS = ("repair", "report")
 
 
 def with_pulled_cables(bench: Bench) -> Bench:
@@ -104,6 +109,11 @@ class Soak:
 
     def kill(self, *, spare_service: bool = False) -> None:
         """Kill one of the processes, of a kind that is drawn by lot."""
+        if self.rng.random() < 0.2 and (recordings := sorted(self.folder.glob("*/*.h5"))):
+            command = str(self.rng.choice(COMMANDS))
+            path = recordings[int(self.rng.integers(len(recordings)))]
+            self._kill_command(command, path, float(self.rng.uniform(0.3, 4.0)))
+            return
         found = {kind: pids for kind, pids in processes(self.folder).items() if pids}
         if "service" in found and (
             spare_service or not self._has_planned() or self.rng.random() < 0.5
@@ -118,6 +128,19 @@ class Soak:
             self.kills["restart" if is_restart else kind] += 1
         if kind == "service" and self._service is not None:
             self._service.wait()
+
+    def _kill_command(self, command: str, path: Path, seconds: float) -> None:
+        """Start a command on a recording, and kill it after this time unless it has ended."""
+        with subprocess.Popen(
+            python_command("tui", command, str(path)),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        ) as process:
+            try:
+                process.wait(seconds)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                self.kills[command] += 1
 
     def _has_planned(self) -> bool:
         """Whether the service knows what is due next: all that was due before is accounted for."""
@@ -182,8 +205,28 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
             continue
         if not (report.intact and report.closed) or journal_path(path).exists():
             found.append(f"{part}: not intact and closed")
+    for run in runs:
+        if run.state is RunState.DONE and run.removed is None:
+            last = bench.recording_directory / run.parts[-1]
+            found += _unfinished_results(last)
     there = {path.name for path in bench.recording_directory.glob("*.h5")}
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
+
+
+def _unfinished_results(recording: Path) -> list[str]:
+    """Return which results of a run that is done are not there or cut in the middle."""
+    found = []
+    with Recording.open(recording) as opened:
+        if not opened.result_attributes():
+            found.append(f"{recording.name}: no results")
+    try:
+        json.loads(recording.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        found.append(f"{recording.name}: JSON: {error}")
+    report = recording.with_suffix(".html")
+    if not (report.exists() and report.read_bytes().rstrip().endswith(b"</html>")):
+        found.append(f"{recording.name}: no whole report")
+    return found
 
 
 def slope(usage: list[tuple[float, ...]], column: int) -> str:
@@ -224,6 +267,7 @@ def main() -> int:
             changes = {
                 "schedule": Schedule(runs=(ENTRY,)),
                 "storage": Storage(keep_runs=40, min_free=10**7),
+                "recording": reachable.recording.model_copy(update={"report": "html"}),
             }
             bench = reachable.model_copy(update=changes)
             (folder / "bench.toml").write_text(dump(bench), encoding="utf-8")
