@@ -6,8 +6,8 @@ kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, 
 of the clock. One kill of the service in three is a restart by SIGTERM. In the last CALM seconds
 (default 0) the service itself is left alone, so that its memory can be followed. One kill in five
 strikes a ``huddle repair`` or ``huddle report`` that someone starts on a recording of the service.
-Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and descriptors of
-the service went. The clock begins an hour before clocks change in Berlin.
+Cables are pulled meanwhile. It prints what came of every due run, what is wrong, and how memory and
+descriptors of the service went. The clock begins an hour before clocks change in Berlin.
 """
 
 from __future__ import annotations
@@ -297,8 +297,8 @@ def main() -> int:
         print("reasons", Counter(re.sub(r"\d+", "N", run.reason)[:100] for run in runs))
         print("memory in MB", slope(soak.usage, 1), "; descriptors", slope(soak.usage, 2))
         if soak.usage:
-            load = np.array(soak.usage)[:, 6]
-            print(f"load of the computer {load.mean():.1f}, at most {load.max():.1f}")
+            loads = np.array(soak.usage)[:, 6]
+            print(f"load of the computer {loads.mean():.1f}, at most {loads.max():.1f}")
         print(
             "log",
             Counter(
