@@ -1,7 +1,7 @@
 """A service under fire: SIGKILL to it and to all it starts, and a clock that is set.
 
 ``python -m tests.torture.service_kills [KILLS] [SECONDS] [INTERVAL] [STEPS] [RATE] [CALM]`` runs
-a simulated bench at RATE (default 20) times real time by a schedule of ten minutes, until so many
+a simulated bench at RATE (default 20) times real time by a schedule of 20 minutes, until so many
 kills (default 300; one in INTERVAL seconds, default 4) or seconds have passed, with so many steps
 of the clock. One kill of the service in three is a restart by SIGTERM. In the last CALM seconds
 (default 0) the service itself is left alone, so that its memory can be followed. One kill in five
@@ -46,11 +46,12 @@ from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
+    from tui.service.records.run_state import Run
 
 RATE = 20.0
 BEGIN = datetime(2026, 10, 24, 23, 55, tzinfo=UTC)  # an hour and five minutes before clocks change
 ENTRY = ScheduledRun(
-    name="ten", cron="*/10 * * * *", time_zone="Europe/Berlin", duration=240.0, when_busy="queue"
+    name="soak", cron="*/20 * * * *", time_zone="Europe/Berlin", duration=480.0, when_busy="queue"
 )
 KINDS = {"service": "service_program", "recorder": "tui record", "estimate": "processes.finish"}
 COMMANDS = ("repair", "report")
@@ -163,15 +164,14 @@ class Soak:
             has = [float(bool(found[kind])) for kind in ("recorder", "estimate")]
             self.usage.append((now, memory, n_open, self._n_started, *has, os.getloadavg()[0]))
 
-    def finish(self) -> None:
-        """Let what is unfinished end, then stop the service."""
+    def finish(self, until: datetime) -> None:
+        """Let runs that were due before an instant end, then stop the service."""
         store = RunStore(load(self.bench).recording_directory)
-        deadline = time.monotonic() + 180
+        deadline = time.monotonic() + 300
         while time.monotonic() < deadline:
             self.keep_alive()
             with suppress(HuddleError):
-                unfinished = store.runs(None, RunState.RECORDING, RunState.ESTIMATING)
-                if self._has_planned() and not unfinished:
+                if self._has_planned() and not [r for r in store.runs() if _is_left(r, until)]:
                     break
             time.sleep(0.5)
         if self._service is not None:
@@ -180,23 +180,24 @@ class Soak:
         self._log.close()
 
 
+def _is_left(run: Run, until: datetime) -> bool:
+    return run.due < until and not run.is_over
+
+
 def faults(bench_path: Path, until: datetime) -> list[str]:
     """Return what is wrong with the runs and recordings of a service."""
     bench = load(bench_path)
     store = RunStore(bench.recording_directory)
     runs = store.runs()
-    found = [
-        f"{run.name}: left {run.state}"
-        for run in runs
-        if not run.is_over and run.state is not RunState.DUE
-    ]
+    found = [f"{run.name}: left {run.state}" for run in runs if _is_left(run, until)]
     known = {run.due.timestamp() for run in runs}
     # What is due before a service has planned anything, nobody knows of.
     begin = min((run.due for run in runs), default=BEGIN) - timedelta(seconds=1)
     due = takewhile(lambda at: at < until, due_times(ENTRY, begin))
     found += [f"{at:%d %H:%M %Z}: no row" for at in due if at.timestamp() not in known]
-    kept = {part for run in runs if run.removed is None for part in run.parts}
-    for part in sorted(kept):
+    parts = [(part, run) for run in runs if run.removed is None for part in run.parts]
+    kept = {part for part, _ in parts}
+    for part in sorted({part for part, run in parts if run.is_over}):
         path = bench.recording_directory / part
         try:
             report = verify(path)
@@ -288,7 +289,7 @@ def main() -> int:
                     soak.clock.set_by(float(soak.rng.choice([-1500.0, -40.0, 90.0, 1800.0])))
                 time.sleep(0.1)
             until = soak.clock.now() - timedelta(minutes=2)
-            soak.finish()
+            soak.finish(until)
         runs = RunStore(load(folder / "bench.toml").recording_directory).runs()
         wrong = faults(folder / "bench.toml", until)
         print(f"{time.monotonic() - begin:.0f} s, kills {dict(soak.kills)}, {n_steps} clock steps")

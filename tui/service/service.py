@@ -296,6 +296,7 @@ class Service:
             _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
             await self._clock.sleep(RETRY * 2**run.attempts, self.stop)
             return run.because(str(error))
+        run = replace(run, parts=outcome.parts or run.parts)
         for note in outcome.notes:
             run = run.because(note)
         if outcome.error:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
+from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import Run, RunState
 
 if TYPE_CHECKING:
@@ -192,7 +193,8 @@ class Window:
         if run.target_cov is None or STOPPED in run.reason:
             return False
         try:
-            with Recording.open(self._folder / run.parts[-1]) as recording:
+            last = with_continuations([self._folder / run.parts[-1]])[-1]
+            with Recording.open(last) as recording:
                 return recording.closed
         except (HuddleError, OSError):
             return False

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ from tui.output.json_document import document
 from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
+from tui.service.records.parts import with_continuations
 from tui.service.records.run_state import BandNoise
 
 if TYPE_CHECKING:
@@ -71,12 +72,16 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of it: an error, or a verdict (empty without limits), and what is to be known."""
+    """What came of it: an error, or a verdict (empty without limits), and what is to be known.
+
+    ``parts`` are the file names of the request, with those in which its recorders went on.
+    """
 
     verdict: str = ""
     notes: tuple[str, ...] = ()
     noise: tuple[BandNoise, ...] = ()
     error: str = ""
+    parts: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, text: str) -> Outcome:
@@ -92,7 +97,8 @@ class Outcome:
             noise = tuple(
                 BandNoise.of(*(each[name] for name in _NOISE)) for each in found.pop("noise")
             )
-            return cls(noise=noise, notes=tuple(found.pop("notes")), **found)
+            notes, parts = tuple(found.pop("notes")), tuple(found.pop("parts"))
+            return cls(noise=noise, notes=notes, parts=parts, **found)
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"no outcome: {error}") from None
 
@@ -106,13 +112,16 @@ def options_table(wanted: Mapping[str, object]) -> dict[str, Any]:
 
 
 def finish(request: Request) -> Outcome:
-    """Repair, estimate, store, report.
+    """Repair, estimate, store, report; also the files in which recorders went on."""
+    parts = with_continuations(map(Path, request.parts))
+    try:
+        outcome = _finished(replace(request, parts=[str(part) for part in parts]))
+    except (HuddleError, EstimatorError, OSError) as error:
+        outcome = Outcome(error=str(error) or type(error).__name__)
+    return replace(outcome, parts=tuple(part.name for part in parts))
 
-    Raises
-    ------
-    HuddleError, EstimatorError
-        If there is no result.
-    """
+
+def _finished(request: Request) -> Outcome:
     paths, notes = _repaired([Path(part) for part in request.parts])
     table = EstimateTable.model_validate(request.options)
     names = table_keys()
@@ -217,11 +226,7 @@ def main() -> None:
     configure(style=LogFormat.JSON)
     found = json.loads(sys.argv[1])
     request = Request(**found | {"bands": tuple((low, high) for low, high in found["bands"])})
-    try:
-        outcome = finish(request)
-    except (HuddleError, EstimatorError, OSError) as error:
-        outcome = Outcome(error=str(error) or type(error).__name__)
-    sys.stdout.write(json.dumps(finite(asdict(outcome))))
+    sys.stdout.write(json.dumps(finite(asdict(finish(request)))))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from tui.runs.child_log import ChildLog
 from tui.runs.recorder_process import RecorderFailedError, RecorderProcess
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.locks import Lock, is_held, kill_holder
+from tui.service.records.parts import with_continuations
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -273,7 +274,7 @@ class _FoundRecorder:
 
     def failure(self) -> str:
         try:
-            with Recording.open(self._out) as recording:
+            with Recording.open(with_continuations([self._out])[-1]) as recording:
                 closed = recording.closed
         except (HuddleError, OSError) as error:
             return str(error)

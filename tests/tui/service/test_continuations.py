@@ -1,0 +1,74 @@
+"""Runs whose recorder went on in another file because the disk refused the first one."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.host_clock import SystemClock
+from daq.protocols.block import Block, HostTime
+from daq.recording.reader import Recording
+from tests.tui.example_snapshot import growing
+from tests.tui.service.bench_files import Place
+from tui.commands.runs import pin_runs, verify_recordings
+from tui.service.processes.finish import Request, finish
+from tui.service.records.run_state import RunState
+from tui.service.records.storage import remove
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RATE = 200  # of the demo
+
+
+def record(path: Path, seconds: int, continues: str = "", *, closed: bool = True) -> str:
+    """Write a recording of the demo's bench; return its run_id."""
+    rng = np.random.default_rng(3)
+    begun = SystemClock().now()
+    with growing(path, continues=continues) as writer:
+        for second in range(seconds):
+            ns = (second + 1) * 10**9
+            at = HostTime(begun.monotonic_ns + ns, begun.utc_ns + ns)
+            for sensor in "ABC":
+                counts = rng.integers(-999, 999, (RATE, 3)).astype(np.int32)
+                writer.append(Block(sensor, second * RATE, counts, at))
+        writer.commit()
+        if closed:
+            writer.close()
+    with Recording.open(path) as recording:
+        return recording.run_id
+
+
+def recorded(folder: Path) -> list[str]:
+    """Write a recording, two files that continue it, and another of such a name."""
+    first = record(folder / "r.h5", 12, closed=False)
+    second = record(folder / "r-2.h5", 8, first)
+    record(folder / "r-3.h5", 1, second, closed=False)
+    record(folder / "r-4.h5", 1)
+    return ["r.h5", "r-2.h5", "r-3.h5"]
+
+
+@pytest.mark.virtual_time
+async def test_files_that_continue_a_recording_belong_to_its_run(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    folder = place.bench.recording_directory
+    names = recorded(folder)
+    outcome = finish(Request([str(folder / "r.h5")], {"segment": "2s"}))
+    assert (outcome.error, list(outcome.parts)) == ("", names)
+    assert outcome.notes == ("r-3.h5: shorter than one segment, and left out",)
+    result = json.loads((folder / "r-2.json").read_text(encoding="utf-8"))
+    assert result["segments"] == 11 + 7
+    place.steps.outcomes = [outcome]
+    await place.serve(1.5 * 3600.0)
+    run = place.store.runs()[0]
+    assert (run.state, list(run.parts)) == (RunState.DONE, names)
+    pin_runs(folder, ["r-2.h5"], pinned=True)
+    assert place.store.runs()[0].pinned
+    verify_recordings([folder], json=str(tmp_path / "verified.json"))
+    verified = json.loads((tmp_path / "verified.json").read_text(encoding="utf-8"))
+    assert [each["intact"] for each in verified["recordings"]] == [True] * len(names)
+    remove(run, folder)
+    assert [path.name for path in folder.glob("r*.*")] == ["r-4.h5"]
