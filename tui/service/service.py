@@ -223,7 +223,7 @@ class Service:
         return end is not None and end > moment
 
     async def _record_windows(self) -> None:
-        while True:
+        while not self.stop.is_set():
             run = await self._windows.get()
             if self.stop.is_set():
                 return

@@ -58,6 +58,14 @@ async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_res
     assert [path.rpartition("/")[2] for path in request.parts] == list(run.parts)
 
 
+async def test_a_stop_in_the_last_second_of_a_window_ends_the_service(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    async with asyncio.timeout(2 * HOUR):
+        await place.serve(HOUR + 569)  # 13:09:59
+    (run,) = place.store.unfinished("lab")
+    assert (run.state, run.reason) == (RunState.ESTIMATING, "")
+
+
 async def test_a_killed_service_finds_its_recorder_again(tmp_path: Path) -> None:
     place = Place(tmp_path)
     await place.serve(HOUR + 170, killed=True)
