@@ -71,4 +71,4 @@ async def test_files_that_continue_a_recording_belong_to_its_run(tmp_path: Path)
     verified = json.loads((tmp_path / "verified.json").read_text(encoding="utf-8"))
     assert [each["intact"] for each in verified["recordings"]] == [True] * len(names)
     remove(run, folder)
-    assert [path.name for path in folder.glob("r*.*")] == ["r-4.h5"]
+    assert [path.name for path in folder.glob("r*.[hj]*")] == ["r-4.h5"]
