@@ -28,7 +28,7 @@ from daq.results.band_summary import correlation_of
 from daq.results.sources import sources
 from estimator.self_noise.band_means import band_means, log_edges
 from tui.application.app import HuddleApp
-from tui.commands.tui import RecordingControls
+from tui.commands.tui_controls import RecordingControls
 from tui.report.contents import report_of
 from tui.report.paper import write_paper
 

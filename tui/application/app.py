@@ -12,15 +12,17 @@ from textual.binding import Binding, BindingType
 
 from tui.application.dialogs import MarkScreen, StopScreen
 from tui.application.following import FollowingApp
+from tui.application.forms.start import StartForm
 from tui.application.messages import RecordingOpened
 from tui.application.plan import TestPlan
 from tui.application.reference import can_open
-from tui.application.start_form import StartForm
 from tui.application.state import TITLES, VIEWS
 from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from textual.driver import Driver
 
     from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
@@ -43,6 +45,8 @@ class HuddleApp(FollowingApp):
         Whether to start a recording when the application opens.
     models : tuple of Mask
         Noise models to show beside the curves; in a unit of motion.
+    driver : type, optional
+        Of the terminal; Textual's own, if not given.
     """
 
     CSS_PATH = "huddle.tcss"
@@ -64,8 +68,9 @@ class HuddleApp(FollowingApp):
         path: Path | None = None,
         start: bool = False,
         models: tuple[Mask, ...] = (),
+        driver: type[Driver] | None = None,
     ) -> None:
-        super().__init__(controls, models)
+        super().__init__(controls, models, driver)
         self._given = path
         self._start_at_once = start
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
+    from textual.driver import Driver
     from textual.filter import LineFilter
     from textual.screen import Screen
 
@@ -69,8 +70,13 @@ class FollowingApp(App[None]):
 
     state: var[State] = var(partial(State, ""), always_update=True)
 
-    def __init__(self, controls: Controls, models: tuple[Mask, ...] = ()) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        controls: Controls,
+        models: tuple[Mask, ...] = (),
+        driver: type[Driver] | None = None,
+    ) -> None:
+        super().__init__(driver)
         self._models = models
         self._controls = controls
         self._ended = threading.Event()

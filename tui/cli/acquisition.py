@@ -41,6 +41,15 @@ def tui(
             " HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and HUDDLE_RECORDING.",
         ),
     ] = "",
+    baud: Annotated[
+        int | None,
+        typer.Option(
+            "--baud",
+            min=1200,
+            help="Rate of the line to the terminal: what changed is sent no faster"
+            " (default: that of a serial port, else unlimited).",
+        ),
+    ] = None,
     models: ModelsOption = "",
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -58,7 +67,7 @@ def tui(
         )
     from tui.commands.tui import open_application
 
-    open_application(source, on_event=on_event, models=models, **wanted)
+    open_application(source, on_event=on_event, models=models, baud=baud, **wanted)
 
 
 @examples(

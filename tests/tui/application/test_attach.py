@@ -18,7 +18,7 @@ from daq.recording.reader import Recording
 from tests.tui.application.screen_text import screen_text
 from tests.waiting import limit
 from tui.application.app import HuddleApp
-from tui.commands.tui import BenchControls
+from tui.commands.tui_controls import BenchControls
 from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:

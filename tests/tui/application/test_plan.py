@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from textual.events import Key
 
 from daq.bench.model import Limit
 from daq.errors import HuddleError
@@ -26,7 +27,7 @@ from tests.tui.example_snapshot import (
 from tui.application.app import HuddleApp
 from tui.application.messages import RecordingOpened, StatusUpdated
 from tui.application.plan import TestPlan, end_text, is_surely_decided, parse_end
-from tui.commands.tui import announce
+from tui.commands.tui_controls import announce
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,7 +63,11 @@ def test_what_is_no_end_is_refused_with_what_was_expected(text: str) -> None:
 async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
-        await pilot.press("s", *"ann", "tab", *"hot", "tab")
+        await pilot.press("s")
+        await shown(pilot, app)
+        for key in (*"ann", "tab", *"hot", "tab"):  # in one burst, as from a serial line
+            app.post_message(Key(key, "\t" if key == "tab" else key))
+        await shown(pilot, app)
         entry = app.screen.query_one("#end")
         entry.value = "decided"  # type: ignore[attr-defined]
         await pilot.press("enter")

@@ -19,7 +19,7 @@ from tui.application.app import HuddleApp
 from tui.application.messages import ReferenceReady
 from tui.application.reference import reference_of
 from tui.application.state import RECORDINGS, RESULT, Reference
-from tui.commands.tui import save_result
+from tui.commands.tui_controls import save_result
 from tui.output.results import curves_csv
 from tui.simulation.write_recording import simulate_recording
 

@@ -26,7 +26,7 @@ from daq.estimation.settings import Settings
 from daq.results.sources import sources
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tui.cli.main import app
-from tui.commands.tui import BenchControls
+from tui.commands.tui_controls import BenchControls
 from tui.report.contents import report_of
 from tui.report.figures.drift import without_line
 from tui.report.paper import write_paper

@@ -12,6 +12,7 @@ from textual.binding import Binding, BindingType
 from textual.widgets import DataTable, Input, Static
 
 from tui.application.dialogs import QuestionScreen
+from tui.application.forms.estimate import SettingsForm
 from tui.application.messages import (
     CatalogueRead,
     DeletionRequested,
@@ -19,7 +20,6 @@ from tui.application.messages import (
     ReferenceRequested,
 )
 from tui.application.recordings_view.rows import COLUMNS, about, matches, row, size
-from tui.application.settings_form import SettingsForm
 from tui.application.state import RECORDINGS, RESULT, TEST
 from tui.application.view import MUTED, View
 from tui.runs.catalogue import catalogue

@@ -9,9 +9,9 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
+from tui.application.forms.estimate import SettingsForm
 from tui.application.messages import OpeningRequested, ReferenceRequested
 from tui.application.result_view.result_text import result
-from tui.application.settings_form import SettingsForm
 from tui.application.state import RESULT
 from tui.application.view import MUTED, View
 

@@ -1,0 +1,1 @@
+"""Forms over a view, checked while they are typed."""

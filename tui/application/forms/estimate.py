@@ -1,0 +1,60 @@
+"""A form for the settings of an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from daq.bench.estimate_settings import OPTIONS, from_text
+from tui.application.forms.form import Field, Form
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+
+FIELDS = ("methods", "segment", "overlap", "window", "detrend", "clocks", "band", "unit")
+
+
+class SettingsForm(Form[Mapping[str, object]]):
+    """Asks for settings; returns those that were changed, None if it was left.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording.
+    settings : Settings, optional
+        What is shown in the empty fields; without it, that they are those of the bench.
+    """
+
+    def __init__(self, name: str, settings: Settings | None) -> None:
+        fields = [
+            Field(field, OPTIONS[field].key or field, placeholder=_placeholder(field, settings))
+            for field in FIELDS
+        ]
+        super().__init__(f"estimate {name} again", fields, does="estimates")
+
+    def hint(self, name: str) -> str:
+        """Return what a setting does."""
+        return OPTIONS[name].help
+
+    def problem(self, name: str) -> str:
+        """Return what is wrong with a value; empty if nothing is, or if there is none."""
+        text = self.value(name)
+        try:
+            if text:
+                from_text(name, text)
+        except ValueError as error:
+            return f"{text}: {error}"
+        return ""
+
+    def submit(self) -> None:
+        """Estimate with what was given."""
+        given = {name: text for name in FIELDS if (text := self.value(name))}
+        self.dismiss({name: from_text(name, text) for name, text in given.items()})
+
+
+def _placeholder(field: str, settings: Settings | None) -> str:
+    if settings is None:
+        return "as the bench file says"
+    value = getattr(settings, field)
+    text = "" if value is None else OPTIONS[field].text(value)
+    return text if isinstance(text, str) else ", ".join(text)

@@ -1,0 +1,127 @@
+"""What all forms share: a line for each field, and below what the field means, or what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+
+from textual import on
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, VerticalScroll
+from textual.screen import ModalScreen
+from textual.widgets import Input, Label, Static
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from textual.app import ComposeResult
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One line of a form.
+
+    Attributes
+    ----------
+    name : str
+        Its id.
+    title, value, placeholder : str
+    """
+
+    name: str
+    title: str
+    value: str = ""
+    placeholder: str = ""
+
+
+class Form(ModalScreen[Result | None], Generic[Result]):
+    """Asks for some values; None if it was left.
+
+    Parameters
+    ----------
+    title : str
+    fields : sequence of Field
+    does : str
+        What enter does.
+    """
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,ctrl+c", "leave", "Cancel"),
+        # With priority: of keys typed in one burst, those behind it are for the next field.
+        Binding("tab", "app.focus_next", "Next", show=False, priority=True),
+        Binding("shift+tab", "app.focus_previous", "Previous", show=False, priority=True),
+    ]
+
+    def __init__(self, title: str, fields: Sequence[Field], *, does: str) -> None:
+        super().__init__()
+        self._title, self._fields, self._does = title, fields, does
+
+    def compose(self) -> ComposeResult:
+        """Lay out a line for each field."""
+        with VerticalScroll(classes="form") as form:
+            for field in self._fields:
+                with Horizontal():
+                    yield Label(field.title)
+                    yield Input(
+                        field.value,
+                        id=field.name,
+                        placeholder=field.placeholder,
+                        compact=True,
+                        max_length=200,
+                    )
+            yield Static(id="hint")
+        form.border_title = self._title
+        form.border_subtitle = f"tab next · enter {self._does} · esc goes back"
+        form.can_focus = False
+
+    def problem(self, name: str) -> str:
+        """Return what is wrong with a field; empty if nothing is."""
+        raise NotImplementedError
+
+    def hint(self, name: str) -> str:
+        """Return what a field means."""
+        raise NotImplementedError
+
+    def submit(self) -> None:
+        """Use the values: nothing is wrong with any."""
+        raise NotImplementedError
+
+    def value(self, name: str) -> str:
+        """Return what has been typed into a field."""
+        return self.query_one(f"#{name}", Input).value.strip()
+
+    def explain(self, name: str) -> None:
+        """Say what a field means, or what is wrong with it."""
+        problem = self.problem(name)
+        self.query_one(f"#{name}", Input).set_class(bool(problem), "-wrong")
+        self.tell(problem or self.hint(name), is_wrong=bool(problem))
+
+    def tell(self, text: str, *, is_wrong: bool = False) -> None:
+        """Write a line below the fields."""
+        hint = self.query_one("#hint", Static)
+        hint.set_class(is_wrong, "-wrong")
+        hint.update(text)
+
+    @on(Input.Changed)
+    def _on_change(self, event: Input.Changed) -> None:
+        self.explain(str(event.input.id))
+
+    def on_descendant_focus(self) -> None:
+        """Explain the field at the cursor."""
+        if isinstance(self.focused, Input):
+            self.explain(str(self.focused.id))
+
+    @on(Input.Submitted)
+    def _on_submit(self) -> None:
+        for field in self._fields:
+            if self.problem(field.name):
+                self.query_one(f"#{field.name}", Input).focus()
+                self.explain(field.name)
+                return
+        self.submit()
+
+    def action_leave(self) -> None:
+        """Change nothing."""
+        self.dismiss(None)

@@ -1,0 +1,1 @@
+"""Terminals that can do less: slow lines, and those without Unicode."""

@@ -1,0 +1,305 @@
+"""What the application asks of a bench, and of a recording: start, stop, read, write, announce."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shlex
+import subprocess
+import threading
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from daq.acquisition.before_test.preview import preview
+from daq.errors import HuddleError
+from daq.host_clock import SystemClock
+from daq.recording.control import ask
+from daq.recording.reader import Recording
+from daq.recording.storage.names import recording_path
+from daq.results.sources import sources
+from daq.results.store import store_results
+from tui.output.console import write_json
+from tui.output.extras import require
+from tui.output.json_document import document
+from tui.output.results import curves_csv
+from tui.runs.estimate_settings import settings_for
+from tui.runs.find_running import running_recording
+from tui.runs.recorder_process import RecorderProcess
+from tui.simulation.host_time import host_time
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from daq.acquisition.before_test.preview import SensorPreview
+    from daq.bench.model import Bench
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from daq.results.decision.verdict import TestVerdict
+    from tui.application.controls import Preview
+    from tui.application.plan import TestPlan
+
+ALWAYS = ("three-sensor", "three-channel")
+"""Cheap methods, shown for comparison with the chosen ones."""
+HOOK_TIMEOUT = 60.0
+"""Seconds after which a command for events is ended."""
+
+
+@dataclass
+class BenchControls:
+    """Controls of a bench file, which start recorder processes."""
+
+    path: Path
+    bench: Bench
+    settings: Settings
+    can_start: bool = True
+    reports: Path | None = None
+    """Folder of reports; None: beside their recordings."""
+    on_event: str = ""
+    """Command for the end of a test, and for trouble."""
+    started: list[RecorderProcess] = field(default_factory=list)
+    ports: threading.Lock = field(default_factory=threading.Lock)
+    """Held by who reads the sensors."""
+
+    @property
+    def name(self) -> str:
+        """The bench's name."""
+        return self.bench.name
+
+    @property
+    def folder(self) -> Path:
+        """Where the bench file wants recordings."""
+        return self.bench.recording_directory
+
+    def start(self, plan: TestPlan) -> Path:
+        """Start a recorder; return its file once it exists."""
+        out = recording_path(self.bench, SystemClock().now())
+        with self.ports:  # a preview has released them
+            recorder = RecorderProcess(
+                self.path, out, duration=plan.duration, operator=plan.operator
+            )
+        self.started.append(recorder)
+        recorder.wait_for_file()
+        return out
+
+    def find_running(self) -> Path | None:
+        """Return the file of a running recorder of this bench, if there is one."""
+        return running_recording(self.bench)
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder of a file to stop."""
+        ask(path, "stop")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder of a file to record a remark."""
+        ask(path, "mark", text)
+
+    @property
+    def preview(self) -> Preview | None:
+        """Reads the sensors of the bench."""
+        return partial(read_sensors, self.bench, self.ports)
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Start the command that the user gave for events."""
+        announce(self.on_event, event, text, path)
+
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Return the settings of a recording's own bench, with changes, and that bench."""
+        return about(path, changes)
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+        """Write the result into the recording, unless it holds one."""
+        with Recording.open(path) as recording:
+            if recording.results():
+                return
+        store_results(path, snapshot, verdict)
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report."""
+        return _report(path, snapshot, settings, folder=self.reports)
+
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Write CSV and JSON beside the recording, or with the reports."""
+        return save_result(path, snapshot, settings, verdict, folder=self.reports or path.parent)
+
+    def release(self) -> None:
+        """Release the recorders, which continue."""
+        for recorder in self.started:
+            recorder.close()
+
+
+@dataclass(frozen=True)
+class RecordingControls:
+    """Controls of a recording: while it grows it can be stopped and marked."""
+
+    path: Path
+    settings: Settings
+    bench: Bench | None = None
+    can_start: bool = False
+    on_event: str = ""
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.stem
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the recording."""
+        return self.path.parent
+
+    def start(self, plan: TestPlan) -> Path:
+        """Raise an error: a recording cannot be started again."""
+        del plan
+        raise HuddleError("this is a recording; huddle tui BENCH starts one")
+
+    def find_running(self) -> Path:
+        """Return the recording itself."""
+        return self.path
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder to stop."""
+        ask(path, "stop")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder to record a remark."""
+        ask(path, "mark", text)
+
+    @property
+    def preview(self) -> None:
+        """Return nothing: the sensors of a recording may be anywhere."""
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Start the command that the user gave for events."""
+        announce(self.on_event, event, text, path)
+
+    def about(
+        self, path: Path, changes: Mapping[str, object]
+    ) -> tuple[Settings | None, Bench | None]:
+        """Return the settings of a recording's own bench, with changes, and that bench."""
+        return about(path, changes)
+
+    def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
+        """Do nothing: the process that records writes the result."""
+
+    def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
+        """Write the report beside the recording."""
+        return _report(path, snapshot, settings)
+
+    def save(
+        self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
+    ) -> tuple[Path, ...]:
+        """Write CSV and JSON beside the recording."""
+        return save_result(path, snapshot, settings, verdict, folder=path.parent)
+
+
+def read_sensors(
+    bench: Bench,
+    ports: threading.Lock,
+    show: Callable[[tuple[SensorPreview, ...]], None],
+    ended: threading.Event,
+) -> None:
+    """Read the sensors of a bench until `ended` is set; holds the lock of the ports meanwhile.
+
+    Raises
+    ------
+    HuddleError
+        If they cannot be read.
+    """
+    clock, loop_factory = host_time(bench)
+    with ports, asyncio.Runner(loop_factory=loop_factory) as runner:
+        try:
+            runner.run(preview(bench, clock, show, ended=ended))
+        except* HuddleError as errors:
+            raise HuddleError("; ".join(map(str, errors.exceptions))) from errors
+
+
+def announce(command: str, event: str, text: str, path: Path | None) -> None:
+    """Start a command with the environment variables HUDDLE_EVENT, _TEXT and _RECORDING.
+
+    Raises
+    ------
+    HuddleError
+        If it cannot be started, or ends with an error.
+    """
+    if not command:
+        return
+    about = {"HUDDLE_EVENT": event, "HUDDLE_TEXT": text, "HUDDLE_RECORDING": str(path or "")}
+    try:
+        ended = subprocess.run(
+            shlex.split(command),
+            env=os.environ | about,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=HOOK_TIMEOUT,
+            check=False,
+        )
+    except (OSError, ValueError, subprocess.TimeoutExpired) as error:
+        raise HuddleError(f"--on-event {command}: {error}") from error
+    if ended.returncode:
+        said = ended.stderr.strip() or f"exit code {ended.returncode}"
+        raise HuddleError(f"--on-event {command}: {said}")
+
+
+def about(path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
+    """Return the settings for a recording, with changes and methods for comparison; its bench.
+
+    Raises
+    ------
+    HuddleError
+        If it cannot be read, or the changes do not fit it.
+    """
+    try:
+        settings, bench = settings_for(path, **changes)
+    except typer.BadParameter as error:
+        raise HuddleError(error.message) from None
+    return with_comparison(settings, changes), bench
+
+
+def save_result(
+    path: Path,
+    snapshot: Snapshot,
+    settings: Settings,
+    verdict: TestVerdict | None,
+    *,
+    folder: Path,
+) -> tuple[Path, ...]:
+    """Write an estimate as CSV and JSON; that of a growing recording says nothing of its file.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
+    """
+    csv, json = (folder / f"{path.stem}{suffix}" for suffix in (".csv", ".json"))
+    csv.write_text(curves_csv(snapshot), encoding="utf-8")
+    about = sources([path]) if snapshot.closed else ()
+    result = document(snapshot, settings, sources=about, verdict=verdict)
+    write_json(str(json), result)
+    return csv, json
+
+
+def _report(
+    path: Path, snapshot: Snapshot, settings: Settings, *, folder: Path | None = None
+) -> Path:
+    require("matplotlib", "jinja2")
+    from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
+
+    out = (folder or path.parent) / f"{path.stem}.html"
+    write(snapshot, out, recordings=[path], settings=settings)
+    return out
+
+
+def with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:
+    """Add cheap methods for comparison, unless the user chose the methods."""
+    if wanted.get("methods") is not None or "all" in settings.methods:
+        return settings
+    return replace(settings, methods=tuple(dict.fromkeys((*settings.methods, *ALWAYS))))
