@@ -14,18 +14,20 @@ import numpy as np
 
 from daq.archive.averages import Average, Estimator, converted
 from daq.archive.changes import Changes, Drift, changes, drift
+from daq.archive.density import FEWEST_BINS, DensityCounter
 from daq.archive.spectra_file import SpectraFile
 from daq.errors import ArchiveError
-from daq.results.band_summary import band_of, channel_means, judged_method
+from daq.results.band_summary import band_within, channel_means, judged_method
 from estimator.errors import BandError
 from estimator.self_noise.band_means import CERTAIN, NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
     from datetime import tzinfo
 
     from numpy.typing import NDArray
 
+    from daq.archive.density import Density
     from daq.archive.plan import Plan
     from daq.archive.store import Entry
     from daq.estimation.settings import Settings
@@ -36,11 +38,6 @@ if TYPE_CHECKING:
 
 DAY_NS = 86400 * 10**9
 FALSE_ALARM = 0.01
-POINTS_PER_OCTAVE = 8
-"""Of the density; each is a mean over an octave (McNamara and Buland 2004)."""
-LOWEST_DB, HIGHEST_DB = -320, 80
-_FEWEST_BINS = 4
-"""Frequencies in an octave."""
 WORKING_HOURS = range(8, 18)
 NIGHT_HOURS = frozenset({22, 23, 0, 1, 2, 3, 4, 5})
 
@@ -53,46 +50,6 @@ class Levels:
     spread: FloatArray
     low: FloatArray
     high: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Density:
-    """How often a stretch has a self-noise, as PQLX draws it.
-
-    Attributes
-    ----------
-    frequency : float64, shape (n_points,)
-        Centres of octaves, in Hz.
-    counts : int64, shape (n_points, n_levels, n_channels)
-        Stretches with a level from ``LOWEST_DB + k`` to one dB above.
-    not_positive : int64, shape (n_points, n_channels)
-        Stretches whose estimate is zero or below, and so has no level.
-    n_stretches, n_short : int
-        Stretches counted, and those left out as less than half of one.
-    """
-
-    frequency: FloatArray
-    counts: IntArray
-    not_positive: IntArray
-    n_stretches: int
-    n_short: int
-
-    def percentile(self, share: float) -> FloatArray:
-        """Return the level in dB below which this share of stretches lies, (n_points, n_channels).
-
-        NaN where it has no level. Within a bin of 1 dB, stretches are taken to be spread evenly.
-        """
-        total = self.counts.sum(axis=1) + self.not_positive
-        wanted = share * total
-        below = np.concatenate(
-            [self.not_positive[:, None], self.not_positive[:, None] + np.cumsum(self.counts, 1)], 1
-        )
-        level = np.argmax(below[:, 1:] >= wanted[:, None], axis=1)
-        before = np.take_along_axis(below, level[:, None], axis=1)[:, 0]
-        inside = np.take_along_axis(self.counts, level[:, None], axis=1)[:, 0]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found = LOWEST_DB + level + np.clip((wanted - before) / inside, 0, 1)
-        return np.where((total > 0) & (self.not_positive < np.maximum(wanted, 1e-9)), found, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +159,9 @@ def answer(
     # Days and stretches go by the method that judges.
     first = settings.methods[:1] if settings.methods[:1] != ("all",) else ("three-sensor",)
     one = Estimator(plan, replace(settings, methods=first), channels)
-    tally = _Tally(plan, one, zone)
+    usable = min(entry.described.usable for entry in known)
+    bands = _bands(one, usable)
+    tally = _Tally(plan, one, zone, bands)
     pooled = Average()
     problems: list[str] = []
     for number, entry in enumerate(known):
@@ -212,10 +171,9 @@ def answer(
         problems += tally.take(entry, pooled)
     snapshot = every.snapshot(pooled, diagnose=True)
     tally.end()
-    bands = tally.bands(snapshot)
-    n_series = (-1, len(bands) * len(snapshot.channels))
-    levels = tally.levels(bands)
     days = np.array(sorted(tally.days), dtype=np.int64)
+    levels = Levels(*np.stack([tally.days[day].means for day in days.tolist()], axis=1))
+    n_series = (-1, len(bands) * len(snapshot.channels))
     at = (days - days[0]) / DAY_NS
     mean, spread = levels.mean.reshape(n_series), levels.spread.reshape(n_series)
     return Answer(
@@ -224,29 +182,40 @@ def answer(
         method=judged_method(snapshot, one.settings),
         bands=bands,
         days_utc_ns=days,
-        n_segments=np.array([tally.days[int(day)].n_segments for day in days]),
+        n_segments=np.array([tally.days[day].n_segments for day in days.tolist()]),
         levels=levels,
         drift=drift(at, mean, spread),
         changes=changes(mean, spread, false_alarm=false_alarm),
-        density=tally.density(),
-        contrast=tally.contrast(bands),
+        density=tally.density.density(),
+        contrast=tally.contrast(),
         problems=tuple(problems),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Day:
+    """What is kept of a day: its spectra would fill the memory."""
+
+    n_segments: int
+    means: FloatArray
+    """As `_Tally._means` returns them."""
 
 
 class _Tally:
     """What is gathered from the stretches on the way through the archive."""
 
-    def __init__(self, plan: Plan, one: Estimator, zone: tzinfo) -> None:
-        self._plan, self._one, self._zone = plan, one, zone
-        self.days: dict[int, Snapshot] = {}
+    def __init__(
+        self,
+        plan: Plan,
+        one: Estimator,
+        zone: tzinfo,
+        bands: Sequence[tuple[float, float]],
+    ) -> None:
+        self._plan, self._one, self._zone, self._bands = plan, one, zone, bands
+        self.density = DensityCounter(one.welch.frequencies, len(one.channels))
+        self.days: dict[int, _Day] = {}
         self._open: dict[int, Average] = {}
         self._weekday, self._night = Average(), Average()
-        self._edges = _octaves(one.welch.frequencies, POINTS_PER_OCTAVE)
-        n_points, n_channels = len(self._edges), len(one.channels)
-        self._counts = np.zeros((n_points, HIGHEST_DB - LOWEST_DB, n_channels), dtype=np.int64)
-        self._not_positive = np.zeros((n_points, n_channels), dtype=np.int64)
-        self._n_stretches = self._n_short = 0
 
     def take(self, entry: Entry, pooled: Average) -> list[str]:
         """Take every stretch of a recording; returns a message for each that is damaged."""
@@ -273,7 +242,7 @@ class _Tally:
                     average.add(described, start, n_segments, csm)
                 alone = Average()
                 alone.add(described, start, n_segments, csm)
-                self._count(alone)
+                self.density.add(self._noise_of(alone))
         return problems
 
     def _times_of_day(self, start_utc_ns: int) -> list[Average]:
@@ -283,72 +252,24 @@ class _Tally:
         working = local.weekday() < 5 and local.hour in WORKING_HOURS
         return [self._weekday] if working else []
 
+    def _noise_of(self, alone: Average) -> FloatArray | None:
+        """Return the noise PSD of one stretch; None with less than half of its segments."""
+        whole = self._plan.stretch_s * self._one.welch.sampling_rate / self._one.welch.hop
+        if alone.n_segments < whole / 2:
+            return None
+        results = self._one.snapshot(alone, curves_only=True).results
+        return next(iter(results.values())).noise_psd if results else None
+
     def _end_days(self, before: float) -> None:
         for day in [day for day in self._open if day < before]:
-            self.days[day] = self._one.snapshot(self._open.pop(day))
+            snapshot = self._one.snapshot(self._open.pop(day))
+            self.days[day] = _Day(snapshot.n_segments, self._means(snapshot))
 
     def end(self) -> None:
         """End the last days."""
         self._end_days(np.inf)
 
-    def _count(self, alone: Average) -> None:
-        """Count one stretch in the density."""
-        whole = self._plan.stretch_s * self._one.welch.sampling_rate / self._one.welch.hop
-        if alone.n_segments < whole / 2:
-            self._n_short += 1
-            return
-        snapshot = self._one.snapshot(alone, curves_only=True)
-        if not snapshot.results:
-            self._n_short += 1
-            return
-        self._n_stretches += 1
-        noise = next(iter(snapshot.results.values())).noise_psd
-        known = np.isfinite(noise)
-        total = np.cumsum(np.vstack([np.zeros(noise.shape[1]), np.where(known, noise, 0.0)]), 0)
-        number = np.cumsum(np.vstack([np.zeros(noise.shape[1]), known]), 0)
-        low, high = self._edges.T
-        n_bins = number[high] - number[low]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = (total[high] - total[low]) / n_bins
-            level = np.floor(10 * np.log10(mean)) - LOWEST_DB
-        self._not_positive += (n_bins > 0) & (mean <= 0)
-        point, channel = np.nonzero((n_bins > 0) & (mean > 0))
-        bins = np.clip(level[point, channel], 0, self._counts.shape[1] - 1).astype(np.int64)
-        np.add.at(self._counts, (point, bins, channel), 1)
-
-    def bands(self, pooled: Snapshot) -> tuple[tuple[float, float], ...]:
-        """Return the bands of the series."""
-        whole = band_of(self._one.settings, pooled)
-        if self._one.settings.band is not None:
-            return (whole,)
-        frequency = pooled.frequency
-        octaves = []
-        centre = 2.0 ** np.ceil(np.log2(whole[0]) + 0.5)
-        while centre * np.sqrt(2) <= whole[1]:
-            edges = (float(centre / np.sqrt(2)), float(centre * np.sqrt(2)))
-            if np.count_nonzero((frequency >= edges[0]) & (frequency <= edges[1])) >= _FEWEST_BINS:
-                octaves.append(edges)
-            centre *= 2
-        return (whole, *octaves)
-
-    def levels(self, bands: Sequence[tuple[float, float]]) -> Levels:
-        """Return the noise of every day."""
-        snapshots = [snapshot for _, snapshot in sorted(self.days.items())]
-        return _levels([_means(each, self._one.settings, bands) for each in snapshots])
-
-    def density(self) -> Density:
-        """Return the density."""
-        frequency = self._one.welch.frequencies
-        low, high = frequency[self._edges[:, 0]], frequency[self._edges[:, 1] - 1]
-        return Density(
-            np.sqrt(low * high),
-            self._counts,
-            self._not_positive,
-            self._n_stretches,
-            self._n_short,
-        )
-
-    def contrast(self, bands: Sequence[tuple[float, float]]) -> Contrast | None:
+    def contrast(self) -> Contrast | None:
         """Compare working hours and nights; None where one of them has too little."""
         both = (self._weekday, self._night)
         if not all(each.n_segments for each in both):
@@ -356,7 +277,7 @@ class _Tally:
         snapshots = [self._one.snapshot(each) for each in both]
         if not all(each.results for each in snapshots):
             return None
-        weekday, night = (Levels(*_means(each, self._one.settings, bands)) for each in snapshots)
+        weekday, night = (Levels(*self._means(each)) for each in snapshots)
         with np.errstate(invalid="ignore", divide="ignore"):
             difference = 10 * np.log10(weekday.mean / night.mean)
             relative = np.hypot(weekday.spread / weekday.mean, night.spread / night.mean)
@@ -373,40 +294,37 @@ class _Tally:
             difference + half,
         )
 
-
-def _means(
-    snapshot: Snapshot, settings: Settings, bands: Sequence[tuple[float, float]]
-) -> FloatArray:
-    """Return mean, spread, low and high, shape (4, n_bands, n_channels)."""
-    found = np.full((4, len(bands), len(snapshot.channels)), np.nan)
-    noise = next(iter(snapshot.results.values()), None)
-    for number, band in enumerate(bands):
-        if noise is None:
-            continue
-        try:
-            means = channel_means(noise, snapshot, settings, band)
-        except BandError:
-            continue
-        found[:, number] = np.array(
-            [[m.mean[0], m.spread[0], m.low[0], m.high[0]] for m in means]
-        ).T
-    return found
+    def _means(self, snapshot: Snapshot) -> FloatArray:
+        """Return mean, spread, low and high, shape (4, n_bands, n_channels)."""
+        found = np.full((4, len(self._bands), len(snapshot.channels)), np.nan)
+        noise = next(iter(snapshot.results.values()), None)
+        for number, band in enumerate(self._bands):
+            if noise is None:
+                continue
+            try:
+                means = channel_means(noise, snapshot, self._one.settings, band)
+            except BandError:
+                continue
+            found[:, number] = np.array(
+                [[m.mean[0], m.spread[0], m.low[0], m.high[0]] for m in means]
+            ).T
+        return found
 
 
-def _levels(found: Iterable[FloatArray]) -> Levels:
-    return Levels(*np.stack(list(found), axis=1))
-
-
-def _octaves(frequency: FloatArray, per_octave: int) -> IntArray:
-    """Return first and last + 1 bin of overlapping octaves, shape (n_points, 2)."""
-    edges = []
-    centre = frequency[1] * np.sqrt(2)
-    while centre * np.sqrt(2) <= frequency[-1] * (1 + 1e-9):
-        low, high = np.searchsorted(frequency, [centre / np.sqrt(2), centre * np.sqrt(2)])
-        if high - low >= _FEWEST_BINS:
-            edges.append((int(low), int(high)))
-        centre *= 2 ** (1 / per_octave)
-    return np.array(edges, dtype=np.int64).reshape(-1, 2)
+def _bands(one: Estimator, usable: float) -> tuple[tuple[float, float], ...]:
+    """Return the bands of the series; nothing is known above `usable` Hz."""
+    frequency = one.welch.frequencies
+    whole = band_within(one.settings, frequency, float(frequency[frequency <= usable].max()))
+    if one.settings.band is not None:
+        return (whole,)
+    octaves = []
+    centre = 2.0 ** np.ceil(np.log2(whole[0]) + 0.5)
+    while centre * np.sqrt(2) <= whole[1]:
+        edges = (float(centre / np.sqrt(2)), float(centre * np.sqrt(2)))
+        if np.count_nonzero((frequency >= edges[0]) & (frequency <= edges[1])) >= FEWEST_BINS:
+            octaves.append(edges)
+        centre *= 2
+    return (whole, *octaves)
 
 
 def _utc(ns: int) -> str:

@@ -41,7 +41,11 @@ def band_of(settings: Settings, snapshot: Snapshot) -> tuple[float, float]:
 
     It ends where nothing can be said any more, unless that is all of it.
     """
-    frequency, known = snapshot.frequency, highest_known(snapshot)
+    return band_within(settings, snapshot.frequency, highest_known(snapshot))
+
+
+def band_within(settings: Settings, frequency: FloatArray, known: float) -> tuple[float, float]:
+    """Return what `band_of` returns, from frequencies of which nothing is known above `known`."""
     low, high = settings.band or (float(frequency[1]), 0.9 * float(frequency[-1]))
     return low, min(high, known) if low < known else high
 

@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from daq.archive.answers import LOWEST_DB, Density, answer
+from daq.archive.answers import answer
+from daq.archive.density import LOWEST_DB, Density
 from daq.archive.execution import carried_out
 from daq.archive.sources import recordings_in, sort
 from daq.archive.spectra_file import SpectraFile, SpectraWriter

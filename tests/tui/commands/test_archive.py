@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import shutil
 import signal
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 
 from daq.archive.answers import answer
 from daq.archive.store import Store
+from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
 from tests.daq.archive.months import (
     HOUR_NS,
@@ -187,7 +189,14 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
     ]
     store = store_for(tmp_path / "store", paths[0], stretch="day")
     assert fill(store, paths) == []
-    found = answer(store.plan, store.entries()[0], SETTINGS)
+    kept: list[int] = []  # spectra of days that have ended, as recordings are taken
+
+    def count(_: int, __: int) -> None:
+        kept.append(sum(isinstance(each, Snapshot) for each in gc.get_objects()))
+
+    gc.collect()
+    found = answer(store.plan, store.entries()[0], SETTINGS, progress=count)
+    assert kept == [kept[0]] * 10
     assert found.changes.found[:6].all()
     assert set(found.changes.day[:6]) == {5}
     assert np.all(np.abs(found.changes.amount[:6] - 20 * np.log10(2)) < 0.5)

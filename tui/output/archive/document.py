@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from daq.archive.answers import LOWEST_DB
+from daq.archive.density import LOWEST_DB
 from tui.output.archive.tables import day_text
 from tui.output.csv_text import csv_text
 from tui.output.json_document import document
