@@ -11,7 +11,7 @@ import numpy as np
 from daq.archive.execution import carried_out
 from daq.archive.plan import Plan
 from daq.archive.sources import sort
-from daq.archive.store import Store
+from daq.archive.store import PLAN_FILE, Store
 from daq.archive.task import Task, software_version
 from daq.bench.model import Channel
 from daq.estimation.segments.segment_pass import Pass
@@ -107,22 +107,25 @@ def content(store: Store) -> dict[str, bytes]:
 
 
 def assert_same(one: Store, other: Store) -> None:
-    """See that two archives have the same files, and in them the same values to rounding."""
-    assert {p.name for p in one.folder.iterdir()} == {p.name for p in other.folder.iterdir()}
-    for path in one.folder.glob("*.h5"):
-        with h5py.File(path) as first, h5py.File(other.folder / path.name) as second:
-            found: list[str] = []
-            first.visit(found.append)
-            for name in found:
-                if not isinstance(first[name], h5py.Dataset):
-                    continue
-                a, b = first[name][()], second[name][()]
-                if np.issubdtype(np.asarray(a).dtype, np.inexact):
-                    np.testing.assert_allclose(
-                        a, b, rtol=1e-9, atol=1e-12 * np.abs(a).max(initial=0)
-                    )
-                else:
-                    assert np.array_equal(a, b), name
+    """See that two archives have the same files, and in them the same values, bit for bit."""
+    assert values(one) == values(other)
+
+
+def values(store: Store) -> dict[str, bytes]:
+    """Return every dataset and attribute of an archive: HDF5 may lay out equal values otherwise."""
+    found: dict[str, bytes] = {PLAN_FILE: (store.folder / PLAN_FILE).read_bytes()}
+    for path in store.folder.glob("*.h5"):
+
+        def take(name: str, item: h5py.Group, path: Path = path) -> None:
+            for key, value in item.attrs.items():
+                found[f"{path.name} {name} {key}"] = repr(np.asarray(value).tolist()).encode()
+            if isinstance(item, h5py.Dataset):
+                found[f"{path.name} {name}"] = np.asarray(item[()]).tobytes()
+
+        with h5py.File(path) as file:
+            take("/", file)
+            file.visititems(take)
+    return found
 
 
 def with_reject(settings: Settings) -> Settings:
