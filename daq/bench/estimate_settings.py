@@ -354,7 +354,8 @@ class EstimateSettings:
         int | Literal["auto"] | None,
         Option(
             "Dimensions of the common motion for maximum likelihood: a number, or auto for as many"
-            " as the model test of each band requires. Default: as many as a sensor has channels.",
+            " as the model test of each band requires; with four or more sensors by gradients of"
+            " the motion where they explain it. Default: as many as a sensor has channels.",
             check=_dimension,
             flags=("--dimension",),
             metavar="N|auto",

@@ -175,6 +175,8 @@ class Sensor(Table):
     channels: tuple[Channel, ...] = Field(min_length=1, description="[[sensors.channels]] tables")
     clock: Name | None = None
     """Sensors of one clock name are sampled by one clock."""
+    position: tuple[Number, Number, Number] | None = None
+    """In metres, x, y and z from any origin: where the motion's gradients are looked for."""
     data_sheet: DataSheet | None = None
 
     def clock_name(self, *, shares_clock: bool) -> str:

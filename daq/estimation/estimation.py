@@ -34,6 +34,7 @@ from daq.estimation.noise_estimates import (
     averages,
     in_units,
     known_gains,
+    known_positions,
     noise_estimates,
     quantisation_psd,
     up_to,
@@ -439,6 +440,7 @@ class Estimation:
             dims=dims,
             gains=self._gains,
             dimensions=self._dimensions if keep and self._fits(bands) else None,
+            positions=known_positions(self._recordings[0], self._passes[0].aligned.channels),
         )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, self.n_segments

@@ -12,6 +12,7 @@ from daq.errors import WrongSettingError
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.dimension import BandDimension, choose_dimension
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
+from estimator.likelihood.gradients import Gradients, noise_by_gradients, with_gradients
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.result import SelfNoise
 from estimator.spectra.multiresolution import Band, MultiResolution
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Channel
     from daq.estimation.segments.segment_pass import Pass
     from daq.estimation.settings import Settings
+    from daq.recording.interface import ReadableRecording
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
@@ -44,6 +46,8 @@ class Dimensions:
 
     n_factors: tuple[IntArray, ...]
     chosen: tuple[BandDimension, ...] = ()
+    gradients: Gradients | None = None
+    """Of the motion, where they explain it; only of estimates without octaves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +162,17 @@ def known_gains(settings: Settings, channels: Channels) -> FloatArray:
     return gains
 
 
+def known_positions(recording: ReadableRecording, channels: Channels) -> FloatArray | None:
+    """Return the positions of sensors in metres, (n_sensors, 3); None unless all are known."""
+    bench = recording.bench
+    names = dict.fromkeys(sensor for sensor, _ in channels)
+    if bench is None or not set(names) <= {sensor.name for sensor in bench.sensors}:
+        return None
+    positions = [bench.sensor(name).position for name in names]
+    known = [each for each in positions if each is not None]
+    return np.array(known) if len(known) == len(positions) else None
+
+
 def neighbours(band: Band) -> FloatArray:
     """Return how averages at neighbouring frequencies of a band are correlated."""
     window = get_window(band.settings.window, band.settings.segment_length)
@@ -171,6 +186,7 @@ def noise_estimates(
     dims: tuple[int, ...],
     gains: FloatArray,
     dimensions: Dimensions | None = None,
+    positions: FloatArray | None = None,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -183,6 +199,8 @@ def noise_estimates(
     gains : float64, shape (n_channels,)
     dimensions : Dimensions, optional
         Those chosen before, where they are not to be chosen anew.
+    positions : float64, shape (n_sensors, 3), optional
+        Of the sensors, in metres.
     """
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
@@ -194,7 +212,7 @@ def noise_estimates(
                 if method == "two-channel":
                     options = [{"response": gains.astype(np.complex128)} for _ in bands]
                 elif method == "maximum-likelihood" and settings.dimension is not None:
-                    dimensions = dimensions or _dimensions(bands, settings, dims)
+                    dimensions = dimensions or _dimensions(bands, settings, dims, positions)
                     options = [{"n_factors": q} for q in dimensions.n_factors]
                 parts = [
                     self_noise(
@@ -208,6 +226,8 @@ def noise_estimates(
                     )
                     for band, option in zip(bands, options, strict=True)
                 ]
+                if method == "maximum-likelihood" and dimensions is not None:
+                    parts = _by_gradients(parts, bands, dimensions, dims)
             except InsufficientDataError as error:
                 refused[method] = str(error)
             else:
@@ -215,7 +235,26 @@ def noise_estimates(
     return Estimates(results, refused, dimensions)
 
 
-def _dimensions(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]) -> Dimensions:
+def _by_gradients(
+    parts: list[SelfNoise],
+    bands: Sequence[Band],
+    dimensions: Dimensions,
+    dims: tuple[int, ...],
+) -> list[SelfNoise]:
+    gradients = dimensions.gradients
+    if gradients is None:
+        return parts
+    (part,), (band,) = parts, bands
+    n = band.n_effective
+    return [noise_by_gradients(part, band.csm, gradients, dims=dims, n_effective=n)]
+
+
+def _dimensions(
+    bands: Sequence[Band],
+    settings: Settings,
+    dims: tuple[int, ...],
+    positions: FloatArray | None,
+) -> Dimensions:
     if isinstance(settings.dimension, int):
         q = settings.dimension
         return Dimensions(tuple(np.full(len(band.frequencies), q) for band in bands))
@@ -229,10 +268,20 @@ def _dimensions(bands: Sequence[Band], settings: Settings, dims: tuple[int, ...]
         )
         for band in bands
     ]
-    return Dimensions(
-        tuple(n_factors for n_factors, _ in found),
-        tuple(choice for _, choices in found for choice in choices),
+    n_factors = tuple(n_factors for n_factors, _ in found)
+    chosen = tuple(choice for _, choices in found for choice in choices)
+    if len(bands) > 1:
+        return Dimensions(n_factors, chosen)
+    gradients, chosen = with_gradients(
+        bands[0].csm,
+        bands[0].frequencies,
+        chosen,
+        dims=dims,
+        n_effective=bands[0].n_effective,
+        neighbours=neighbours(bands[0]),
+        positions=positions,
     )
+    return Dimensions(n_factors, chosen, gradients)
 
 
 def _joined(parts: Sequence[SelfNoise]) -> SelfNoise:

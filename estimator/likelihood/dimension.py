@@ -67,6 +67,9 @@ class BandDimension:
         The same with the usual dimension; NaN if that could not be fitted.
     n_sensors : int
         Sensors that have a signal of their own.
+    gradients : bool
+        Whether the further dimensions are the motion's gradients, see
+        `estimator.likelihood.gradients`.
     """
 
     low: float
@@ -79,6 +82,7 @@ class BandDimension:
     cov: float
     usual_cov: float
     n_sensors: int = ENOUGH_SENSORS
+    gradients: bool = False
 
     @property
     def is_undetermined(self) -> bool:

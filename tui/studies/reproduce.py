@@ -17,6 +17,7 @@ from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
 from tui.studies.clocks import clocks
 from tui.studies.estimates import ESTIMATES
+from tui.studies.gradients import gradients
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.responses import calibration, edges
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback, Series, Study
 
 CLOCKS, VERDICTS = "clocks", "verdicts"
-RESPONSES = {"calibration": calibration, "edges": edges}
+RESPONSES = {"calibration": calibration, "edges": edges, "gradients": gradients}
 STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, *RESPONSES)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")

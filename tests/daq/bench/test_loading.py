@@ -253,6 +253,7 @@ psd = [[1, 2], [3, 4]]
             sensor_text("d") + "[[sensors.channels]]\nname='t'\nsensitivity=0\nauxiliary=true",
             'sensors["d"].channels["t"]: sensitivity: expected counts per unit, not zero',
         ),
+        (sensor_text("d", extra="position = [0.1, 'e', 0]"), "position"),
         (sensor_text("d/e"), "expected a printable name without '/'"),
         (
             sensor_text("d", port="/dev/s", driver="scan")

@@ -224,6 +224,8 @@ def _choice(choice: BandDimension) -> str:
     at = f"At {span(choice.low, choice.high)}"
     if choice.n_factors < choice.usual:
         return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
+    if choice.gradients:
+        return f"{at} the motion and its gradients across the bench explain the averages; {price}."
     return (
         f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
         f"{choice.n_factors} dimensions explain the averages; {price}."

@@ -1,0 +1,358 @@
+"""Gradients of the motion across the bench, whose loadings follow from where the sensors stand.
+
+Waves much longer than the bench move a sensor at (x, y) by ``a + x b + y c``, with the same a, b
+and c at all sensors. The loadings of these motions are the sensors' responses times 1, x and y.
+Responses relative to the first sensor come from low frequencies, where gradients are small; what
+the gradients add to them there is of their own form, and does no harm. Of the positions only the
+space that 1, x and y span over the sensors matters: 2 (N - 3) numbers for N sensors. It is fitted
+to the averages at frequencies where gradients are seen but not yet bent; positions measured to 5 mm
+would be too coarse, and none are needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.likelihood import fisher
+from estimator.likelihood.dimension import ENOUGH_SENSORS, LEAST_BINS, MOST_BINS, SURE
+from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
+from estimator.likelihood.known_loadings import known_loadings_test, maximise_known
+from estimator.likelihood.prior import expected_noise, kinds
+from estimator.self_noise.coherency import coherency
+from estimator.self_noise.result import Flag, SelfNoise
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from estimator.likelihood.dimension import BandDimension
+    from estimator.likelihood.known_loadings import KnownLoadings
+    from estimator.types import BoolArray, ComplexArray, FloatArray
+
+LEAST_SENSORS = 4
+"""Three span every plane: whatever their positions, there is nothing to test."""
+RESPONSES_TO = 8.0
+"""Responses are taken up to this multiple of the highest frequency at which no gradient is seen.
+What is not seen there is a few per cent of the noise, nine times that here, and bends less."""
+SHAPE_TO = 20.0
+"""The same for the space that positions span."""
+_STEPS = 3  # of delays and responses in turn
+_CLEARLY = 1.0  # standard deviations of the test by which gradients explain a band better
+_HARMLESS = 0.5  # of the c.o.v. by free factors
+
+
+@dataclass(frozen=True, slots=True)
+class Gradients:
+    """The motion with its first gradients.
+
+    Attributes
+    ----------
+    loadings : complex128, shape (n_freqs, n_channels, 3 * d)
+        Responses of the channels to the motion of the first sensor and its two gradients.
+    used : bool, shape (n_freqs,)
+        Where gradients explain the motion.
+    usual : bool, shape (n_freqs,)
+        Where one motion explains it.
+    misfit : float64, shape (n_freqs,)
+        What gradients leave unexplained, as a fraction of the noise; 0 where they are not used.
+    shape : float64, shape (n_sensors, 3)
+        Orthonormal basis of what 1, x and y span over the sensors.
+    """
+
+    loadings: ComplexArray
+    used: BoolArray
+    usual: BoolArray
+    misfit: FloatArray
+    shape: FloatArray
+
+
+def with_gradients(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    choices: tuple[BandDimension, ...],
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    neighbours: FloatArray | None = None,
+    positions: FloatArray | None = None,
+) -> tuple[Gradients | None, tuple[BandDimension, ...]]:
+    """Explain bands by gradients of the motion where these explain them best.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, channels grouped by sensor.
+    frequency : float64, shape (n_freqs,)
+        Hz, rising.
+    choices : tuple of BandDimension
+        From `estimator.likelihood.dimension.choose_dimension`, with these frequencies.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+    neighbours : float64, shape (n_lags,), optional
+        As `estimator.likelihood.goodness_of_fit.pool` takes them.
+    positions : float64, shape (n_sensors, 2) or (n_sensors, 3), optional
+        Metres: where the fit of the space begins. By default at the averages' own directions.
+
+    Returns
+    -------
+    gradients : Gradients or None
+        None where they are of no use: sensors with unequal numbers of channels, fewer than four,
+        a channel without signal, or one motion that explains all bands.
+    choices : tuple of BandDimension
+        With `gradients` set in the bands that they explain.
+
+    Notes
+    -----
+    A band whose test asks for more dimensions takes gradients if their own test accepts them, at
+    the 1 % level, or with five sensors where what they miss is less than half the c.o.v. by free
+    factors. It widens the intervals. A band that one motion explains takes gradients if they
+    explain it better by more than chance. They have as many parameters.
+    """
+    d, n_sensors = dims[0], len(dims)
+    given = coherency(csm, dims)
+    if len(set(dims)) > 1 or n_sensors < LEAST_SENSORS or not choices:
+        return None, choices
+    kind = kinds(given, dims)
+    whole = given.valid & (given.flags == 0).all(axis=1) & (frequency > 0)
+    if kind.max() >= d or n_effective <= csm.shape[1]:
+        return None, choices
+    seen = next((n for n, each in enumerate(choices) if not _is_usual(each)), len(choices))
+    top = choices[max(0, seen - 1)].high
+    low = np.flatnonzero(whole & (frequency <= RESPONSES_TO * top))
+    above = whole & (frequency > top)
+    middle = np.flatnonzero(above & (frequency <= SHAPE_TO * top))
+    if len(middle) < LEAST_BINS:
+        middle = np.flatnonzero(above)[:LEAST_BINS]
+    if seen == len(choices) or len(low) < LEAST_BINS or len(middle) < LEAST_BINS:
+        return None, choices
+    calm = whole & (frequency <= top)
+    noise = np.full_like(given.psd, np.nan)
+    noise[calm] = maximise(given.matrix[calm], d).psi * given.psd[calm]
+    expected = expected_noise(noise, calm, kind)
+    response, delay = _responses(csm[low], frequency[low], n_sensors)
+    late = np.exp(-2j * np.pi * frequency[:, None] * np.repeat(delay, d))
+    basis = _shape(
+        csm[middle] * late[middle].conj()[:, :, None] * late[middle][:, None, :],
+        response,
+        expected[middle],
+        positions=positions,
+    )
+    loadings = _loadings(response, basis) * late[:, :, None]
+    found = []
+    for choice in choices:
+        rows = np.flatnonzero(whole & (frequency >= choice.low) & (frequency <= choice.high))
+        if not len(rows):
+            found.append(choice)
+            continue
+        stride = -(-len(rows) // MOST_BINS)
+        some = rows[::stride]
+        fit = maximise_known(
+            csm[some], loadings[some], expected[some], kind=kind, n_effective=n_effective
+        )
+        r = HANN_HALF if neighbours is None else neighbours
+        found.append(
+            _chosen(
+                choice, fit, csm[some], n_effective=n_effective, neighbours=r[stride - 1 :: stride]
+            )
+        )
+    used = _where(found, frequency, lambda choice: choice.gradients)
+    usual = _where(found, frequency, _is_usual)
+    missed = np.zeros(len(frequency))
+    for choice in found:
+        if choice.gradients:
+            inside = (frequency >= choice.low) & (frequency <= choice.high)
+            missed[inside] = misfit(choice.test, csm.shape[1], n_effective)
+    gradients = Gradients(loadings, used & whole, usual, missed, basis)
+    return (gradients if gradients.used.any() else None), tuple(found)
+
+
+def _where(
+    choices: Sequence[BandDimension], frequency: FloatArray, which: Callable[[BandDimension], bool]
+) -> BoolArray:
+    """Return the frequencies of some bands."""
+    chosen = np.zeros(len(frequency), np.bool_)
+    for choice in filter(which, choices):
+        chosen |= (frequency >= choice.low) & (frequency <= choice.high)
+    return chosen
+
+
+def noise_by_gradients(
+    found: SelfNoise,
+    csm: ComplexArray,
+    gradients: Gradients,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+) -> SelfNoise:
+    """Return an estimate by maximum likelihood with the frequencies that gradients explain.
+
+    Parameters
+    ----------
+    found : SelfNoise
+        Of the same matrices, by free factors.
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+    gradients : Gradients
+    dims : tuple of int
+    n_effective : float
+    """
+    given = coherency(csm, dims)
+    used = gradients.used & (given.flags == 0).all(axis=1)
+    kind = kinds(given, dims)
+    expected = expected_noise(found.noise_psd, gradients.usual, kind)[used]
+    fit = maximise_known(
+        csm[used], gradients.loadings[used], expected, kind=kind, n_effective=n_effective
+    )
+    error = np.hypot(fit.standard_error(n_effective), gradients.misfit[used, None] * fit.psi)
+    noise_psd, cov, low, high = (
+        each.copy() for each in (found.noise_psd, found.cov, found.low, found.high)
+    )
+    flags = found.flags.copy()
+    noise_psd[used], cov[used] = fit.psi, error / fit.psi
+    low[used], high[used] = fisher.interval(fit.psi, error)
+    flags[used] = np.where(fit.converged, 0, Flag.NOT_CONVERGED)[:, None]
+    return SelfNoise(found.method, noise_psd, cov, low, high, flags)
+
+
+def _is_usual(choice: BandDimension) -> bool:
+    return choice.accepted and not choice.gradients and choice.n_factors <= choice.usual
+
+
+def _outer(noise: FloatArray) -> FloatArray:
+    root = np.sqrt(noise)
+    return np.asarray(root[:, :, None] * root[:, None, :])
+
+
+def _chosen(
+    choice: BandDimension,
+    fit: KnownLoadings,
+    csm: ComplexArray,
+    *,
+    n_effective: float,
+    neighbours: FloatArray,
+) -> BandDimension:
+    """Return the choice for a band, by gradients if they explain it best."""
+    n_factors = 3 * choice.usual
+    test = known_loadings_test(fit, n_factors=n_factors, n_effective=n_effective)
+    pooled = pool(test, np.ones(len(csm), np.bool_), neighbours=neighbours)
+    enough = choice.n_sensors >= ENOUGH_SENSORS
+    harmless = misfit(pooled, csm.shape[1], n_effective) < _HARMLESS * choice.cov
+    if not (pooled.p_value > SURE or (enough and harmless)):
+        return choice
+    if _is_usual(choice):
+        one = model_test(maximise(csm, choice.usual), n_effective=n_effective)
+        better = _excess(one) - _excess(test)
+        if not better > _CLEARLY * np.sqrt(2 * pooled.degrees * pooled.spread):
+            return choice
+    return replace(
+        choice,
+        n_factors=n_factors,
+        accepted=enough,
+        test=pooled,
+        cov=float(np.median(fit.standard_error(n_effective) / fit.psi)),
+        gradients=True,
+    )
+
+
+def misfit(test: BandTest, n_channels: int, n_effective: float) -> float:
+    """Return what gradients leave unexplained in a band, as a fraction of the noise.
+
+    A model that is off by D of the noise of each of p channels raises the statistic of one
+    frequency by ``n p D**2``. Bent waves, simulated, bias the noise by half of this to as much.
+    """
+    excess = max(0.0, test.statistic - test.degrees) / max(1, test.n_frequencies)
+    return float(np.sqrt(excess / (n_effective * n_channels)))
+
+
+def _excess(test: ModelTest) -> float:
+    return float(np.nansum(test.statistic - test.degrees))
+
+
+def _responses(
+    csm: ComplexArray, frequency: FloatArray, n_sensors: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return responses relative to the first sensor, (n_channels, d), and delays in seconds.
+
+    Real matrices and one delay a sensor, by least squares over the cross-spectra with all other
+    sensors: ``S_jk = R_j S_0k`` whatever their noise.
+    """
+    p = csm.shape[1]
+    d = p // n_sensors
+    weight = 1 / np.einsum("fii->f", csm[:, :d, :d]).real
+    omega = 2 * np.pi * frequency
+    response, delay = np.zeros((p, d)), np.zeros(n_sensors)
+    response[:d] = np.eye(d)
+    for sensor in range(1, n_sensors):
+        own = slice(sensor * d, (sensor + 1) * d)
+        rest = np.setdiff1d(np.arange(d, p), np.arange(p)[own])
+        seen, reference = csm[:, own][:, :, rest], csm[:, :d][:, :, rest]
+        inner = np.einsum("f,fak,fbk->ab", weight, reference, reference.conj()).real
+        for _ in range(_STEPS):
+            turned = seen * np.exp(1j * omega * delay[sensor])[:, None, None]
+            cross = np.einsum("f,fak,fbk->ab", weight, turned, reference.conj()).real
+            response[own] = np.linalg.solve(inner.T, cross.T).T
+            model = response[own] @ reference
+            met = weight * np.einsum("fak,fak->f", turned, model.conj()).imag
+            energy = weight * np.einsum("fak,fak->f", model, model.conj()).real
+            delay[sensor] -= (omega @ met) / (omega**2 @ energy)
+    return response, delay
+
+
+def _loadings(response: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return the loadings of the motion and its gradients, shape (n_channels, 3 * d)."""
+    d = response.shape[1]
+    by_channel = np.repeat(basis, d, axis=0)
+    return np.concatenate([response * column[:, None] for column in by_channel.T], axis=1)
+
+
+def _shape(
+    csm: ComplexArray,
+    response: FloatArray,
+    expected: FloatArray,
+    *,
+    positions: FloatArray | None,
+) -> FloatArray:
+    """Fit the space that 1, x and y span over the sensors, shape (n_sensors, 3).
+
+    What is left of the averages beside the motion and its gradients, in units of the noise, has
+    the least determinant. The search starts from `positions`, or from the two directions in which
+    the sensors, all brought to the responses of the first, differ most.
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415 - takes a quarter of a second to import
+
+    p, d = response.shape
+    n_sensors = p // d
+    white = (csm / _outer(expected)).mean(axis=0).real
+    scale = 1 / np.sqrt(expected.mean(axis=0))[:, None]
+    one = np.full((n_sensors, 1), 1 / np.sqrt(n_sensors))
+    if positions is None:
+        undo = np.zeros((p, p))
+        for sensor in range(n_sensors):
+            own = slice(sensor * d, (sensor + 1) * d)
+            undo[own, own] = np.linalg.pinv(response[own] * scale[own])
+        level = np.linalg.eigvalsh(white)[0]
+        aligned = undo @ (white - level * np.eye(p)) @ undo.T
+        blocks = aligned.reshape(n_sensors, d, n_sensors, d)
+        differing = np.einsum("iaja->ij", blocks)
+        centred = (np.eye(n_sensors) - one @ one.T) @ differing @ (np.eye(n_sensors) - one @ one.T)
+        plane = np.linalg.eigh(centred)[1][:, -2:]
+    else:
+        plane = np.asarray(positions, np.float64)[:, :2]
+    complete = np.linalg.qr(np.concatenate([one, plane], axis=1), mode="complete")[0]
+    start, beside = complete[:, :3], complete[:, 3:]
+
+    def moved(by: FloatArray) -> FloatArray:
+        tilted = start.copy()
+        tilted[:, 1:] += beside @ by.reshape(-1, 2)
+        return tilted
+
+    def left(by: FloatArray) -> float:
+        loadings = _loadings(response, moved(by)) * scale
+        free = np.linalg.qr(loadings, mode="complete")[0][:, 3 * d :]
+        return float(np.linalg.slogdet(free.T @ white @ free)[1])
+
+    best = minimize(left, np.zeros(2 * (n_sensors - 3)), method="BFGS")
+    return np.asarray(np.linalg.qr(moved(best.x))[0])
