@@ -33,7 +33,10 @@ html_theme = "pydata_sphinx_theme"
 html_theme_options = {"secondary_sidebar_items": ["page-toc"], "show_prev_next": False}
 html_show_copyright = False
 html_show_sourcelink = False
-html_extra_path = ["../tui/resources/result-1.schema.json"]
+html_extra_path = [
+    "../tui/resources/result-1.schema.json",
+    "../tui/resources/archive-1.schema.json",
+]
 
 default_role = "py:obj"
 

@@ -10,10 +10,13 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
+from referencing import Registry, Resource
 from typer.testing import CliRunner
 
 from daq.archive.answers import answer
@@ -31,6 +34,8 @@ from tests.daq.archive.months import (
     store_for,
     three,
 )
+from tests.tui.output.test_result_schema import SCHEMA as RESULT
+from tests.tui.output.test_result_schema import strict
 from tests.waiting import finish, wait_until
 from tui.cli.main import app
 from tui.report.figures.archive import days_figure, density_figure
@@ -38,6 +43,9 @@ from tui.report.figures.archive import days_figure, density_figure
 if TYPE_CHECKING:
     from pathlib import Path
 
+SCHEMA: dict[str, Any] = json.loads(
+    (resources.files("tui.resources") / "archive-1.schema.json").read_text("utf-8")
+)
 OPTIONS = ("--segment", "10s", "--method", "three-sensor")
 PLAIN = ("--equalise", "off", "--bridge", "0")
 """As the spectra of archives are."""
@@ -86,6 +94,9 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
         for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
             a, b = (np.array(each[key], dtype=float) for each in (one, other))
             np.testing.assert_allclose(a, b, rtol=1e-9)
+    registry = Registry().with_resource("result-1.schema.json", Resource.from_contents(RESULT))
+    assert found.keys() == SCHEMA["properties"].keys()
+    Draft202012Validator(strict(SCHEMA), registry=registry).validate(found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
     assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)
     assert found["archive"] == {"stretch_s": 3600, "recordings": 3, "problems": []}

@@ -1,4 +1,7 @@
-"""The answer of an archive as JSON and CSV; docs/archives.md describes both."""
+"""The answer of an archive as JSON and CSV; docs/archives.md describes both.
+
+``tui/resources/archive-1.schema.json`` describes the JSON for programs.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ if TYPE_CHECKING:
     from daq.archive.answers import Answer, Levels
     from daq.archive.store import Store
 
+SCHEMA_VERSION = 1
+"""Rises when a key is removed or changes its meaning; new keys do not change it."""
 PERCENTILES = (10, 50, 90)
 
 
@@ -23,6 +28,7 @@ def archive_document(answer: Answer, store: Store, n_recordings: int) -> dict[st
     shape = (len(answer.bands), len(pooled.channels))
     density, changes = answer.density, answer.changes
     return {
+        "schema_version": SCHEMA_VERSION,
         "archive": {
             "stretch_s": store.plan.stretch_s,
             "recordings": n_recordings,
