@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator.diagnostics.relative_response import CanonicalCoherence, own_channels
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.likelihood.fisher import cramer_rao_cov, efficiency
+from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.coherency import check_dims
 from estimator.spectra.windows import effective_averages, get_window
@@ -189,6 +189,67 @@ def plan(
         settings=settings,
     )
     return [*plans, least]
+
+
+def crossed_csm(
+    directions: FloatArray,
+    positions: FloatArray,
+    *,
+    snr: float,
+    wavelength: float,
+) -> tuple[ComplexArray, FloatArray]:
+    """Return true cross-spectra where waves from all sides cross triaxial sensors.
+
+    Parameters
+    ----------
+    directions : float64, shape (n_channels, 3)
+    positions : float64, shape (n_sensors, 2)
+        Metres.
+    snr : float
+    wavelength : float
+        Metres, long beside the bench.
+
+    Returns
+    -------
+    csm : complex128, shape (1, n_channels, n_channels)
+        With a noise PSD of 1.
+    loadings : float64, shape (n_channels, 9)
+        Of the motion and its gradients.
+
+    Notes
+    -----
+    The motion, and its gradients with ``(2 pi / wavelength)**2 / 2`` of its PSD each, are
+    independent, and alike along all axes.
+    """
+    basis = np.column_stack([np.ones(len(positions)), positions])
+    loadings = np.concatenate(
+        [np.repeat(column, 3)[:, None] * directions for column in basis.T], axis=1
+    )
+    gradient = snr * (2 * np.pi / wavelength) ** 2 / 2
+    power = np.repeat([snr, gradient, gradient], 3)
+    csm = (loadings * power) @ loadings.T + np.eye(len(loadings))
+    return csm[None].astype(np.complex128), loadings
+
+
+def gradient_cost(csm: ComplexArray, loadings: FloatArray) -> float:
+    """Return by how much gradients raise the c.o.v. of the worst channel.
+
+    Parameters
+    ----------
+    csm, loadings
+        From `crossed_csm`.
+
+    Returns
+    -------
+    float
+        c.o.v. of one frequency times the root of the averages; infinite where the noise of the
+        sensors cannot be told apart from gradients.
+    """
+    basis = np.linalg.qr(loadings)[0]
+    inverse = np.linalg.inv(csm)
+    motion = inverse - (np.eye(len(loadings)) - basis @ basis.T)
+    variance = np.einsum("fii->fi", covariance(np.abs(inverse) ** 2 - np.abs(motion) ** 2))
+    return float(np.sqrt(variance.max())) if np.isfinite(variance).all() else float("inf")
 
 
 def _plan(

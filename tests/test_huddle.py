@@ -450,11 +450,19 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
         assert entry.bias.tolist() == document["bias"]
     assert repr(found).split() == command("plan", str(bench), *arguments).split()
     aligned = huddle.plan(snr=250, fs=200, segment="10s")
-    assert "Six sensors do" in aligned.remarks[-1]
+    assert "or use six sensors: five on a circle of 12 cm" in aligned.remarks[-1]
     four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)
-    assert "without knowing the noise" in four.remarks[-1]
+    assert "no band is called accepted" in four.remarks[-1]
     six = huddle.plan(snr=250, fs=200, segment="10s", sensors=6)
-    assert not any("waves cross" in line for line in six.remarks)
+    assert "six sensors" not in six.remarks[-1]
+    assert aligned.waves is not None
+    assert six.waves is not None
+    # long waves: bias in parts of the noise over SNR times (2 pi radius / wavelength)**2
+    share = 0.01 / (250 * (2 * np.pi * 0.12 * aligned.waves.one_percent / 150) ** 2)
+    assert 0.1 < share < 10
+    # as good as six where they are best, to 10 %; three sensors have no bound
+    assert abs(six.waves.cost / six.waves.cost_of_six - 1) < 0.1
+    assert aligned.waves.cost == np.inf
     assert max(map(abs, aligned["three-channel"].bias)) < 1e-3
     for wrong, said in (
         ({"fs": None}, "fs=None: expected a sampling rate"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from tui.notebook.planning import plan_bench
@@ -24,6 +25,7 @@ def plan_test(path: Path, *, snr: float, cov: float, json: str | None) -> None:
         {
             "snr": snr,
             "cov": cov,
+            "waves": None if planned.waves is None else asdict(planned.waves),
             "methods": [
                 {
                     "method": entry.method,

@@ -23,6 +23,7 @@ from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
 from tui.notebook.options import settings_of
 from tui.notebook.text import rendered
+from tui.notebook.waves import Waves, waves_across
 from tui.output.formatting import percent, signed
 from tui.simulation.devices import scenario_of
 
@@ -76,24 +77,6 @@ class MethodPlan:
         )
 
 
-ENOUGH_FOR_GRADIENTS = 6
-"""Triaxial sensors that tell any gradient of the motion from the noise of all of them."""
-_ADVICE = (
-    " Six sensors do, at different distances from their centre and turned differently; or put the"
-    " sensors closer together."
-)
-_WAVES = {
-    3: "This assumes that all sensors measure one motion. Where waves cross the bench, three"
-    f" sensors cannot tell its gradients from noise; the model test can only warn.{_ADVICE}",
-    4: "This assumes that all sensors measure one motion. Where waves cross the bench, four sensors"
-    f" explain the averages by more dimensions (--dimension auto) without knowing the noise."
-    f"{_ADVICE}",
-    5: "This assumes that all sensors measure one motion. Where waves cross the bench, five sensors"
-    " estimate the noise if like channels have like noise (--dimension auto); six need no such"
-    " assumption.",
-}
-
-
 @dataclass(frozen=True, slots=True)
 class Leakage:
     """What unequal responses leak into the noise at the edges of segments, without equalisation.
@@ -123,7 +106,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
     ----------
     snr, cov : float
     settings : WelchSettings
-    n_sensors : int
+    waves : Waves or None
+        What waves across triaxial sensors do; None for others.
     leakage : Leakage or None
         What responses of the bench file that differ leak into the noise; None if they do not.
     """
@@ -135,11 +119,11 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         snr: float,
         cov: float,
         settings: WelchSettings,
-        n_sensors: int,
+        waves: Waves | None = None,
         leakage: Leakage | None = None,
     ) -> None:
         self.snr, self.cov, self.settings = snr, cov, settings
-        self.n_sensors, self.leakage = n_sensors, leakage
+        self.waves, self.leakage = waves, leakage
         self._plans = dict(plans)
 
     def __getitem__(self, method: str) -> MethodPlan:
@@ -189,8 +173,8 @@ class RecordingPlan(Mapping[str, MethodPlan]):
                 f"{plans[0].method} assumes known gains of the channels, the bound does not; so "
                 "its duration can be shorter than that of the bound."
             )
-        if self.n_sensors < ENOUGH_FOR_GRADIENTS:
-            lines.append(_WAVES[max(3, self.n_sensors)])
+        if self.waves is not None:
+            lines.append(self.waves.sentences)
         if self.leakage is not None:
             found = self.leakage
             lines.append(
@@ -215,7 +199,20 @@ def plan_bench(path: Path, *, snr: float, cov: float) -> RecordingPlan:
         snr=snr,
         cov=cov,
         leakage=_leakage(bench, settings, snr),
+        positions=_positions(bench),
     )
+
+
+def _positions(bench: Bench) -> FloatArray | None:
+    """Return positions in metres, (n_sensors, 3): of the bench file, or as simulated."""
+    known = [sensor.position for sensor in bench.sensors]
+    if all(each is not None for each in known):
+        return np.array(known, dtype=np.float64)
+    if not bench.simulation:
+        return None
+    scenario = scenario_of(bench)
+    simulated = np.array([scenario.sensors[sensor.name].position for sensor in bench.sensors])
+    return simulated if simulated.any() else None
 
 
 def _leakage(bench: Bench, settings: Settings, snr: float) -> Leakage | None:
@@ -320,6 +317,7 @@ def _planned(
     snr: float,
     cov: float,
     leakage: Leakage | None = None,
+    positions: FloatArray | None = None,
 ) -> RecordingPlan:
     welch = WelchSettings(
         sampling_rate=sampling_rate,
@@ -335,7 +333,7 @@ def _planned(
         snr=snr,
         cov=cov,
         settings=welch,
-        n_sensors=len(dims),
+        waves=waves_across(directions, dims, positions, snr=snr),
         leakage=leakage,
     )
 

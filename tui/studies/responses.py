@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback
 
 SEED = 20261123
-N_DRAWS = 200
+N_DRAWS = 800
 N_RUNS = 3
 NOISE = 1e-12
 RATE, MINUTES = 200.0, 20.0

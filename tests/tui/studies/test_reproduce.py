@@ -184,7 +184,7 @@ def test_a_point_off_theory_is_not_passed() -> None:
 def test_an_unknown_study_is_refused_before_anything_is_simulated() -> None:
     with pytest.raises(
         ScenarioError,
-        match=r"no study 'fig6'; expected fig4, .*clocks, verdicts, .*calibration, edges or all",
+        match=r"no study 'fig6'; expected fig4, .*clocks, verdicts, .*gradients or all",
     ):
         reproduce(["fig4", "fig6"], told=quiet)
     assert set(STUDIES) >= {"fig4", "fig5", "fig9", "fig12", "fig13", "setup1", "setup2", "fig14"}

@@ -194,7 +194,8 @@ def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
         return []
     unusual = [choice for choice in choices if choice.accepted and choice.n_factors != choice.usual]
     failing = [choice for choice in choices if choice.is_biased]
-    lines = [_choice(choice) for choice in unusual]
+    lines = _gradients([choice for choice in unusual if choice.gradients])
+    lines += [_choice(choice) for choice in unusual if not choice.gradients]
     if failing:
         bands = ", ".join(f"{choice.low:.3g}–{choice.high:.3g}" for choice in failing)
         lines.append(
@@ -216,6 +217,34 @@ def _dimensions(choices: Sequence[BandDimension]) -> list[str]:
     return lines
 
 
+def _gradients(choices: Sequence[BandDimension]) -> list[str]:
+    """Return the bands that gradients of the motion explain, and their cost in precision."""
+    if not choices:
+        return []
+    bands = ", ".join(f"{low:.3g}–{high:.3g}" for low, high in _joined(choices))
+    low, high = (f"{pick(each.cov for each in choices):.2g}" for pick in (min, max))
+    usual = max(each.usual_cov for each in choices)
+    return [
+        (
+            f"At {bands} Hz the motion and its gradients across the bench explain the averages; the"
+            f" c.o.v. of one frequency is {low if low == high else f'{low} to {high}'} instead of"
+            f" {usual:.2g}."
+        )
+    ]
+
+
+def _joined(choices: Sequence[BandDimension]) -> list[tuple[float, float]]:
+    """Return the edges of bands, neighbours taken together."""
+    spans: list[tuple[float, float]] = []
+    for choice in choices:
+        width = (choice.high - choice.low) / 4
+        if spans and choice.low - spans[-1][1] < width:
+            spans[-1] = (spans[-1][0], choice.high)
+        else:
+            spans.append((choice.low, choice.high))
+    return spans
+
+
 def _choice(choice: BandDimension) -> str:
     """Return an unusual dimension, and its cost in precision."""
     price = f"the c.o.v. of one frequency is {choice.cov:.2g}"
@@ -224,8 +253,6 @@ def _choice(choice: BandDimension) -> str:
     at = f"At {span(choice.low, choice.high)}"
     if choice.n_factors < choice.usual:
         return f"{at} the motion has {choice.n_factors} of {choice.usual} dimensions; {price}."
-    if choice.gradients:
-        return f"{at} the motion and its gradients across the bench explain the averages; {price}."
     return (
         f"{at} the sensors do not share one motion of {choice.usual} dimensions; "
         f"{choice.n_factors} dimensions explain the averages; {price}."
