@@ -13,7 +13,9 @@ starts at 1970-01-01T00:00:00Z. A row with NaN becomes a gap.
 from __future__ import annotations
 
 import math
+import struct
 import zipfile
+import zlib
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +25,7 @@ from daq.formats.foreign_sensor import ForeignSensor, finite_stretches
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import Any
+    from typing import Any, BinaryIO
 
     from numpy.typing import NDArray
 
@@ -31,6 +33,8 @@ _LARGE = 1 << 28
 _INFLATION = 100
 """Archives larger than 256 MB that are packed more tightly than this hold no samples."""
 RESERVED = ("sampling_rate", "start_time")
+_COMPRESSED = 15
+"""Kind of a compressed element of a MATLAB file, miCOMPRESSED."""
 
 
 def read_npz(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSensor, ...]:
@@ -96,6 +100,7 @@ def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
     from scipy.io import loadmat  # noqa: PLC0415 - takes long
 
     try:
+        _refuse_mat_bombs(path)
         found = loadmat(path)
     except NotImplementedError:
         arrays = _mat73(path)
@@ -104,6 +109,44 @@ def read_mat(path: Path, sampling_rate: float | None = None) -> tuple[ForeignSen
     else:
         arrays = {name: np.asarray(array) for name, array in found.items() if name[:2] != "__"}
     return _sensors(path, {name: _upright(array) for name, array in arrays.items()}, sampling_rate)
+
+
+def _refuse_mat_bombs(path: Path) -> None:
+    """Refuse compressed arrays of version 5 that become far more than they are.
+
+    After a header of 128 bytes an element has its kind and length (MAT-File Format, "Data Element
+    Format"). Its contents may lie about their size, so they are counted.
+
+    Raises
+    ------
+    ValueError
+        With the sizes.
+    """
+    with path.open("rb") as file:
+        header = file.read(128)
+        order = {b"IM": "<", b"MI": ">"}.get(header[126:])
+        if order is None:
+            return  # of another version
+        tag = struct.Struct(f"{order}II")
+        while len(head := file.read(tag.size)) == tag.size:
+            kind, packed = tag.unpack(head)
+            following = file.tell() + packed
+            if kind == _COMPRESSED:
+                _refuse_bomb("array", _inflated(file, packed), packed)
+            file.seek(following)
+
+
+def _inflated(file: BinaryIO, packed: int) -> int:
+    """Return how many bytes so many bytes become; a lower bound where these are too many."""
+    most = max(_LARGE, _INFLATION * packed)
+    inflate, size = zlib.decompressobj(), 0
+    while packed > 0 and size <= most and not inflate.eof:
+        content = file.read(min(packed, 1 << 16))
+        if not content:
+            break
+        packed -= len(content)
+        size += len(inflate.decompress(content))
+    return size
 
 
 def _mat73(path: Path) -> dict[str, NDArray[Any]]:

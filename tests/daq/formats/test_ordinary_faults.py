@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
+from daq.formats.readers import npz
 from daq.recording.reader import Recording
 
 if TYPE_CHECKING:
@@ -75,6 +79,18 @@ def test_an_archive_that_inflates_to_gigabytes_is_refused(tmp_path: Path) -> Non
             file.write(bytes(1 << 23))
     with pytest.raises(ImportFormatError, match=r"A\.npy: \d+ bytes that become 536871040"):
         import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+
+
+def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npz, "_LARGE", 1 << 20)  # of 256 MB, which would take a second
+    savemat(tmp_path / "a.mat", {"sampling_rate": 100.0, "A": SAMPLES}, do_compression=True)
+    packed = zlib.compress(bytes(1 << 22))
+    with (tmp_path / "a.mat").open("ab") as file:
+        file.write(struct.pack("<II", 15, len(packed)) + packed)
+    with pytest.raises(ImportFormatError, match=r"array: \d+ bytes that become 4194304"):
+        import_files([tmp_path / "a.mat"], tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize(
