@@ -136,8 +136,8 @@ def test_obspy_removes_the_same_response(tmp_path: Path) -> None:
         )
     band, theirs = welch(trace.data, RATE, nperseg=500)
     _, found = welch(ours, RATE, nperseg=500)
-    inside = (band > 0.1) & (band < 0.9 * RATE / 2)
-    assert np.abs(10 * np.log10(found / theirs))[inside].max() < 0.01
+    # The spectra have one window, so that what it leaks is in both.
+    assert np.abs(10 * np.log10(found / theirs))[band > 0].max() < 1e-4
 
 
 def test_a_gain_holds_at_its_own_frequency(tmp_path: Path) -> None:
