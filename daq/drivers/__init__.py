@@ -1,5 +1,5 @@
-"""Drivers: a thin shell of I/O around each protocol, behind one interface.
+"""Drivers: a thin layer of I/O around each protocol, with a common interface.
 
-A driver opens, identifies, configures and reads. It never retries, keeps indices across sessions
-or writes files; acquisition does.
+A driver opens a port, identifies and configures the device, and reads. Retries, indices across
+sessions and files are the task of :mod:`daq.acquisition`.
 """

@@ -1,4 +1,4 @@
-"""Bench files that must work on this computer, with the drivers installed here."""
+"""Bench files, checked against the drivers installed on this computer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class InstalledDrivers(Mapping[str, DriverType]):
-    """The installed drivers, each imported when it is looked up."""
+    """The installed drivers by name, each imported when it is looked up."""
 
     def __getitem__(self, name: str) -> DriverType:
         if name not in driver_names():
@@ -40,7 +40,7 @@ def load(path: str | Path) -> Bench:
     Raises
     ------
     BenchFileError
-        With every fault of the file, one a line.
+        With all errors in the file, one per line.
     """
     return loading.load(path, InstalledDrivers())
 
@@ -51,6 +51,6 @@ def parse(text: str, source: str | Path = "bench") -> Bench:
     Raises
     ------
     BenchFileError
-        With every fault of the text, one a line.
+        With all errors in the text, one per line.
     """
     return loading.parse(text, source, InstalledDrivers())

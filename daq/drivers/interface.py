@@ -1,14 +1,14 @@
-"""The seam between devices and the recorder.
+"""Interface between devices and the recorder.
 
-A driver serves one *port*, and all sensors of the bench file that name it: one sensor on a serial
-line, three on a digitizer with nine inputs, several slaves on one Modbus bus. It is a thin shell of
-I/O around a sans-IO protocol: open, configure, read, hand over. It does not retry, keep indices
-across sessions, or write files; the recorder does (``daq.acquisition.recorder``,
+A driver serves one *port*, and all sensors of the bench file on this port: one sensor on a serial
+line, three on a digitizer with nine inputs, several slaves on one Modbus bus. It is a thin layer of
+I/O around a sans-IO protocol: it opens, configures, reads, and yields blocks. The recorder retries,
+keeps indices across sessions, and writes files (``daq.acquisition.recorder``,
 ``daq.acquisition.sample_index``).
 
 A third-party package adds a driver by an entry point in the group ``huddle.drivers`` that names a
-:class:`DriverType`. A driver that can check its part of the bench file has the method ``check`` as
-well (:class:`daq.bench.driver_rules.Checking`).
+:class:`DriverType`. A driver that can check its part of the bench file also has the method
+``check`` (:class:`daq.bench.driver_rules.Checking`).
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ if TYPE_CHECKING:
 
 
 DEFAULT_PATIENCE = 10.0
-"""Seconds without a block after which a port is lost, if its session states nothing else."""
+"""Default of :attr:`PatientSession.patience`, in s."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInformation:
-    """What a device says about itself; empty or None where it does not say."""
+    """Information that a device reports; empty or None if it reports none."""
 
     sensor: str
     model: str = ""
     serial_number: str = ""
     firmware: str = ""
     sampling_rate: float | None = None
-    """Actual sampling rate in Hz as read back from the device."""
+    """Actual sampling rate in Hz, read from the device."""
     temperature: float | None = None
-    """In °C."""
+    """Temperature in °C."""
     details: dict[str, str] = field(default_factory=dict)
     trouble: str = ""
-    """Why nothing is known: one of several on its port that does not answer. The driver goes on
-    asking; a run does not begin without it."""
+    """Why no information is available: one of several devices on the port does not reply. The
+    driver keeps polling; a run does not start without the device."""
 
 
 class Session(Protocol):
@@ -54,30 +54,30 @@ class Session(Protocol):
 
     @property
     def information(self) -> tuple[DeviceInformation, ...]:
-        """One entry per sensor, as read when the session was opened."""
+        """One entry per sensor, read when the session was opened."""
         ...
 
     def read(self) -> AsyncIterator[Block | Event]:
-        """Start sampling and yield what comes, until closed.
+        """Start sampling and yield blocks and events, until closed.
 
         Raises
         ------
         NotConnectedError
-            The port went away.
+            If the port disappears.
         NoAnswerError
-            The device stopped sending.
+            If the device stops sending.
         RemoteProtocolError
-            The device sends what its protocol does not allow.
+            If the device violates its protocol.
         """
         ...
 
 
 class DriverType(DriverRules, Protocol):
-    """What an entry point in ``huddle.drivers`` names."""
+    """A driver, the target of an entry point in ``huddle.drivers``."""
 
     @property
     def name(self) -> str:
-        """As in the bench file's ``driver = "…"``."""
+        """Name in the bench file: ``driver = "…"``."""
         ...
 
     @property
@@ -88,71 +88,71 @@ class DriverType(DriverRules, Protocol):
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[Session]:
-        """Open the port, identify and configure the device; leave it quiet and closed on exit.
+        """Open the port, identify and configure the device; on exit, leave it idle and closed.
 
         Raises
         ------
         NotConnectedError, NoAnswerError, WrongDeviceError
-            Each naming sensor, port, what was expected and what came.
+            With sensor, port, expected and received values.
         """
         ...
 
 
 class PatientSession(Session, Protocol):
-    """A session that states how long its device may be silent without being lost.
+    """A session that states how long its device may be silent before it counts as lost.
 
-    The recorder alone decides that a silent port is lost; :meth:`Session.read` sets no time limit
-    of its own. A sensor is *late* two block periods after its last block. Its port is *lost*, and
-    is opened again, after the longest of ``patience``, twice the longest recent interval between
-    blocks, and what earlier sessions on the port have taught. A device that pauses for less and
-    then delivers everything has lost nothing, and neither has the recording.
+    Only the recorder decides that a silent port is lost; :meth:`Session.read` has no time limit. A
+    sensor is *late* two block periods after its last block. Its port is *lost*, and opened again,
+    after the longest of ``patience``, twice the longest recent interval between blocks, and the
+    interval learned from earlier sessions on the port. A device that pauses for less and then
+    delivers all samples causes no gap.
 
-    A driver that can tell a silent device from one that has stopped (one that answers and says that
-    it does not sample) ends the session at once with ``NoAnswerError``.
+    If the driver can distinguish a silent device from one that stopped (one that replies that it
+    does not sample), it ends the session immediately with ``NoAnswerError``.
     """
 
     @property
     def patience(self) -> float:
-        """Seconds of the device's time without a block after which the port is lost.
+        """Seconds without a block after which the port is lost; ``DEFAULT_PATIENCE`` if missing.
 
-        The length of the buffer in the device, if longer than ``DEFAULT_PATIENCE``, or the user's
-        own setting. Sessions that state nothing have ``DEFAULT_PATIENCE``.
+        Use the user's setting, else the length of the device's buffer if that is longer than
+        ``DEFAULT_PATIENCE``.
         """
         ...
 
     @property
     def hint(self) -> str:
-        """What to check if no block comes; the end of the error message. May be missing."""
+        """Advice if no block arrives; ends the error message. Optional."""
         ...
 
     @property
     def recovers(self) -> bool:
-        """Whether the device recovers from an overflow, and is not stalled. May be missing."""
+        """Whether the device is recovering from an overflow, and not stalled. Optional."""
         ...
 
 
 class ResumedSession(Session, Protocol):
-    """A session that may go on where another ended."""
+    """A session that may continue an earlier one."""
 
     @property
     def resumed(self) -> bool:
-        """Whether its blocks are in the index of the session before."""
+        """Whether its blocks continue the index of the session before."""
         ...
 
 
 @runtime_checkable
 class Resuming(Protocol):
-    """A driver (:class:`DriverType`) of devices that count on while nobody can hear them.
+    """A driver (:class:`DriverType`) of devices that continue to count while disconnected.
 
-    With a counter that runs on, what is missing is known exactly. The driver decides whether it
-    does: where the device was restarted, or may have been, it opens it as at first.
+    The counter then gives the exact number of missing samples. The driver decides whether the count
+    continued: if the device was restarted, or may have been, the driver opens it as at the start.
     """
 
     def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AbstractAsyncContextManager[ResumedSession]:
-        """Open a port again after ``before``, the last session there, was lost.
+        """Open a port again, as :meth:`DriverType.open`.
 
-        As :meth:`DriverType.open`; ``before`` is over.
+        ``before`` is the last session on the port; it was lost and has ended.
         """
         ...

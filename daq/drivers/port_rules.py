@@ -1,4 +1,4 @@
-"""Checks of a bench file: what a port must be, and what all its sensors must agree on."""
+"""Checks of a bench file: addresses of ports, and common settings of the sensors of a port."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def require_alike(
     Raises
     ------
     BenchFileError
-        If a later sensor gives another value than the first, whose value is used.
+        If a sensor's value differs from that of the first sensor, which applies.
     """
     first = sensors[0]
     for sensor in sensors[1:]:
@@ -58,12 +58,12 @@ def require_alike(
 
 
 def require_address(sensor: Sensor) -> None:
-    """Check that a network port is an address, and any other a device.
+    """Check that the port of a sensor is a network address or a serial device.
 
     Raises
     ------
     BenchFileError
-        If it is none.
+        If it is neither.
     """
     if sensor.port.startswith(NETWORK):
         try:

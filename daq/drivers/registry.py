@@ -1,6 +1,6 @@
-"""Which drivers there are: entry points in the group ``huddle.drivers``.
+"""The installed drivers: entry points in the group ``huddle.drivers``.
 
-A third-party package adds one by naming a :class:`~daq.drivers.interface.DriverType` in its
+A third-party package adds a driver by naming a :class:`~daq.drivers.interface.DriverType` in its
 metadata:
 
 .. code-block:: toml
@@ -8,8 +8,8 @@ metadata:
     [project.entry-points."huddle.drivers"]
     mydevice = "mypackage.driver:DRIVER"
 
-One that cannot be imported, or is no driver, is an error where it is asked for; the others are as
-good as without it.
+A driver that cannot be imported, or that lacks parts of the interface, raises an error only when it
+is requested. Other drivers are not affected.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def driver_type(name: str) -> DriverType:
     Raises
     ------
     ValueError
-        Saying which drivers there are.
+        If no driver has this name; the message lists all names.
     DriverError
-        Its package cannot be imported, or what it names is no driver.
+        If the driver cannot be imported, or lacks parts of the interface.
     """
     if name not in _entry_points():
         raise ValueError(
@@ -57,7 +57,7 @@ def driver_type(name: str) -> DriverType:
     which = f"driver {name!r} ({point.value}{package})"
     try:
         driver = point.load()
-    except Exception as error:  # it runs somebody's module
+    except Exception as error:  # third-party code may raise anything
         raise DriverError(
             f"{which} cannot be imported: {type(error).__name__}: {error};"
             " reinstall or remove that package"

@@ -1,12 +1,12 @@
-"""Driver for SeedLink servers: seismic digitizers and what passes their records on.
+"""Driver for SeedLink servers: seismic digitizers and servers that forward their records.
 
-``port`` is ``seedlink://host`` or ``seedlink://host:port`` (18000, if not given). All sensors of a
-port share one connection. Version 4 of the protocol is spoken where the server offers it, else 3.
+``port`` is ``seedlink://host`` or ``seedlink://host:port`` (default 18000). All sensors of a port
+share one connection. The driver uses version 4 of the protocol if the server offers it, else 3.
 
-Blocks state the digitizer's UTC, so no clock is fitted. After a connection was lost the next one
-goes on with the packet after the last that came, of each station: nothing is lost for as long as
-the server keeps its packets, and what comes twice is recorded once. What the server no longer has
-is a gap of exact length.
+Blocks state the digitizer's UTC, so no clock model is fitted. After a reconnection each station
+continues with the packet after its last one. No samples are lost while the server still has the
+packets, and repeated samples are recorded once. Packets that the server no longer has become a gap
+of exact length.
 """
 
 from __future__ import annotations
@@ -60,22 +60,22 @@ class SeedLinkSettings(BaseModel):
     station: Code
     """Code of the station."""
     location: Annotated[str, Field(pattern=r"^(\*|--|[A-Z0-9?]{2})$")] = "*"
-    """Location code, ``"--"`` if it is blank, ``"*"`` for any; ``?`` stands for any character."""
+    """Location code, ``"--"`` if blank, ``"*"`` for any; ``?`` matches any character."""
     channels: Annotated[tuple[ChannelPattern, ...], Strict(strict=False)] | None = None
-    """Code of each channel, as ``["HNZ", "HNN", "HNE"]``, or one pattern for all of them, as
-    ``["HN?"]``, whose channels are taken in the order Z, N, E, 1, 2, 3. The names of the sensor's
-    channels, if not given."""
+    """Code of each channel, such as ``["HNZ", "HNN", "HNE"]``, or one pattern for all, such as
+    ``["HN?"]``, whose channels are in the order Z, N, E, 1, 2, 3. Default: the names of the
+    sensor's channels."""
     protocol: Literal["auto", "3", "4"] = "auto"
-    """Version of SeedLink: 4 where the server offers it, if not given."""
+    """Version of SeedLink; default: 4 if the server offers it, else 3."""
     samples: Literal["int32", "float32", "float64"] = "int32"
     """Type of the samples in the records."""
     late: PositiveFloat = 10.0
-    """Seconds that a hole waits for a record that comes late."""
+    """Seconds to wait for a late record before a hole becomes a gap."""
     patience: PositiveFloat = 60.0
-    """Seconds without a record after which the server is lost and connected again."""
+    """Seconds without a record after which the server is lost and reconnected."""
 
     def selection(self, sensor: Sensor) -> Selection:
-        """Return which streams the sensor has; raises BenchFileError."""
+        """Return the selection of the sensor's streams; raise BenchFileError if invalid."""
         n_channels = len(sensor.channels)
         codes = self.channels or tuple(channel.name for channel in sensor.channels)
         fits = len(codes) in {1, n_channels} and all(len(code) == 3 for code in codes)
@@ -90,7 +90,7 @@ class SeedLinkSettings(BaseModel):
 
 
 class SeedLinkSession:
-    """A server that sends; all streams of at least one sensor have been heard."""
+    """A server that sends; all streams of at least one sensor have been received."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class SeedLinkSession:
         """Whether blocks continue the index of the session before."""
         self.patience = patience
         """See :class:`daq.drivers.interface.PatientSession`."""
-        self.hint = "the server sends no records; does its digitizer run?"
+        self.hint = "the server sends no records; check its digitizer"
         self._stream = stream
         self._heard = heard
 
@@ -142,13 +142,13 @@ class SeedLinkDriver:
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[SeedLinkSession]:
-        """Connect, choose stations, and listen until every stream has been heard."""
+        """Connect, select stations, and listen until every stream has been received."""
         return _opened(sensors, clock, None)
 
     def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AbstractAsyncContextManager[SeedLinkSession]:
-        """Do the same from the packets after the last that came on."""
+        """Open, and continue after the last received packets."""
         return _opened(sensors, clock, before if isinstance(before, SeedLinkSession) else None)
 
 
@@ -212,13 +212,13 @@ class _Server:
         self.version: Version = 3
         self.software = self.organisation = ""
         self.rest: tuple[bytes, HostTime] | None = None
-        """What came after the last reply."""
+        """Bytes received after the last reply."""
         self._stream = stream
         self._buffer = b""
         self._at: HostTime | None = None
 
     async def greet(self, wanted: str) -> None:
-        """Ask who it is, and settle on a version of the protocol."""
+        """Request the server's name, and select the version of the protocol."""
         await self._send("HELLO")
         self.software, self.organisation = await self._line("HELLO"), await self._line("HELLO")
         if "seedlink" not in self.software.lower():
@@ -228,7 +228,7 @@ class _Server:
         offered = packets.speaks_version_4(self.software)
         if wanted == "4" and not offered:
             raise WrongDeviceError(
-                f"{self._stream.label}: settings.protocol is 4, and the server does not offer it:"
+                f"{self._stream.label}: settings.protocol is 4, but the server does not offer it:"
                 f" {self.software[:80]!r}"
             )
         if offered and wanted != "3":
@@ -238,7 +238,7 @@ class _Server:
     async def choose(
         self, selections: Mapping[str, Selection], last: Mapping[str, tuple[int, int]]
     ) -> None:
-        """Choose stations and channels, and begin."""
+        """Select stations and channels, and start the transfer."""
         stations: dict[str, list[Selection]] = {}
         for selection in selections.values():
             stations.setdefault(selection.station_id, []).append(selection)
@@ -289,7 +289,7 @@ class _Server:
 async def _listen(
     stream: ByteStream, decoder: SeedLinkDecoder, seconds: float, heard: list[Block | Event]
 ) -> None:
-    """Listen until the streams of every sensor are known; those of some may never come."""
+    """Listen until the streams of every sensor are decided, for at most ``seconds``."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             while decoder.silent:
@@ -310,7 +310,7 @@ def _information(
             there = ", ".join(decoder.heard(sensor.name)) or "none"
             settings = SeedLinkSettings.model_validate(sensor.settings)
             trouble = (
-                f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} were not heard in"
+                f"{label}: the {len(sensor.channels)} streams of {sensor.name!r} not received in"
                 f" {patience:g} s; of {settings.network}.{settings.station} that match: {there}"
             )
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
@@ -319,7 +319,7 @@ def _information(
         if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-6:
             raise WrongDeviceError(
                 f"{label}: {sensor.name!r}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz;"
-                " correct sampling_rate, or choose other channels"
+                " correct sampling_rate, or select other channels"
             )
         details = {
             "server": server.software[:80],

@@ -1,12 +1,11 @@
 """Driver for devices that send delimited text over a serial line, TCP or UDP.
 
-``preset`` gives a known device's format, and any setting beside it changes that; see
-:mod:`daq.protocols.text.decoder` for what a format is made of. Ports: serial,
-``socket://host:port``, and ``udp://address:port`` to listen at (``udp://0.0.0.0:8888`` for any
-interface).
+``preset`` selects the format of a known device; other settings override it.
+:mod:`daq.protocols.text.decoder` describes formats. Ports: serial, ``socket://host:port``, and
+``udp://address:port`` to listen on (``udp://0.0.0.0:8888`` for any interface).
 
-A device that is quiet until told sends after ``start``, and ``stop`` is sent in the end: LILY
-tiltmeters take ``*9900XYC2`` and ``*9900XYC-OFF``.
+Some devices send only after a command: the driver sends ``start`` at the start and ``stop`` at the
+end. LILY tiltmeters need ``*9900XYC2`` and ``*9900XYC-OFF``.
 """
 
 from __future__ import annotations
@@ -63,44 +62,44 @@ class TextSettings(BaseModel):
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
     layout: Literal["row", "labelled", "json", "channel"] | None = None
-    """"row": a line is one sample of every channel. "labelled": the same as ``X:1 Y:2``. "json":
-    the same as a JSON object. "channel": name, time, samples of one channel."""
+    """"row": one line per sample of every channel. "labelled": likewise, as ``X:1 Y:2``. "json":
+    likewise, as a JSON object. "channel": name, time, samples of one channel."""
     delimiter: str | None = None
     terminator: Annotated[str, Field(min_length=1)] | None = None
     prefix: str | None = None
     suffix: str | None = None
     tag: str | None = None
-    """What the first field of a row must be."""
+    """Required value of the first field of a row."""
     columns: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Strict(strict=False)] | None = None
-    """Field of each channel, counted from 0 (layout "row"); the first ones, if not given."""
+    """Field of each channel, counted from 0 (layout "row"); default: the first fields."""
     channel_names: Annotated[tuple[str, ...], Strict(strict=False)] | None = None
-    """Name of each channel in the messages (not in layout "row"); the channels' own, if not given.
-    In layout "json" also ``acc.0`` for the first entry of a list."""
+    """Name of each channel in the messages (not in layout "row"); default: the channels' names. In
+    layout "json", ``acc.0`` is the first entry of the list ``acc``."""
     time_column: Annotated[int, Field(ge=0)] | str | None = None
     """Field of the time: its number (layout "row") or name."""
     time_format: str | None = None
-    """"epoch" (seconds since 1970), as Python's strptime has it (UTC), or "millis" or "micros"
-    since the device was started."""
+    """"epoch" (seconds since 1970), a format of Python's strptime (UTC), or "millis" or "micros"
+    since the start of the device."""
     counter_column: Annotated[int, Field(ge=0)] | str | None = None
     counter_modulus: PositiveInt | None = None
     nmea_checksum: bool | None = None
     whole: bool | None = None
-    """Whether samples are whole numbers."""
+    """Whether samples are integers."""
     decimal_comma: bool | None = None
     """Whether numbers are written ``1,5``."""
     hexadecimal_bits: Annotated[int, Field(ge=4, le=32)] | None = None
     """Bits of samples written in hexadecimal, two's complement."""
     device_time: bool | None = None
-    """Whether the device's time is the clock, instead of arrival."""
+    """Whether the device's time is used as clock, instead of the arrival."""
     start: str = ""
-    """Sent to the device to make it send."""
+    """Command that starts the device."""
     stop: str = ""
-    """Sent in the end."""
+    """Command that stops the device."""
     baud_rate: PositiveInt = 19200
     parity: Literal["N", "E", "O"] = "N"
     patience: PositiveFloat = DEFAULT_PATIENCE
-    """Seconds without samples after which the device is lost and connected again; for a device that
-    sends more seldom than every minute, at least twice that interval."""
+    """Seconds without samples after which the device is lost and reconnected. If the device sends
+    less often than every minute, set at least twice its interval."""
 
     @field_validator("time_format")
     @classmethod
@@ -108,18 +107,19 @@ class TextSettings(BaseModel):
         known = value is None or value == "epoch" or value in SINCE_START
         if not known and not is_readable(value or ""):
             raise ValueError(
-                'expected "epoch", "millis", "micros", or date and time as Python\'s strptime has'
-                ' them, such as "%Y-%m-%d %H:%M:%S.%f"'
+                'expected "epoch", "millis", "micros", or date and time in a format of Python\'s'
+                ' strptime, such as "%Y-%m-%d %H:%M:%S.%f"'
             )
         return value
 
     def format_for(self, sensor: Sensor) -> TextFormat:
-        """Return the format these settings come to.
+        """Return the format of these settings.
 
         Raises
         ------
         BenchFileError
-            There is not one column, or one name, for each channel; or messages could not be read.
+            If the number of columns or names differs from the number of channels, or the settings
+            contradict each other.
         """
         given = {
             field.name: value
@@ -141,7 +141,7 @@ class TextSettings(BaseModel):
         if format_.terminator in format_.delimiter:
             expected = (
                 f"is in settings.delimiter = {toml_value(format_.delimiter)}; expected one that"
-                " ends a message and not a field"
+                " ends a message, not a field"
             )
             raise BenchFileError(
                 FileFault("settings.terminator", expected, format_.terminator, sensor.name)
@@ -151,7 +151,7 @@ class TextSettings(BaseModel):
 
 
 def _check_format(format_: TextFormat, sensor: Sensor) -> None:
-    """Raise BenchFileError for settings that do not go together."""
+    """Raise BenchFileError for settings that contradict each other."""
     if format_.device_time and format_.layout != "channel" and format_.time_column is None:
         expected = "expected settings.time_column with it"
         raise BenchFileError(FileFault("settings.device_time", expected, True, sensor.name))
@@ -170,7 +170,7 @@ def _check_format(format_: TextFormat, sensor: Sensor) -> None:
 
 
 class _Source(Protocol):
-    """Where the text comes from."""
+    """Source of the text."""
 
     async def receive(self) -> list[Block | Event]: ...
     async def send(self, payload: bytes) -> None: ...
@@ -205,19 +205,19 @@ class _DatagramSource:
         found = self._decoder.receive_datagram(received, at)
         for host in sorted(self._stream.strangers - self._told):
             self._told.add(host)
-            text = f"datagrams from {host} are left out: another device sends to this port"
+            text = f"datagrams from {host} are ignored: another device sends to this port"
             found.append(Event(self._sensor, EventKind.STATUS, text, at))
         return found
 
     async def send(self, payload: bytes) -> None:
-        """Do nothing: it listens only."""
+        """Do nothing: the source only listens."""
 
     def discard(self) -> None:
         self._stream.discard()
 
 
 class TextSession:
-    """A port at which text comes, or will when asked for."""
+    """An open port; the device sends by itself or after the start command."""
 
     def __init__(
         self,
@@ -234,26 +234,26 @@ class TextSession:
         self._settings = settings
         self._decoder = decoder
         self._advice = (
-            "does the device cast to this computer and port, and does a firewall let it pass?"
+            "check that the device sends to this computer and port, and that no firewall blocks it"
             if isinstance(source, _DatagramSource)
             else "check cable, power, settings.baud_rate and settings.start"
         )
 
     @property
     def hint(self) -> str:
-        """What to check if no block comes: the format, if there are rows and none could be read."""
+        """Advice if no block arrives: on the format, if rows arrive but none is readable."""
         rows = self._decoder.first_rows
         if not rows:
             return self._advice
         shown = ", ".join(repr(row[:60].decode("ascii", "replace")) for row in rows[:2])
         guess = guess_settings(rows)
         if guess is None:
-            return f"rows came that settings do not match: {shown}; is settings.baud_rate right?"
+            return f"received rows that settings do not match: {shown}; check settings.baud_rate"
         would = ", ".join(f"{key} = {toml_value(value)}" for key, value in guess.items())
-        return f"rows came that settings do not match: {shown}; these would: {would}"
+        return f"received rows that settings do not match: {shown}; these would: {would}"
 
     async def read(self) -> AsyncIterator[Block | Event]:
-        """Ask for samples and yield blocks of them."""
+        """Start the device and yield blocks and events."""
         self._source.discard()
         if self._settings.start:
             await self._source.send(self._settings.start.encode())
@@ -271,7 +271,7 @@ class TextDriver:
     shares_clock = False
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return int32 for whole numbers, float64 else."""
+        """Return int32 for integers, else float64."""
         return TextSettings.model_validate(sensor.settings).format_for(sensor).dtype
 
     def check(self, sensors: Sequence[Sensor]) -> None:
@@ -301,7 +301,7 @@ class TextDriver:
 
 
 def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, TextSettings, TextFormat]:
-    """Return the sensor, its settings and format; raise BenchFileError for what cannot be."""
+    """Return the sensor, its settings and format; raise BenchFileError if they are invalid."""
     sensor = only(sensors, "text comes from one")
     settings = TextSettings.model_validate(sensor.settings)
     for key in ("start", "stop"):

@@ -119,7 +119,7 @@ async def test_every_trigger_makes_a_sample(running: Running) -> None:
 
 async def test_without_a_trigger_there_is_no_sample(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "trigger-rising"})
-    with pytest.raises(NoAnswerError, match="one for each trigger: is there a signal at EXT"):
+    with pytest.raises(NoAnswerError, match="one per trigger; check the signal at EXT"):
         await record(DRIVER, sensor, 1, speed=SPEED)
 
 

@@ -205,7 +205,7 @@ async def test_silence_and_strangers_are_told_apart() -> None:
         with pytest.raises(NoAnswerError, match=r"'A' on socket://.* got nothing; check cable"):
             await blocks(sensor, 1)
         talks = True
-        with pytest.raises(WrongDeviceError, match=r"no Epson .* got 6c 6f 67 69 6e 3a 20"):
+        with pytest.raises(WrongDeviceError, match=r"not an Epson .* got 6c 6f 67 69 6e 3a 20"):
             await blocks(sensor, 1)
         await asyncio.gather(*filter(None, tasks))
 

@@ -1,4 +1,4 @@
-"""Identify an Epson accelerometer and set it up: its settings in the bench file, its registers."""
+"""Settings, identification and configuration of an Epson accelerometer."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 REPLY_TIMEOUT = 0.3
 QUIET = 0.03
-"""Without a byte for so long, in s, the device has stopped streaming: six frames at 200 Hz."""
+"""Silence after which the device has stopped streaming, in s: six frames at 200 Hz."""
 ATTEMPTS, READ_ATTEMPTS = 5, 3
 SETTLE_TIMEOUT = 3.0
-"""For the device to get ready (flash, reset) or change its mode or filter, s."""
+"""Maximum time for the device to start (flash, reset) or change its mode or filter, s."""
 WRITE_INTERVAL = 0.002
-"""Seconds from one command to the next; the data sheet asks for 350 µs (also after selecting a
-window), and a USB adapter may join what is written within one of its frames of 1 ms."""
+"""Time between two commands, s. The data sheet requires 350 µs, also after selecting a window. A
+USB adapter may join commands written within one of its frames of 1 ms."""
 
 Field = Literal["x", "y", "z", "temperature"]
 EXTERNAL = {
@@ -52,27 +52,27 @@ class EpsonSettings(BaseModel):
     )
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
-    """As the device is set (it leaves the factory at 460800)."""
+    """Baud rate of the device (460800 by default)."""
     filter: str | None = None
-    """Name of the filter; the usual one for model and sampling rate if not given."""
+    """Name of the filter; default: the one for model and sampling rate."""
     fields: Annotated[tuple[Field, ...], Strict(strict=False)] | None = None
-    """What each channel is, in order; x, y, z, and temperature for an auxiliary channel."""
+    """Field of each channel, in order: x, y, z, and temperature for an auxiliary channel."""
     flags: bool = True
-    """Whether bursts carry the error flag."""
+    """Whether bursts contain the error flag."""
     tilt: bool = False
     """Whether x, y, z are tilt angles instead of accelerations."""
     reduced_noise: bool = False
-    """The reduced-noise-floor condition of the M-A352."""
+    """Whether an M-A352 uses its reduced-noise-floor condition."""
     temperature_stabilisation: bool | None = None
-    """Bias stabilisation against thermal shock of the M-A352; on there, if not given."""
+    """Whether an M-A352 stabilises its bias against thermal shock; default: yes."""
     external: Literal["off", "trigger-rising", "trigger-falling", "pps-rising", "pps-falling"] = (
         "off"
     )
-    """What the EXT pin does; 1PPS on the M-A370 only."""
+    """Function of the EXT pin; 1PPS on the M-A370 only."""
     full_scale: PositiveFloat = 15.0
-    """In g, peak; samples beyond are marked as clipped."""
+    """Full scale in g, peak; samples beyond are marked as clipped."""
     patience: PositiveFloat = DEFAULT_PATIENCE
-    """Seconds without a frame after which the device is lost and connected again."""
+    """Seconds without a frame after which the device is lost and reconnected."""
 
     @field_validator("filter")
     @classmethod
@@ -84,7 +84,7 @@ class EpsonSettings(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """What a sensor's settings come to in the device's registers."""
+    """Contents of the device's registers for a sensor's settings."""
 
     sampling_rate: int
     filter: str
@@ -95,9 +95,14 @@ class Configuration:
 
     @classmethod
     def of(cls, sensor: Sensor, model: str = "") -> Configuration:
-        """Raise BenchFileError for what the device cannot do.
+        """Return the configuration of a sensor.
 
-        ``model`` is what the device says it is; until it is asked, what the bench file says holds.
+        ``model`` is the model that the device reports; if empty, the bench file's model applies.
+
+        Raises
+        ------
+        BenchFileError
+            If the device lacks a setting.
         """
         settings = EpsonSettings.model_validate(sensor.settings)
         model = (model or sensor.model).upper()
@@ -137,16 +142,16 @@ class Configuration:
 
     @property
     def is_triggered(self) -> bool:
-        """Whether each sample waits for a signal at the EXT pin."""
+        """Whether a signal at the EXT pin triggers each sample."""
         return self.settings.external.startswith("trigger")
 
     @property
     def hint(self) -> str:
-        """What to look at if no sample comes."""
-        return ", one for each trigger: is there a signal at EXT?" if self.is_triggered else ""
+        """Advice for the error message if no sample arrives."""
+        return ", one per trigger; check the signal at EXT" if self.is_triggered else ""
 
     def decoder(self, sensor: str) -> BurstDecoder:
-        """Return a decoder of the bursts the device will send."""
+        """Return a decoder of the configured bursts."""
         full_scale = self.settings.full_scale * commands.COUNTS_PER_G
         return BurstDecoder(
             sensor,
@@ -157,7 +162,7 @@ class Configuration:
         )
 
     def writes(self) -> list[tuple[Register, bool, int]]:
-        """Return what to set: which register, whether its high byte, and to what."""
+        """Return the writes: register, whether its high byte, value."""
         s, burst_ctrl = self.settings, self.burst.burst_ctrl
         stabilises = s.temperature_stabilisation
         if stabilises is None:
@@ -178,7 +183,7 @@ class Configuration:
 
 
 def _lacking(settings: EpsonSettings, model: str) -> FileFault | None:
-    """Return a setting that a model does not have; None if it has all, or is not known."""
+    """Return a fault for a setting that the model lacks; None if there is none."""
     if "A370" in model:
         if settings.filter in commands.NOT_ON_A370:
             known = ", ".join(name for name in commands.FILTERS if name not in commands.NOT_ON_A370)
@@ -192,7 +197,7 @@ def _lacking(settings: EpsonSettings, model: str) -> FileFault | None:
 
 
 class Device:
-    """Registers of one device in configuration mode."""
+    """Access to the registers of one device in configuration mode."""
 
     def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
         self.stream = stream
@@ -200,13 +205,13 @@ class Device:
         self._stream = stream
 
     async def _send(self, payload: bytes) -> None:
-        """Send commands of three bytes each, every one by itself."""
+        """Send commands of three bytes one by one, ``WRITE_INTERVAL`` apart."""
         for start in range(0, len(payload), commands.SIZE):
             await self._stream.write(payload[start : start + commands.SIZE])
             await asyncio.sleep(WRITE_INTERVAL)
 
     async def ask(self, register: Register) -> None:
-        """Ask for a register, and leave what comes to the caller."""
+        """Request a register without waiting for the reply."""
         await self._stream.write(bytes([commands.DELIMITER]))
         await asyncio.sleep(WRITE_INTERVAL)
         await self._send(commands.read(register))
@@ -216,7 +221,7 @@ class Device:
         await self._send(commands.write(register, value, high=high))
 
     async def read(self, register: Register) -> int:
-        """Read a register; an answer that was lost on the way is asked for again."""
+        """Read a register; repeat the request if the reply is lost."""
         for _ in range(READ_ATTEMPTS - 1):
             with contextlib.suppress(NoAnswerError, WrongDeviceError):
                 return await self._read(register)
@@ -236,7 +241,7 @@ class Device:
         expected = f"expected {register.address:02X} xx xx 0D for register {register.address:02X}"
         if received:
             raise WrongDeviceError(
-                f"{self._stream.label}: no Epson accelerometer: {expected} of window"
+                f"{self._stream.label}: not an Epson accelerometer: {expected} of window"
                 f" {register.window}, got {received[-16:].hex(' ')}"
             )
         raise NoAnswerError(
@@ -245,7 +250,7 @@ class Device:
         )
 
     async def wait_clear(self, register: Register, bits: int, doing: str) -> int:
-        """Read a register until bits of it are clear; return it."""
+        """Read a register until ``bits`` are clear; return its value."""
         try:
             async with asyncio.timeout(SETTLE_TIMEOUT):
                 while (value := await self.read(register)) & bits:
@@ -257,7 +262,7 @@ class Device:
         return value
 
     async def stop(self) -> None:
-        """Enter configuration mode and let what was on its way pass."""
+        """Enter configuration mode and discard the remaining frames."""
         await self.write(commands.MODE_CTRL, commands.CONFIGURATION, high=True)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SETTLE_TIMEOUT):
@@ -266,7 +271,7 @@ class Device:
                         await self._stream.read()
 
     async def identify(self, attempts: int = ATTEMPTS) -> None:
-        """Find the device, streaming or not, in the middle of a command or not."""
+        """Find the device, whether it is streaming, idle, or waiting for the rest of a command."""
         failure: DeviceError | None = None
         for _ in range(attempts):
             await self.stop()
@@ -286,7 +291,7 @@ class Device:
             raise failure
 
     async def answer(self) -> tuple[bytes, HostTime] | None:
-        """Ask for the ID, which disturbs no stream; return what comes, None if nothing does."""
+        """Request the ID, which disturbs no stream; return the next bytes, or None if silent."""
         for _ in range(READ_ATTEMPTS - 1):
             await self.ask(commands.ID)
             with contextlib.suppress(TimeoutError):
@@ -295,7 +300,13 @@ class Device:
         return None
 
     async def information(self) -> DeviceInformation:
-        """Read what the device says about itself; refuse it if it is not the one expected."""
+        """Read the device's information.
+
+        Raises
+        ------
+        WrongDeviceError
+            If model or serial number differ from the bench file.
+        """
         await self.wait_clear(commands.GLOB_CMD, commands.NOT_READY, "starting")
         model, serial_number = await self._identity()
         if refusal := self._refusal(model, serial_number):
@@ -315,9 +326,10 @@ class Device:
         )
 
     async def _identity(self) -> tuple[str, str]:
-        """Return model and serial number, read twice alike: replies bear no checksum.
+        """Return model and serial number.
 
-        A wrong one would be taken for the device's own, and the device refused ever after.
+        Replies have no checksum, so both are read until two readings agree: a wrong serial number
+        would be recorded, and the device refused at every reconnection.
         """
         before: tuple[str, str] | None = None
         for _ in range(ATTEMPTS):
@@ -327,12 +339,12 @@ class Device:
                 return found
             before = found
         raise WrongDeviceError(
-            f"{self._stream.label}: model and serial number differ each time they are read,"
+            f"{self._stream.label}: model and serial number differ at each reading,"
             f" last {' '.join(before or ())!r}; check the cable"
         )
 
     def _refusal(self, model: str, serial_number: str) -> str:
-        """Say why this is not the device the bench file names; nothing if it is."""
+        """Return how this device differs from the bench file; empty if it does not."""
         wanted = self._sensor.model
         named = re.search(r"A\d{3}", wanted.upper())
         if named and named[0] not in model:
@@ -342,12 +354,12 @@ class Device:
         return ""
 
     async def sampling_rate(self) -> float | None:
-        """Read the rate the device is set to, in Hz."""
+        """Read the configured sampling rate in Hz; None if its code is unknown."""
         code = await self.read(commands.SMPL_CTRL) >> 8
         return next((float(rate) for rate, c in commands.RATES.items() if c == code), None)
 
     async def configure(self, configuration: Configuration) -> None:
-        """Set every register that matters, and read each back."""
+        """Set every relevant register, and read each back."""
         for register, high, value in configuration.writes():
             await self._set(register, value, high=high)
         for register, high, value in configuration.writes():
@@ -360,7 +372,7 @@ class Device:
                 raise WrongDeviceError(
                     f"{self._stream.label}: register {register.address + high:02X} of window"
                     f" {register.window} was set to {value:02X} and reads {found:02X}:"
-                    " this model does not have that setting"
+                    " this model lacks that setting"
                 )
 
     async def _set(self, register: Register, value: int, *, high: bool) -> None:

@@ -1,15 +1,17 @@
 """Driver for Epson M-A352 and M-A370 accelerometers on a UART.
 
-The device is put into configuration mode (it may be found streaming from before), identified, set
-up completely and read back, and streams by itself (UART_AUTO) until the session ends; then it is
-left in configuration mode, quiet. Nothing is written to its flash.
+The driver puts the device into configuration mode (it may still stream from an earlier session),
+identifies it, sets all registers and reads them back. The device then streams spontaneously
+(UART_AUTO) until the session ends, when the driver returns it to configuration mode. Nothing is
+written to its flash.
 
-A device that was lost is left as it is: with the cable out it goes on streaming, and its COUNT goes
-on. Once it is heard again, in the same format and with COUNT where host time says it should be, it
-is taken on as it is, so that what is missing is known exactly. It cannot be asked for its serial
-number while it streams; a stream that goes on like this is taken for its own. Only what is heard
-and does not go on so, or answers because it does not stream, is set up anew; while nothing comes
-nothing but a question is sent, for the cable may be back just when a command to stop arrives.
+A lost device is not stopped: with the cable unplugged it continues to stream, and COUNT continues.
+When it is received again, in the same format and with COUNT in agreement with host time, the driver
+continues the stream as it is, so that the number of missing samples is exact. A streaming device
+cannot report its serial number; agreement in format and COUNT identifies it. Otherwise the device
+is configured again: if its stream does not continue the old one, or if it replies because it does
+not stream. While the device is silent, the driver sends only read requests: a stop command would
+interrupt the stream if the cable was reconnected at that moment.
 """
 
 from __future__ import annotations
@@ -45,22 +47,22 @@ if TYPE_CHECKING:
     from daq.transport.byte_stream import ByteStream
 
 ASK_AFTER = 1.0
-"""Seconds of silence after which the device is asked whether it was restarted."""
+"""Silence in s after which the driver tests whether the device was restarted."""
 GATHER = 0.1
-"""Frames of so many seconds are decoded together, which is what a row of ``blocks`` holds."""
+"""Duration in s of the frames decoded together: a row of ``blocks``."""
 WAITING = 0.05
-"""Seconds within which bytes that are there already are read."""
+"""Time limit in s for reading bytes already received."""
 LISTEN = 0.5
-"""How long a device that was lost is listened to, s; and again once something is heard."""
+"""Time in s to listen for a lost device, and again after the first bytes."""
 
 
 class EpsonSession:
-    """An accelerometer, set up and quiet until :meth:`read`, or heard streaming as before.
+    """An accelerometer, configured and idle until :meth:`read`, or still streaming.
 
     Parameters
     ----------
-    heard : bytes and host time
-        What came already of a stream that goes on, and when the last of it did.
+    heard : (bytes, HostTime) or None
+        For a stream that continues: the bytes already received, and their arrival.
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class EpsonSession:
 
     @property
     def resumed(self) -> bool:
-        """Whether blocks go on in the index of the session before."""
+        """Whether blocks continue the index of the session before."""
         return self._heard is not None
 
     async def read(self) -> AsyncIterator[Block | Event]:
@@ -97,7 +99,7 @@ class EpsonSession:
             for item in self.decoder.receive(*self._heard):
                 yield item
         at: HostTime | None = None
-        # One that waits for a trigger answers, and was not restarted.
+        # A device waiting for a trigger also replies, so a reply does not prove a restart.
         ask_after = None if configuration.is_triggered else ASK_AFTER
         n_frames = round(GATHER * configuration.sampling_rate)
         while True:
@@ -124,10 +126,10 @@ class EpsonSession:
         return f"expected {configuration.sampling_rate} frames a second{configuration.hint}"
 
     async def _rest(self, last: HostTime | None) -> tuple[bytes, HostTime]:
-        """Return the frames that were too few to be read, and when the last of them came.
+        """Return received frames that were too few for a read, and the arrival of the last one.
 
-        They came one after the other behind those read ``last``, not only now: by this time it is
-        estimated how long a device that was restarted has been silent.
+        The arrival is computed from the last read and the sampling rate, because it serves to
+        estimate the silence of a restarted device.
         """
         received, now = b"", self._clock.now()
         self._stream.expect(1)
@@ -141,13 +143,13 @@ class EpsonSession:
         return received, HostTime(last.monotonic_ns + passed_ns, last.utc_ns + passed_ns)
 
     async def _asked(self) -> tuple[bytes, HostTime]:
-        """Ask a silent device for its ID, and return the next frames.
+        """Request the ID of a silent device, and return the next frames.
 
         Raises
         ------
         NoAnswerError
-            If the device answers: it was restarted and does not stream any more. A device whose
-            frames are only held up does not answer.
+            If the device replies: it was restarted and no longer streams. A device whose frames are
+            only delayed does not reply.
         """
         await self._device.ask(commands.ID)
         received, at = await self._stream.read()
@@ -158,12 +160,12 @@ class EpsonSession:
 
 
 async def identify(port: str, clock: HostClock, *, baud_rate: int) -> DeviceInformation:
-    """Ask whether an Epson accelerometer is on a port, and which; it is left quiet.
+    """Return the information of the Epson accelerometer on a port; leave it idle.
 
     Raises
     ------
     DeviceError
-        None is there.
+        If the port has none.
     """
     anyone = Sensor(
         name="found",
@@ -188,8 +190,8 @@ class EpsonDriver:
     settings = EpsonSettings
     shares_clock = False
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
-        """Return int32: counts, and those of the temperature too."""
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
+        """Return int32, for all fields including temperature."""
         return np.dtype(np.int32)
 
     def check(self, sensors: Sequence[Sensor]) -> None:
@@ -200,7 +202,7 @@ class EpsonDriver:
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[EpsonSession]:
-        """Open the port, identify the accelerometer and set it up."""
+        """Open the port, identify and configure the accelerometer."""
         sensor, configuration = _configured(sensors)
         async with (
             _port(sensor, configuration, clock) as stream,
@@ -212,16 +214,16 @@ class EpsonDriver:
     async def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AsyncIterator[EpsonSession]:
-        """Open the port and take on a device that streams on; set it up if it does not."""
+        """Open the port and continue the device's stream; configure it if it does not stream."""
         sensor, configuration = _configured(sensors)
         async with _port(sensor, configuration, clock) as stream:
             device = Device(sensor, stream)
             if isinstance(before, EpsonSession):
                 heard = await _listen(stream, before.decoder) or await device.answer()
                 if heard is None:
-                    raise NoAnswerError(f"{stream.label}: nothing comes, and nothing answers")
+                    raise NoAnswerError(f"{stream.label}: no frames and no reply")
                 if commands.find_reply(heard[0], commands.ID.address) == commands.DEVICE_ID:
-                    heard = await _listen(stream, before.decoder)  # to one that streams yet
+                    heard = await _listen(stream, before.decoder)  # it may stream nevertheless
                 if heard is not None and before.decoder.continues(*heard):
                     async with _left_quiet(device, stream):
                         yield EpsonSession(
@@ -261,7 +263,7 @@ async def _set_up(
             configuration = Configuration.of(sensor, information.model)
         except BenchFileError as error:
             raise WrongDeviceError(f"port {sensor.port}: {error}") from error
-        await device.configure(configuration)  # reads back what it sets
+        await device.configure(configuration)  # reads registers back
         actual = float(configuration.sampling_rate)
         information = replace(information, sampling_rate=actual)
         decoder = configuration.decoder(sensor.name)
@@ -270,7 +272,7 @@ async def _set_up(
 
 @contextlib.asynccontextmanager
 async def _left_quiet(device: Device, stream: ByteStream) -> AsyncIterator[None]:
-    """Stop the device at the end; one that was lost is left to go on counting."""
+    """Stop the device on exit, unless it was lost: a lost device continues to count."""
     is_lost = False
     try:
         yield
@@ -285,7 +287,7 @@ async def _left_quiet(device: Device, stream: ByteStream) -> AsyncIterator[None]
 
 
 async def _listen(stream: ByteStream, decoder: BurstDecoder) -> tuple[bytes, HostTime] | None:
-    """Return what comes, as much of it as shows whether ``decoder`` knows it; None if nothing."""
+    """Return bytes until ``decoder`` recognises its stream or time is up; None if silent."""
     try:
         async with asyncio.timeout(LISTEN):
             heard, at = await stream.read()

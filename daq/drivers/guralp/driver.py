@@ -1,11 +1,11 @@
 """Driver for Güralp digitizers: GCF over a serial line, or from a Scream server.
 
-Nothing is configured: a digitizer sends what its own terminal was told. The driver listens until
-every stream has been heard, takes the sampling rate from the blocks, acknowledges them and asks
-again for those that were lost. Blocks state UTC, so no clock is fitted.
+The driver configures nothing: the digitizer is configured at its own terminal. The driver listens
+until it has received every stream, takes the sampling rate from the blocks, acknowledges blocks and
+requests lost ones again. Blocks state UTC, so no clock model is fitted.
 
 ============================ =====================================================================
-``port``                     what is spoken
+``port``                     protocol
 ============================ =====================================================================
 serial, ``socket://``        frames with block recovery (``link = "serial"``)
 ``socket://``                a Scream server over TCP (``link = "scream"``)
@@ -44,7 +44,7 @@ COMPONENTS = "ZNEX1234"
 
 
 class GuralpSession:
-    """Streams that have all been heard."""
+    """A session in which every stream has been received once."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class GuralpSession:
             found = await self._link.receive()
 
     def _identified(self, first: Block) -> Event:
-        """See who it is that was not there at the beginning: another device is left out."""
+        """Identify a sensor whose streams were missing at the start; exclude a wrong device."""
         self._absent.discard(first.sensor)
         try:
             self._identify(first.sensor)
@@ -97,7 +97,7 @@ class GuralpDriver:
     settings = GuralpSettings
     shares_clock = False
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return int32."""
         return np.dtype(np.int32)
 
@@ -109,7 +109,7 @@ class GuralpDriver:
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[GuralpSession]:
-        """Open the port and listen until every stream has been heard."""
+        """Open the port and listen until every stream has been received."""
         first = sensors[0]
         settings = GuralpSettings.model_validate(first.settings)
         names = ", ".join(repr(sensor.name) for sensor in sensors)
@@ -130,7 +130,7 @@ class GuralpDriver:
 
 
 def _configured(sensors: Sequence[Sensor]) -> dict[str, tuple[str, ...]]:
-    """Return the streams of each sensor; of the only one perhaps none, which are to be found."""
+    """Return the stream IDs of each sensor; a single sensor may have none, to be discovered."""
     every = {s.name: GuralpSettings.model_validate(s.settings) for s in sensors}
     require_address(sensors[0])
     require_alike(sensors, every, GuralpSettings.model_fields.keys() - {"streams", "system_id"})
@@ -184,8 +184,8 @@ async def _discover(
                         return
     streams_heard = ", ".join(sorted(link.streams.unknown)) or "nothing"
     raise NoAnswerError(
-        f"{label}: expected {n_channels} streams of one digitizer, heard {streams_heard} in"
-        f" {settings.patience:g} s; say which with settings.streams"
+        f"{label}: expected {n_channels} streams of one digitizer, received {streams_heard} in"
+        f" {settings.patience:g} s; set settings.streams"
     )
 
 
@@ -200,9 +200,9 @@ async def _listen(
     label: str,
     heard: list[Block | Event],
 ) -> tuple[DeviceInformation, ...]:
-    """Listen until every stream has come; return what the blocks say.
+    """Listen until every stream has been received; return the information of each sensor.
 
-    Where one sensor of several does not come, the others go on without it: it may come later.
+    If only some of several sensors send, the session starts with them: the others may follow.
     """
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(settings.patience):
@@ -216,8 +216,8 @@ async def _listen(
             continue
         others = ", ".join(sorted(link.streams.unknown)) or "no other"
         trouble = (
-            f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} did not come within"
-            f" {settings.patience:g} s; heard {others}"
+            f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} not received within"
+            f" {settings.patience:g} s; received {others}"
         )
         information.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
     if all(one.trouble for one in information):

@@ -1,7 +1,7 @@
-"""The ways to GCF blocks: a serial line, a Scream server over TCP, or one over UDP.
+"""Links that transport GCF blocks: a serial line, a Scream server over TCP or UDP.
 
-A link receives, has what came decoded, and says what has to be said to the other end: replies to
-blocks on a serial line, requests for packets that were lost over UDP.
+A link receives and decodes bytes, and sends what the other end needs: replies to blocks on a serial
+line, requests for packets lost over UDP.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
     from daq.transport.udp import DatagramStream
 
 SEND_INTERVAL = 10.0
-"""Between two requests to go on sending, s."""
+"""Interval of requests to continue sending, s."""
 RECOVERY_TIMEOUT = 2.0
 FIRST_RETRY, LONGEST_RETRY = 5.0, 300.0
-"""After a recovery that failed, when the next is tried, s; twice as long after each."""
+"""Delay of the next recovery after a failed one, s; doubled after each failure."""
 
 
 class Link(Protocol):
-    """One way to blocks."""
+    """A link that delivers blocks."""
 
     @property
     def streams(self) -> Streams:
-        """What has been heard."""
+        """The received streams."""
         ...
 
     async def receive(self) -> list[Block | Event]:
-        """Wait for what comes next, and say what is to be said to it."""
+        """Wait for the next bytes, decode them, and reply to the other end."""
         ...
 
 
@@ -71,7 +71,7 @@ class _SerialLink:
 class _TcpLink:
     def __init__(self, stream: ByteStream, ids: dict[str, tuple[str, ...]]) -> None:
         self._stream = stream
-        self._decoder = ScreamDecoder(ids, patience=0)  # in order, or lost before
+        self._decoder = ScreamDecoder(ids, patience=0)  # TCP preserves order
 
     @property
     def streams(self) -> Streams:
@@ -94,7 +94,7 @@ class _UdpLink:
         self._clock = clock
         self._recovery = recovery
         self._delay = FIRST_RETRY
-        self._retry_ns: int | None = None  # where the last recovery failed
+        self._retry_ns: int | None = None  # time of the next recovery, after a failed one
         self._name = next(iter(ids)) if len(ids) == 1 else ""
         self._decoder = ScreamDecoder(ids)
 
@@ -111,7 +111,7 @@ class _UdpLink:
         return found
 
     async def _recover(self, where: tuple[str, int], at: HostTime) -> list[Block | Event]:
-        """Ask for missing packets over TCP; where that fails, not again for a while."""
+        """Request missing packets over TCP; after a failure, wait before the next request."""
         found: list[Block | Event] = []
         try:
             async with asyncio.timeout(RECOVERY_TIMEOUT):
@@ -129,7 +129,7 @@ class _UdpLink:
                     await writer.wait_closed()
         except (OSError, TimeoutError, asyncio.IncompleteReadError) as error:
             why = str(error) or "no answer"
-            text = f"no recovery of lost packets over TCP, again in {self._delay:g} s: {why}"
+            text = f"no recovery of lost packets over TCP, next in {self._delay:g} s: {why}"
             self._retry_ns = at.monotonic_ns + round(self._delay * 1e9)
             self._delay = min(2 * self._delay, LONGEST_RETRY)
             return [*found, Event(self._name, EventKind.STATUS, text[:200], at)]
@@ -141,7 +141,7 @@ class _UdpLink:
 
 
 async def _packet(reader: asyncio.StreamReader) -> bytes | None:
-    """Read one packet of a Scream server over TCP, None where it no longer has it."""
+    """Read one packet of a Scream server over TCP; None if the server no longer has it."""
     start = await reader.readexactly(4)
     if start == scream.NOT_AVAILABLE:
         return None
@@ -159,7 +159,7 @@ async def open_link(
     *,
     label: str,
 ) -> AsyncIterator[Link]:
-    """Open a port; yield a link that joins the streams of each sensor."""
+    """Open a port and yield its link."""
     if port.startswith("udp://"):
         async with open_datagrams(port, clock, listen=False, label=label) as datagrams:
             host, number = host_and_port(port)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 StreamId = Annotated[
     str, Field(pattern="^[0-9A-Z]{1,6}$"), AfterValidator(lambda text: text.lstrip("0") or "0")
 ]
-"""Without leading zeros, which no block tells."""
+"""A stream ID without leading zeros, which blocks do not preserve."""
 
 
 class GuralpSettings(BaseModel):
@@ -18,17 +18,17 @@ class GuralpSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     streams: tuple[StreamId, ...] | None = None
-    """Stream ID of each channel, as ``("DEMOZ2", "DEMON2", "DEMOE2")``. If not given, those of the
-    one digitizer that is heard, in the order Z, N, E, X of their fifth character."""
+    """Stream ID of each channel, such as ``("DEMOZ2", "DEMON2", "DEMOE2")``. Default: the streams
+    of the only digitizer received, in the order Z, N, E, X of their fifth character."""
     link: Literal["serial", "scream"] = "serial"
-    """What a ``socket://`` port speaks."""
+    """Protocol of a ``socket://`` port."""
     baud_rate: Annotated[int, Field(gt=0)] = 115200
     acknowledge: bool = True
-    """Whether blocks are acknowledged and lost ones asked for again (serial)."""
+    """Whether to acknowledge blocks and request lost ones again (serial)."""
     recovery_port: Annotated[int, Field(ge=0, le=65535)] | None = None
-    """TCP port for packets lost over UDP; that of the server if not given, 0 for none."""
+    """TCP port for packets lost over UDP; default: the server's port; 0 for no recovery."""
     patience: PositiveFloat = 30.0
-    """Seconds to wait until every stream has been heard; and without any block later, after which
-    the digitizer is lost and connected again."""
+    """Seconds to wait for every stream at the start. Later, seconds without a block after which the
+    digitizer is lost and reconnected."""
     system_id: str = ""
-    """Expected system ID; any, if empty."""
+    """Expected system ID; empty for any."""

@@ -1,4 +1,4 @@
-"""Identify a LabJack and set it up: its registers on the wire."""
+"""Identification and configuration of a LabJack."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
 MODBUS_PORT = 502
 OWN = ("inputs", "range", "negative_inputs")
-"""Settings of a sensor; the others are of the stream, and taken from the port's first sensor."""
+"""Settings of each sensor; all others belong to the stream and to the port's first sensor."""
 BUFFERS = {"T7": 32768, "T8": 262144}
 
 
 class Registers:
-    """One connection to port 502."""
+    """Access to the registers over one connection to port 502."""
 
     def __init__(self, stream: ByteStream) -> None:
         self._stream = stream
@@ -47,13 +47,13 @@ class Registers:
 
     @property
     def label(self) -> str:
-        """Name sensors and port, for error messages."""
+        """Sensors and port, for error messages."""
         return self._stream.label
 
     async def exchange(
         self, *commands: Command, reply_within: float | None = REPLY_TIMEOUT
     ) -> tuple[bytes, HostTime]:
-        """Do several reads and writes at once; return what was read, and when it came."""
+        """Send several reads and writes in one message; return the values and their arrival."""
         self._transaction = (self._transaction + 1) % 65536
         request = Adu(self._transaction, 255, reg.encode_feedback(commands))
         await self._stream.write(reg.encode_adu(request))
@@ -67,11 +67,11 @@ class Registers:
                             return reg.feedback_values(adu.pdu, size), at
         except TimeoutError as error:
             raise NoAnswerError(
-                f"{self.label}: no reply of the device within {reply_within:g} s"
+                f"{self.label}: no reply from the device within {reply_within:g} s"
             ) from error
 
     async def do(self, doing: str, *commands: Command) -> bytes:
-        """Exchange, and say what the device refused and why."""
+        """Exchange; raise an error with the action and the reason if the device refuses."""
         try:
             return (await self.exchange(*commands))[0]
         except RemoteProtocolError as error:
@@ -79,7 +79,7 @@ class Registers:
             raise WrongDeviceError(f"{self.label}: {doing}: {error}{reason}") from error
 
     async def reason(self) -> str:
-        """Return what the device says about its last refusal."""
+        """Return the device's reason for its last refusal, as text; empty if unknown."""
         with contextlib.suppress(RemoteProtocolError):
             values, _ = await self.exchange(Read(reg.LAST_ERROR_DETAIL, 1))
             return f", reason {int.from_bytes(values, 'big')}"
@@ -91,23 +91,23 @@ class Registers:
         return float(struct.unpack(">f", values)[0])
 
     async def stop_stream(self) -> None:
-        """End the stream, if one runs."""
-        with contextlib.suppress(RemoteProtocolError):  # 2620: none runs
+        """Stop the stream, if one is running."""
+        with contextlib.suppress(RemoteProtocolError):  # 2620: no stream is running
             await self.exchange(long(reg.STREAM_ENABLE, 0))
 
 
 def long(address: int, value: int) -> Write:
-    """Write a UINT32."""
+    """Return the command that writes a UINT32."""
     return Write(address, value.to_bytes(4, "big"))
 
 
 def real(address: int, value: float) -> Write:
-    """Write a FLOAT32."""
+    """Return the command that writes a FLOAT32."""
     return Write(address, struct.pack(">f", value))
 
 
 def exact(rate: float) -> float:
-    """Return the rate whose interval is a whole number of the device's ticks: FLOAT32 rounds."""
+    """Return the exact rate: its interval is a whole number of timer ticks, but FLOAT32 rounds."""
     return reg.CORE_HZ / max(1, round(reg.CORE_HZ / rate))
 
 
@@ -132,7 +132,8 @@ def inputs_of(
     Raises
     ------
     BenchFileError
-        An input is given twice, or not one for each channel; or sensors differ in what is common.
+        If an input appears twice, or the number of inputs and channels differ, or sensors differ in
+        common settings.
     """
     require_alike(sensors, settings, LabJackSettings.model_fields.keys() - OWN)
     inputs: dict[str, tuple[int, ...]] = {}
@@ -158,7 +159,7 @@ def inputs_of(
             taken[number] = sensor.name
         if sensor.sampling_rate != sensors[0].sampling_rate:
             expected = (
-                f"expected {sensors[0].sampling_rate:g}, as of all sensors on port {sensor.port}"
+                f"expected {sensors[0].sampling_rate:g}, as for all sensors on port {sensor.port}"
             )
             raise BenchFileError(
                 FileFault("sampling_rate", expected, sensor.sampling_rate, sensor.name)
@@ -178,7 +179,13 @@ def inputs_of(
 async def identify(
     registers: Registers, sensors: Sequence[Sensor]
 ) -> tuple[str, DeviceInformation]:
-    """Return which product it is and what it says about itself; refuse it if it is another."""
+    """Return the product, T7 or T8, and the device's information.
+
+    Raises
+    ------
+    WrongDeviceError
+        If the device is neither, or its serial number differs from the bench file.
+    """
     values = await registers.do(
         "identifying",
         Read(reg.TEST, 2),
@@ -212,23 +219,23 @@ async def identify(
 
 @dataclass(frozen=True, slots=True)
 class Uptime:
-    """What the device's 32-bit timer of 20 Hz stood at, and when.
+    """Value of the device's 32-bit timer of 20 Hz, and the host time of its reading.
 
-    It wraps in 6.8 years only. (LabJack does not say where it begins; here it need not be known.)
+    It wraps after 6.8 years. (LabJack does not document its start value, which is not needed.)
     """
 
     ticks: int
     at: HostTime
 
-    def went_on_until(self, later: Uptime) -> bool:
-        """Whether the device was not restarted until ``later``: its timer went on meanwhile."""
+    def continues_to(self, later: Uptime) -> bool:
+        """Return whether the timer ran without a restart of the device until ``later``."""
         elapsed = (later.at.monotonic_ns - self.at.monotonic_ns) * 1e-9
         went_on = (later.ticks - self.ticks) % (1 << 32) / reg.SYSTEM_HZ
         return abs(went_on - elapsed) <= SLACK + CLOCK_TOLERANCE * elapsed
 
 
 async def read_uptime(registers: Registers) -> Uptime | None:
-    """Read the timer that tells a restart; None of a device that has none."""
+    """Read the timer that reveals a restart; return None if the device has none."""
     with contextlib.suppress(RemoteProtocolError):
         values, at = await registers.exchange(Read(reg.SYSTEM_TIMER_20HZ, 2))
         return Uptime(int.from_bytes(values, "big"), at)
@@ -238,26 +245,26 @@ async def read_uptime(registers: Registers) -> Uptime | None:
 async def set_inputs(
     registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
 ) -> None:
-    """Set the range and the negative side of a sensor's inputs.
+    """Set the range and the negative inputs of a sensor.
 
     Raises
     ------
     WrongDeviceError
-        If the product does not have what the bench file says.
+        If the product lacks a setting of the bench file.
     """
     if fault := lacking(settings, numbers, product):
         raise WrongDeviceError(f"{registers.label}: {fault}")
     negative = settings.negative_inputs or (reg.SINGLE_ENDED,) * len(numbers)
     for number, other in zip(numbers, negative, strict=True):
         commands: list[Command] = [real(reg.AIN_RANGE + 2 * number, range_of(settings, product))]
-        if product == "T7":  # the T8's inputs are differential, each with a ground of its own
+        if product == "T7":  # each input of a T8 has its own negative terminal
             commands.append(Write(reg.AIN_NEGATIVE_CHANNEL + number, other.to_bytes(2, "big")))
         await registers.do(f"setting AIN{number}", *commands)
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPlan:
-    """What is to be scanned, and how."""
+    """Parameters of the stream."""
 
     scan_list: tuple[int, ...]
     rate: float
@@ -269,7 +276,7 @@ def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: fl
     timer = labjack.TIMER_ADDRESSES if settings.core_timer else ()
     scan_list = (*timer, *(reg.ain(n) for numbers in inputs.values() for n in numbers))
     if len(scan_list) > 128:
-        expected = f"{len(scan_list)} addresses to scan; a LabJack scans at most 128"
+        expected = f"{len(scan_list)} addresses to scan; expected at most 128"
         raise BenchFileError(FileFault("sensors", expected))
     n_columns = len(scan_list)
     scans = max(1, min(labjack.MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
@@ -277,7 +284,7 @@ def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: fl
 
 
 def patience_of(settings: LabJackSettings, stream: StreamPlan, product: str) -> float:
-    """Return the seconds for which the device keeps its samples while it cannot send them."""
+    """Return the time for which the device's buffer holds unsent samples, in s."""
     if settings.patience is not None:
         return settings.patience
     n_samples = (settings.buffer_bytes or BUFFERS[product]) / 2
@@ -287,7 +294,7 @@ def patience_of(settings: LabJackSettings, stream: StreamPlan, product: str) -> 
 async def set_stream(
     registers: Registers, settings: LabJackSettings, stream: StreamPlan, product: str
 ) -> float:
-    """Set the stream up; return the scan rate the device makes, in Hz."""
+    """Configure the stream; return the actual scan rate, in Hz."""
     command_response = settings.mode == "command-response"
     target = reg.TARGET_COMMAND_RESPONSE if command_response else reg.TARGET_ETHERNET
     divisor = settings.external_clock_divisor
@@ -311,7 +318,7 @@ async def set_stream(
         await registers.do("setting the scan list", Write(reg.STREAM_SCANLIST + 2 * start, values))
     if product == "T7":
         return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
-    # A T8 tells its rate only while it streams; nobody takes these samples.
+    # A T8 reports its rate only while it streams; these samples are discarded.
     await registers.do("starting the stream", long(reg.STREAM_ENABLE, 1))
     try:
         return await registers.real(reg.STREAM_SCANRATE_HZ_ACTUAL)
@@ -322,7 +329,7 @@ async def set_stream(
 async def read_calibrations(
     registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
 ) -> tuple[Calibration, ...]:
-    """Return what the flash holds for each of a sensor's inputs, in their range."""
+    """Return the calibration of each of a sensor's inputs in their range, from the flash."""
     if product == "T7":
         flash = await registers.do(
             "reading the calibration",
@@ -351,7 +358,7 @@ async def read_calibrations(
 def details_of(
     range_: float, inputs: tuple[int, ...], calibrations: tuple[Calibration, ...]
 ) -> dict[str, str]:
-    """Return the range and the calibration of a sensor's inputs, in words."""
+    """Return the range and the calibration of a sensor's inputs, as names and texts."""
     names = [f"AIN{number}" for number in inputs]
     details = {"inputs": ", ".join(names), "range": f"±{range_:g} V"}
     alike = len(set(calibrations)) == 1

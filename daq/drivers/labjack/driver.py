@@ -1,20 +1,20 @@
 """Driver for LabJack T7 and T8 digitizers, which stream analog inputs over Ethernet.
 
-All sensors of one port share the device: each says with ``inputs`` which of its channels is which
-analog input, and one scan list holds them all, so they are sampled by one clock and their samples
-have the same indices.
+All sensors of one port share the device. The setting ``inputs`` of a sensor maps its channels to
+analog inputs. One scan list contains the inputs of all sensors, so that one clock samples them and
+their samples have the same indices.
 
-What is recorded are the converter's counts (uint16), as they come. The device's calibration is read
-from its flash (``DeviceInformation.details``): counts per volt, of each input where they differ. A
-channel's ``sensitivity`` in the bench file is that times the sensor's volts per unit; of a T7 at
-±10 V the nominal 3166.5 counts/V make 3166.5 × 1.27 for a sensor of 1.27 V/(m/s²). The centre of
-the converter (33523 counts of a T7) is an offset like any other.
+The recording holds the unmodified counts of the converter (uint16). The driver reads the device's
+calibration, in counts per volt, from its flash (``DeviceInformation.details``), per input if the
+inputs differ. A channel's ``sensitivity`` in the bench file is this value times the sensor's volts
+per unit: for a T7 at ±10 V (nominally 3166.5 counts/V) and a sensor of 1.27 V/(m/s²), 3166.5 ×
+1.27. The centre of the converter (33523 counts for a T7) is an offset.
 
-The device has few sockets: one on port 502 does everything but spontaneous streams, by function 76.
-With ``core_timer`` the scan list leads with the device's 40 MHz clock, so that gaps are counted
-exactly. A stream that breaks off (2942, 2943, 2945) is started anew. So is that of a device that
-was lost; what went missing is counted by the same clock, unless the device was restarted meanwhile,
-which its slower timer tells (SYSTEM_TIMER_20HZ).
+The device has few sockets: one connection to port 502 serves everything except spontaneous streams,
+by function 76. With ``core_timer`` the scan list begins with the device's 40 MHz timer, which gives
+gaps their exact length. A stream that ends (2942, 2943, 2945) is restarted, and so is the stream of
+a lost device. The timer also gives the length of this gap, unless the device was restarted; a
+slower timer reveals this (SYSTEM_TIMER_20HZ).
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event
 
 ASK_AFTER = 1.0
-"""Seconds of silence, beyond two packets, after which the device is asked whether it streams."""
+"""Silence in s, beyond two packets, after which the driver tests whether the device streams."""
 POLL_INTERVAL = 0.05
-"""Between two reads of a stream by command, s, once it has been read up."""
-MOST_RESTARTS = 3
-"""Of a stream that breaks off with its first packet."""
+"""Interval in s between two reads of a stream in command-response mode, if its buffer is empty."""
+MAX_RESTARTS = 3
+"""Maximum number of restarts of a stream that ends with its first packet."""
 
 
 class LabJackSession:
-    """A digitizer whose scan list is set."""
+    """A digitizer with a configured scan list."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class LabJackSession:
         self.decoder = decoder
         self.uptime = uptime
         self.resumed = resumed
-        """Whether blocks go on in the index of the session before."""
+        """Whether blocks continue the index of the session before."""
         self._registers = registers
         self._settings = settings
         self._clock = clock
@@ -87,14 +87,14 @@ class LabJackSession:
 
     @property
     def recovers(self) -> bool:
-        """Whether no samples need come for now: the buffer has overflowed, and the device goes on.
+        """Whether the device is recovering from an overflow, and may send no samples.
 
-        Who supervises decides how long that may take (:mod:`daq.acquisition.stall_detector`).
+        :mod:`daq.acquisition.stall_detector` limits the duration.
         """
         return self.decoder.recovers
 
     async def read(self) -> AsyncIterator[Block | Event]:
-        """Start the stream and yield its blocks; start it anew where it breaks off."""
+        """Start the stream and yield its blocks; restart the stream if it ends."""
         if self._settings.mode == "command-response":
             received = self._by_command()
         else:
@@ -108,9 +108,9 @@ class LabJackSession:
                     fruitless = 0 if items else fruitless
                     continue
                 fruitless += 1
-                if fruitless > MOST_RESTARTS:
+                if fruitless > MAX_RESTARTS:
                     why = labjack.FATAL[self.decoder.fatal]
-                    raise DeviceError(f"{self._registers.label}: the stream does not go on: {why}")
+                    raise DeviceError(f"{self._registers.label}: the stream keeps ending: {why}")
                 await self._registers.stop_stream()
                 self.decoder.restart()
                 await self._start()
@@ -132,9 +132,10 @@ class LabJackSession:
                     yield self.decoder.receive(received, at)
 
     async def _check_streaming(self) -> None:
-        """End the session if the device says that it does not stream any more.
+        """End the session if the device reports that it no longer streams.
 
-        One that does not answer may be behind a network that pauses; it keeps its samples.
+        A device that does not reply may be behind an interrupted network, with samples in its
+        buffer.
         """
         with contextlib.suppress(RemoteProtocolError):
             try:
@@ -142,14 +143,14 @@ class LabJackSession:
             except NoAnswerError:
                 return
             if not int.from_bytes(values, "big"):
-                raise NoAnswerError(f"{self._registers.label}: the device does not stream any more")
+                raise NoAnswerError(f"{self._registers.label}: the device no longer streams")
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
         read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
         while True:
             try:
-                # Samples that are on their way are in no other reply: no time limit.
+                # No time limit: the samples in a late reply are not sent again.
                 values, at = await self._registers.exchange(read, reply_within=None)
             except RemoteProtocolError as error:
                 reason = await self._registers.reason()
@@ -170,7 +171,7 @@ class LabJackDriver:
     settings = LabJackSettings
     shares_clock = True
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return uint16."""
         return np.dtype(np.uint16)
 
@@ -181,19 +182,19 @@ class LabJackDriver:
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AbstractAsyncContextManager[LabJackSession]:
-        """Connect, identify, read the calibration and set the stream up."""
+        """Connect, identify, read the calibration and configure the stream."""
         return _opened(sensors, clock, None)
 
     def resume(
         self, sensors: Sequence[Sensor], clock: HostClock, before: Session
     ) -> AbstractAsyncContextManager[LabJackSession]:
-        """Do the same; count on where the session before ended, if the device went on meanwhile."""
+        """Open; continue the index of ``before`` if the device was not restarted."""
         return _opened(sensors, clock, before if isinstance(before, LabJackSession) else None)
 
 
 @dataclass(frozen=True, slots=True)
 class _Planned:
-    """What the bench file says of one device."""
+    """Settings of one device in the bench file."""
 
     settings: dict[str, LabJackSettings]
     inputs: dict[str, tuple[int, ...]]
@@ -253,7 +254,7 @@ async def _opened(
                 scan_list=stream_plan.scan_list,
                 scan_rate=rate,
             )
-            resumed = before is not None and _goes_on(before, uptime, information)
+            resumed = before is not None and _continues(before, uptime, information)
             if before is not None and resumed:
                 decoder = before.decoder
                 decoder.restart()
@@ -274,17 +275,17 @@ async def _opened(
                 await registers.stop_stream()
 
 
-def _goes_on(
+def _continues(
     before: LabJackSession, uptime: Uptime | None, now: tuple[DeviceInformation, ...]
 ) -> bool:
-    """Whether it is the same device at the same rate, and its clock ran on meanwhile."""
+    """Return whether the device and its rate are the same, and it was not restarted."""
     then = before.information
     is_same = [(i.serial_number, i.sampling_rate) for i in then] == [
         (i.serial_number, i.sampling_rate) for i in now
     ]
     if not is_same or before.uptime is None or uptime is None:
         return False
-    return before.decoder.can_resume and before.uptime.went_on_until(uptime)
+    return before.decoder.can_resume and before.uptime.continues_to(uptime)
 
 
 DRIVER = LabJackDriver()

@@ -1,1 +1,1 @@
-"""Modbus devices: readings in registers, and block FIFOs."""
+"""Modbus devices: samples in registers, block FIFOs."""

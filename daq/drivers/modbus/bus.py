@@ -1,9 +1,9 @@
-"""A Modbus bus: one request at a time, with host times, named errors and no late replies.
+"""A Modbus bus: one request at a time, with host times and named errors.
 
-On a serial bus nothing in a reply says which request it answers. After silence the bus is therefore
-left alone for as long again: a reply that comes late then belongs to nobody, instead of answering
-the next request. A complete reply with a wrong checksum is known at once, and costs its poll only.
-Modbus TCP numbers its requests and needs no pause.
+On a serial bus a reply does not name its request. After a request without reply the bus therefore
+pauses for the same time again, so that a late reply is not mistaken for the reply to the next
+request. A complete reply with a wrong checksum is recognised without delay and costs only its own
+poll. Modbus TCP numbers its requests and needs no pause.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
     from daq.transport.byte_stream import ByteStream
 
-# what it would print goes into our errors and events
+# Its messages are in the errors and events of this package.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 TCP = "modbus-tcp://"
-LEAST_PATIENCE, LEAST_HURRIED = 0.2, 0.05
-"""Shortest time to wait for a reply, s: of a device whose replies are known, and where there may be
-none."""
+MIN_TIMEOUT, MIN_SHORT_TIMEOUT = 0.2, 0.05
+"""Shortest timeout of a reply, s: of a device with known reply times, and of one that may be
+absent."""
 KNOWN_AFTER = 5
-"""Replies."""
+"""Number of replies after which a device's reply time is known."""
 QUIET = 0.06
-"""Seconds without a byte after which a message has ended: more than a USB adapter (16 ms) or a
-serial server (40 ms) keeps bytes."""
+"""Silence in s that ends a message: longer than a USB adapter (16 ms) or a serial server (40 ms)
+delays bytes."""
 _UNIT = 6
 """Position of the unit in a frame over TCP."""
 EXCEPTIONS = {
@@ -61,7 +61,7 @@ EXCEPTIONS = {
 
 
 class RefusedError(DeviceError):
-    """The device answered with a Modbus exception."""
+    """The device replied with a Modbus exception."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -69,12 +69,12 @@ class RefusedError(DeviceError):
 
 
 class DamagedReplyError(NoAnswerError):
-    """The device answered, and its reply was damaged on the way."""
+    """The device replied, but the reply is damaged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Registers, when they were asked for, and when they came."""
+    """Register values with the host times of request and reply."""
 
     registers: Sequence[int]
     sent: HostTime
@@ -83,7 +83,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """What a link received: registers, or the code of an exception; and when."""
+    """A received reply: registers or the code of an exception, and its arrival."""
 
     registers: Sequence[int]
     exception: int | None
@@ -91,9 +91,9 @@ class _Answer:
 
 
 class _Link(Protocol):
-    """What carries requests and replies.
+    """Transport of requests and replies.
 
-    Raises NoAnswerError with what came instead, as its message, and NotConnectedError.
+    ``ask`` raises NotConnectedError, or NoAnswerError with a description of the received bytes.
     """
 
     async def ask(
@@ -101,12 +101,12 @@ class _Link(Protocol):
     ) -> _Answer: ...
 
     async def settle(self, seconds: float) -> None:
-        """Let a late reply come and go."""
+        """Wait for a late reply and discard it."""
         ...
 
 
 class _RtuLink:
-    """Frames with a checksum on a serial line, or on what a serial server makes of one."""
+    """Modbus RTU over a serial line or a serial server."""
 
     def __init__(self, stream: ByteStream, *, echo: bool) -> None:
         self._stream = stream
@@ -138,15 +138,15 @@ class _RtuLink:
                 quiet = bool(finder.unexpected)
         except TimeoutError:
             pass
-        instead, other_unit = finder.unexpected, finder.other_unit
+        unexpected, other_unit = finder.unexpected, finder.other_unit
         finder.cancel()
         if other_unit == device_id:
-            raise RemoteProtocolError(instead)
-        if instead and other_unit is None:
-            raise DamagedReplyError(instead)
-        if not instead:  # silence: a late reply must not answer the next request
+            raise RemoteProtocolError(unexpected)
+        if unexpected and other_unit is None:
+            raise DamagedReplyError(unexpected)
+        if not unexpected:  # silence: a late reply must not be mistaken for the next one
             await self.settle(patience)
-        raise NoAnswerError(instead)
+        raise NoAnswerError(unexpected)
 
     async def settle(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
@@ -159,7 +159,7 @@ class _TcpLink:
         self._client = client
         self._clock = clock
         self._heard = b""
-        client.ctx.trace_packet = self._trace  # what pymodbus would tell its log
+        client.ctx.trace_packet = self._trace  # otherwise pymodbus logs the packets
 
     async def ask(
         self, device_id: int, function: int, address: int, value: int, patience: float
@@ -173,15 +173,15 @@ class _TcpLink:
             reply = await self._reply(device_id, function, address, value)
             received = self._clock.now()
             if task and task.cancelling() > n_cancelled:
-                # pymodbus waits by wait_for, which until Python 3.12 returns a reply that came in
-                # the same turn of the event loop as a cancellation, and forgets the cancellation
+                # pymodbus uses wait_for, which before Python 3.12 returns a reply received in the
+                # same turn of the event loop as a cancellation, and loses the cancellation.
                 raise asyncio.CancelledError
         except ConnectionException as error:
             raise NotConnectedError("the port closed") from error
         except ModbusIOException as error:
             if not client.connected:
                 raise NotConnectedError("the port closed") from error
-            raise NoAnswerError(self._instead(device_id)) from error
+            raise NoAnswerError(self._unexpected(device_id)) from error
         code = int(getattr(reply, "exception_code", 0)) if reply.isError() else None
         return _Answer(reply.registers, code, received)
 
@@ -202,22 +202,22 @@ class _TcpLink:
             self._heard = whole[: rtu.MAX_FRAME]
         return packet
 
-    def _instead(self, device_id: int) -> str:
+    def _unexpected(self, device_id: int) -> str:
         if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
             return f"received a reply of unit {self._heard[_UNIT]}, expected unit {device_id}"
         return f"received {len(self._heard)} bytes that are no reply" if self._heard else ""
 
 
 @dataclass(slots=True)
-class _Took:
-    """How long a device takes to reply, s, and of how many replies that is known."""
+class _ReplyTime:
+    """Longest reply time of a device in s, and the number of its replies."""
 
     longest: float = 0.0
     n_replies: int = 0
 
 
 class ModbusBus:
-    """One request at a time on one bus. Made by :func:`open_bus`."""
+    """One bus, with one request at a time. Made by :func:`open_bus`."""
 
     def __init__(self, link: _Link, clock: HostClock, *, label: str, timeout: float) -> None:
         self.label = label
@@ -225,27 +225,27 @@ class ModbusBus:
         self._clock = clock
         self._timeout = timeout
         self._patience = timeout
-        self._hurries = False
-        self._took: dict[int, _Took] = {}  # by device
+        self._is_short = False
+        self._reply_times: dict[int, _ReplyTime] = {}  # by device
 
     @contextlib.contextmanager
-    def hurrying(self) -> Iterator[None]:
-        """Wait for replies only as long as those of others take: for who may not be there."""
-        self._hurries = True
+    def short_timeout(self) -> Iterator[None]:
+        """Limit timeouts by the reply times of other devices, for a device that may be absent."""
+        self._is_short = True
         try:
             yield
         finally:
-            self._hurries = False
+            self._is_short = False
 
-    def _patience_with(self, device_id: int) -> float:
-        """Return how long to wait for a device, s: the others on the bus wait too."""
-        took = self._took.get(device_id)
+    def _timeout_for(self, device_id: int) -> float:
+        """Return the timeout for a device in s: as short as possible, since the others wait."""
+        known = self._reply_times.get(device_id)
         seconds = self._timeout
-        if self._hurries:
-            longest = max((other.longest for other in self._took.values()), default=seconds)
-            seconds = max(LEAST_HURRIED, 4 * longest)
-        elif took is not None and took.n_replies >= KNOWN_AFTER:
-            seconds = max(LEAST_PATIENCE, 4 * took.longest)
+        if self._is_short:
+            longest = max((other.longest for other in self._reply_times.values()), default=seconds)
+            seconds = max(MIN_SHORT_TIMEOUT, 4 * longest)
+        elif known is not None and known.n_replies >= KNOWN_AFTER:
+            seconds = max(MIN_TIMEOUT, 4 * known.longest)
         return min(seconds, self._timeout)
 
     async def read(self, function: int, device_id: int, address: int, count: int) -> Reply:
@@ -254,15 +254,15 @@ class ModbusBus:
         Raises
         ------
         DamagedReplyError
-            A reply came that was damaged on the way.
+            If the reply is damaged.
         NoAnswerError
-            No reply, or none to this request, in time.
+            If no reply to this request arrives in time.
         RemoteProtocolError
-            A reply to another request.
+            If the reply belongs to another request.
         RefusedError
-            A Modbus exception.
+            If the reply is a Modbus exception.
         NotConnectedError
-            The port is gone.
+            If the port is closed.
         """
         sent = self._clock.now()
         answer = await self._asked(
@@ -274,13 +274,13 @@ class ModbusBus:
             f" {address + count - 1}",
         )
         elapsed_ns = answer.received.monotonic_ns - sent.monotonic_ns
-        took = self._took.setdefault(device_id, _Took())
+        took = self._reply_times.setdefault(device_id, _ReplyTime())
         took.longest = max(0.99 * took.longest, elapsed_ns * 1e-9 / self._clock.speed)
         took.n_replies += 1
         return Reply(answer.registers, sent, answer.received)
 
     async def write(self, device_id: int, address: int, value: int) -> None:
-        """Write one register by function 6; raises as :meth:`read` does."""
+        """Write one register by function 6; raise the errors of :meth:`read`."""
         await self._asked(
             device_id,
             rtu.WRITE_SINGLE,
@@ -292,7 +292,7 @@ class ModbusBus:
     async def _asked(
         self, device_id: int, function: int, address: int, value: int, asked: str
     ) -> _Answer:
-        self._patience = self._patience_with(device_id)
+        self._patience = self._timeout_for(device_id)
         try:
             answer = await self._link.ask(device_id, function, address, value, self._patience)
         except NotConnectedError as error:
@@ -300,11 +300,11 @@ class ModbusBus:
         except DamagedReplyError as error:
             raise DamagedReplyError(f"{self.label}: a damaged reply to {asked}; {error}") from error
         except NoAnswerError as error:
-            if device_id in self._took:  # it may have become slower
-                self._took[device_id].longest *= 2
-            instead = f"; {error}" if str(error) else ""
+            if device_id in self._reply_times:  # it may have become slower
+                self._reply_times[device_id].longest *= 2
+            detail = f"; {error}" if str(error) else ""
             raise NoAnswerError(
-                f"{self.label}: no answer in {self._patience:.2g} s to {asked}{instead}"
+                f"{self.label}: no answer in {self._patience:.2g} s to {asked}{detail}"
             ) from error
         if answer.exception is not None:
             why = EXCEPTIONS.get(answer.exception, "unknown")
@@ -315,7 +315,7 @@ class ModbusBus:
         return answer
 
     async def settle(self) -> None:
-        """Let a late reply come and go."""
+        """Wait for a late reply and discard it."""
         await self._link.settle(self._patience)
 
 
@@ -336,7 +336,7 @@ async def open_bus(
     Raises
     ------
     NotConnectedError
-        It cannot be opened; the message says why and what to do.
+        If the port cannot be opened; the message has the cause and the remedy.
     """
     if not port.startswith(TCP):
         async with open_port(
@@ -355,7 +355,7 @@ async def open_bus(
     try:
         if not await client.connect():
             plain = port.replace(TCP, "socket://", 1)
-            async with open_port(plain, clock, label=label):  # says why
+            async with open_port(plain, clock, label=label):  # raises an error with the cause
                 raise NotConnectedError(f"{label}: the port opens, but not for Modbus")
         yield ModbusBus(_TcpLink(client, clock), clock, label=label, timeout=reply_timeout)
     finally:

@@ -1,12 +1,13 @@
 """Driver for devices with a block FIFO behind Modbus RTU registers (ProWaveDAQ, PWRVT).
 
-The sampling rate is written to its register, and the reply compared; then the FIFO is read as fast
-as it fills. There is neither a counter nor a time on the device: samples are numbered as they come
-and placed by arrival (:mod:`daq.protocols.modbus.fifo`). Counts are i16; a channel's sensitivity is
-8192 counts/g ÷ 9.80665 = 835.35 counts/(m/s²) by a client's assumption, not by a data sheet.
+The driver writes the sampling rate to its register and compares the reply. Then it reads the FIFO
+as fast as it fills. The device has neither a counter nor a time: samples are numbered in order of
+arrival (:mod:`daq.protocols.modbus.fifo`). Counts are i16. A channel's sensitivity is 8192 counts/g
+÷ 9.80665 = 835.35 counts/(m/s²); this is the assumption of a public client, not of a data sheet.
 
-Public clients disagree on what the first register of a read means, so ``header`` says it. With
-``"left"`` for a device that means ``"size"`` words are asked for that do not wait.
+Public clients disagree on the meaning of the first register of a read; the setting ``header``
+selects it. With ``"left"`` for a device that means ``"size"``, the driver requests words that are
+not in the FIFO.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ if TYPE_CHECKING:
 ATTEMPTS = 3
 HIGHEST_RATE = 65_535
 STALLED = 2.0
-"""Without a sample for so long, in s, the device has stopped."""
+"""Time without a sample, in s, after which the device has stopped."""
 NOT_LESS = 3.0
-"""While as many words wait for so long, in s, the FIFO fills as fast as it is read."""
+"""Time without a decrease of the level, in s, after which the link is too slow."""
 
 
 class FifoSettings(BaseModel):
@@ -54,18 +55,18 @@ class FifoSettings(BaseModel):
     parity: Literal["N", "E", "O"] = "N"
     unit: Annotated[int, Field(ge=1, le=247)] = 1
     header: Literal["size", "left"] = "size"
-    """What the first register of a read means: words that waited, or words left after it."""
+    """First register of a read: words in the FIFO before the read ("size") or after it ("left")."""
     capacity: PositiveInt | None = None
-    """Words the FIFO holds, where known: a level there means that samples were dropped."""
+    """Capacity of the FIFO in words, if known: at this level samples were dropped."""
     set_rate: bool = True
-    """Whether the sampling rate is written to the device."""
+    """Whether to write the sampling rate to the device."""
     poll_interval: PositiveFloat = 0.02
-    """Between two reads, s, once the FIFO has been read up."""
+    """Interval in s between two reads of an empty FIFO."""
     timeout: PositiveFloat = 0.3
-    """How long a reply may take, s."""
+    """Timeout of a reply, s."""
     patience: PositiveFloat | None = None
-    """Seconds without samples after which the device is lost and connected again; what the FIFO
-    holds (``capacity``), and at least 10 s, if not given."""
+    """Seconds without samples after which the device is lost and reconnected; default: the length
+    of the FIFO (``capacity``), at least 10 s."""
 
 
 class FifoSession:
@@ -105,22 +106,22 @@ class FifoSession:
                 raise NoAnswerError(
                     f"{self._stream.label}: the FIFO has been empty for {STALLED:g} s"
                 )
-            level = self._decoder.level or math.inf  # none is known before a first reply
+            level = self._decoder.level or math.inf  # unknown before the first reply
             if self._decoder.started or level < least or least == math.inf:
                 least, lessened = level, loop.time()
             elif loop.time() - lessened > NOT_LESS:
                 raise NoAnswerError(
-                    f"{self._stream.label}: the FIFO is never read up, {self._decoder.level} words"
-                    " wait: the link is too slow for the sampling rate (a higher"
-                    " settings.baud_rate on both ends, or a lower rate)"
+                    f"{self._stream.label}: the FIFO is never empty, {self._decoder.level} words"
+                    " left: the link is too slow for the sampling rate; set a higher"
+                    " settings.baud_rate on both ends, or a lower rate"
                 )
             if self._decoder.level < MAX_WORDS:
                 await asyncio.sleep(self._settings.poll_interval)
 
     async def _once(self) -> tuple[list[Block | Event], bool]:
-        """Read once; return what came, and whether it was a reply."""
+        """Read once; return blocks and events, and whether a reply arrived."""
         decoder, stream = self._decoder, self._stream
-        stream.discard()  # a late reply to an earlier read is none to this one
+        stream.discard()  # a late reply to an earlier read
         await stream.write(decoder.request())
         items: list[Block | Event] = []
         try:
@@ -143,7 +144,7 @@ class FifoDriver:
     settings = FifoSettings
     shares_clock = False
 
-    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- of the seam
+    def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:  # noqa: ARG002 -- interface
         """Return int16."""
         return np.dtype(np.int16)
 
@@ -153,7 +154,7 @@ class FifoDriver:
 
     @contextlib.asynccontextmanager
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
-        """Open the port, see that the device answers, and set its sampling rate."""
+        """Open the port, test that the device replies, and set its sampling rate."""
         sensor, settings = _checked(sensors)
         async with open_port(
             sensor.port,
@@ -189,7 +190,7 @@ class FifoDriver:
 
 
 def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
-    """Return the sensor and its settings; raise BenchFileError for what cannot be."""
+    """Return the sensor and its settings; raise BenchFileError if they are invalid."""
     sensor = only(sensors, "reading one FIFO takes all of a line")
     settings = FifoSettings.model_validate(sensor.settings)
     rate = sensor.sampling_rate
@@ -217,13 +218,13 @@ def _checked(sensors: Sequence[Sensor]) -> tuple[Sensor, FifoSettings]:
 
 
 async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) -> None:
-    """Set the sampling rate, or read the FIFO's level, until the device answers."""
+    """Set the sampling rate, or read the FIFO's level, until the device replies."""
     request = rtu.read_request(settings.unit, 2, 1)
     if settings.set_rate:
         rate = round(sensor.sampling_rate)
         request = rtu.write_request(settings.unit, RATE_REGISTER, rate)
     finder = ReplyFinder()
-    instead = ""
+    unexpected = ""
     for _ in range(ATTEMPTS):
         stream.discard()
         finder.expect(request)
@@ -241,14 +242,14 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
                 )
             if settings.set_rate and reply.payload != request[2:-2]:
                 raise WrongDeviceError(
-                    f"{stream.label}: set {sensor.sampling_rate:g} Hz, the device says"
+                    f"{stream.label}: set {sensor.sampling_rate:g} Hz, the device reports"
                     f" {int.from_bytes(reply.payload[2:4], 'big')}"
                 )
             return
-        instead = finder.unexpected or instead
+        unexpected = finder.unexpected or unexpected
     raise NoAnswerError(
         f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}:"
-        f" {instead or 'nothing came'};"
+        f" {unexpected or 'nothing received'};"
         " check cable, power, settings.baud_rate and settings.unit"
     )
 

@@ -1,10 +1,11 @@
-"""Driver for anything with readings in Modbus registers, RTU and TCP.
+"""Driver for any device with samples in Modbus registers, RTU and TCP.
 
-The device's own sampling is not ours: each poll is one sample at its own instant, recorded with
-it. That serves tilt, slow channels and checks; for noise work use devices that stream.
+Each poll is one sample, recorded with its own instant, independent of the device's own sampling.
+This suits tilt, slow channels and checks; for noise measurements use devices that stream.
 
-Several sensors on one port are slaves on one bus, polled in turn. One that is silent is asked again
-for as long as the others go on, with back-off and little patience, and set up anew when it answers.
+Several sensors on one port are slaves on one bus, polled in turn. While other slaves reply, the
+driver retries a silent one with growing delays and a short timeout, and configures it again when it
+replies.
 """
 
 from __future__ import annotations
@@ -41,18 +42,18 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
 
 FAILURES = 3
-"""Polls without a reply after which a device counts as gone."""
+"""Polls without a reply after which a device is lost."""
 FIRST_RETRY, LONGEST_RETRY = 1.0, 30.0
-"""When a device that is gone is asked again while others on its bus answer, s; each time twice as
-late, since the others have to wait for it."""
+"""Delay in s of the next request to a lost device while others on its bus reply; doubled after each
+request, because the others wait meanwhile."""
 GATEWAY_CODES = {10, 11}
-"""Modbus exceptions by which a gateway says that there is no answer behind it."""
+"""Modbus exceptions by which a gateway reports that the device does not reply."""
 
 ATTEMPTS = 3
-"""Requests to a device that is set up, of which one must bring an undamaged reply."""
+"""Number of requests to a device during configuration; one must succeed."""
 
 OF_THE_BUS = ("timeout", "baud_rate", "parity", "stop_bits", "echo")
-"""Settings of the port's first sensor, for all."""
+"""Settings that the port's first sensor determines for all sensors of the port."""
 
 Address = Annotated[int, Field(ge=0, le=65535)]
 
@@ -63,31 +64,31 @@ class RegisterSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     preset: Literal["witmotion", "labjack-ain"] | None = None
-    """Settings of a known device; those given beside it go before."""
+    """Settings of a known device; explicit settings override them."""
     device_id: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Slave address or unit identifier; 1 if not given."""
+    """Slave address or unit identifier; default: 1."""
     function: Literal[3, 4] | None = None
-    """3 holding registers, 4 input registers."""
+    """Function code: 3 for holding registers, 4 for input registers."""
     address: Address | None = None
-    """Of the first channel; the others follow."""
+    """Address of the first channel, if the channels are contiguous."""
     addresses: tuple[Address, ...] | None = None
-    """Of each channel, where they do not follow one another."""
+    """Address of each channel, if the channels are not contiguous."""
     data_type: DataType | None = None
-    """Of a channel's reading; int16 if not given."""
+    """Data type of each channel; default: int16."""
     word_order: WordOrder | None = None
-    """Which register of a longer value comes first: its most significant word ("big") or least."""
+    """Order of the registers of one value: most significant word first ("big") or last."""
     counter_address: Address | None = None
-    """Of a counter that changes with each new reading."""
+    """Address of a counter that changes with each new sample of the device."""
     time_address: Address | None = None
     time_format: TimeFormat | None = None
     timeout: PositiveFloat = 0.5
-    """For a reply, s."""
+    """Timeout of a reply, s."""
     baud_rate: PositiveInt = 9600
     parity: Literal["N", "E", "O"] = "N"
     stop_bits: Literal[1, 2] = 1
     echo: bool = False
-    """Whether the adapter sends back what is written to it (two-wire RS-485). Where it is not
-    stated, the first reading shows it; a device whose settings are written needs it stated."""
+    """Whether the adapter echoes sent bytes (two-wire RS-485). Without this setting, the first read
+    detects an echo; required if the preset writes to the device."""
 
 
 @dataclass(slots=True)
@@ -99,7 +100,7 @@ class _Polled:
     registers: RegisterMap
     device_id: int
     apart: bool = False
-    """Whether the device refuses registers that lie between those that are needed."""
+    """Whether the device refuses unused registers between the needed ones."""
 
     @classmethod
     def of(cls, sensor: Sensor) -> _Polled:
@@ -116,7 +117,7 @@ class _Polled:
         return cls(sensor, settings, registers, given.get("device_id", preset.get("device_id", 1)))
 
     async def prepare(self, bus: ModbusBus) -> DeviceInformation:
-        """Set up the device where its preset says how, and see that it answers."""
+        """Configure the device if its preset requires it, and test that it replies."""
         wanted = (
             f"sensor {self.sensor.name!r}: expected registers {self.registers} of device"
             f" {self.device_id}"
@@ -155,23 +156,21 @@ class _Polled:
             await self.read(bus)
 
     async def read(self, bus: ModbusBus) -> Reply:
-        """Ask for the registers that are needed.
+        """Read the needed registers.
 
         Raises
         ------
         RemoteProtocolError
-            A reply does not hold as many registers as were asked for.
+            If a reply has the wrong number of registers.
         DeviceError
-            As of :meth:`ModbusBus.read`.
+            As :meth:`ModbusBus.read`.
         """
         held: dict[int, int] = {}
         replies: list[Reply] = []
         for first, count in self.registers.reads(apart=self.apart):
             reply = await bus.read(self.registers.function, self.device_id, first, count)
             if len(reply.registers) != count:
-                raise RemoteProtocolError(
-                    f"{count} registers asked for, {len(reply.registers)} came"
-                )
+                raise RemoteProtocolError(f"{len(reply.registers)} registers; expected {count}")
             held |= dict(enumerate(reply.registers, first))
             replies.append(reply)
         registers = [held[address] for address in self.registers.needed]
@@ -185,7 +184,7 @@ class _Polled:
 
 
 class _Poller:
-    """Polls one sensor, counts what goes wrong, and sets it up again when it comes back."""
+    """Polls one sensor, counts errors, and configures the device again when it replies again."""
 
     def __init__(self, polled: _Polled, clock: HostClock, *, is_gone: bool) -> None:
         self.sensor = polled.sensor.name
@@ -194,7 +193,7 @@ class _Poller:
         self._polled = polled
         self._clock = clock
         self._period_ns = 1e9 / polled.sensor.sampling_rate
-        self._failures = 0  # one after the other
+        self._failures = 0  # consecutive
         self._n_wrong: Counter[str] = Counter()
         self._delay = FIRST_RETRY
         self._decoder = RegisterDecoder(
@@ -204,14 +203,14 @@ class _Poller:
             self._give_up()
 
     async def poll(self, bus: ModbusBus) -> list[Block | Event]:
-        """Ask once; what goes wrong becomes an event."""
+        """Poll once; errors become events."""
         if self.is_gone:
             return await self._retry(bus)
         found: list[Block | Event] = []
         try:
             reply = await self._polled.read(bus)
             found = self._decoder.receive(reply.registers, reply.sent, reply.received)
-        except DamagedReplyError as error:  # it is there: the next poll is due when it was
+        except DamagedReplyError as error:  # the device is present: the schedule does not change
             found = self._event(EventKind.CHECKSUM, str(error))
         except NoAnswerError as error:
             found = self._unanswered(str(error))
@@ -229,9 +228,9 @@ class _Poller:
         return found
 
     async def _retry(self, bus: ModbusBus) -> list[Block | Event]:
-        """Set up a device that was gone, if it answers; it may have lost its settings."""
+        """Configure a lost device if it replies: it may have lost its settings."""
         try:
-            with bus.hurrying():
+            with bus.short_timeout():
                 await self._polled.prepare(bus)
         except NoAnswerError:
             self._failures += 1
@@ -262,7 +261,7 @@ class _Poller:
         return [*self._decoder.flush(), Event(self.sensor, kind, counted, now)]
 
     def _schedule(self) -> None:
-        """Next poll at an absolute instant; those whose time has gone by are left out."""
+        """Schedule the next poll on the absolute grid of polls; omit missed polls."""
         if self._failures >= FAILURES:
             self._give_up()
             return
@@ -271,7 +270,7 @@ class _Poller:
 
 
 class RegisterSession:
-    """A bus whose devices answer, idle until :meth:`read`."""
+    """A bus with devices that reply, idle until :meth:`read`."""
 
     def __init__(
         self,
@@ -309,12 +308,12 @@ class RegisterDriver:
     """See :class:`daq.drivers.interface.DriverType`."""
 
     name = "registers"
-    summary = "readings in Modbus registers, RTU or TCP (WitMotion, LabJack AIN, any other)"
+    summary = "samples in Modbus registers, RTU or TCP (WitMotion, LabJack AIN, any other)"
     settings = RegisterSettings
     shares_clock = False
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
-        """Return the type of the readings in the registers."""
+        """Return the type of the values in the registers."""
         return _Polled.of(sensor).registers.dtype
 
     def check(self, sensors: Sequence[Sensor]) -> None:
@@ -325,7 +324,7 @@ class RegisterDriver:
     async def open(
         self, sensors: Sequence[Sensor], clock: HostClock
     ) -> AsyncIterator[RegisterSession]:
-        """Open the bus and see who of its sensors answers."""
+        """Open the bus and test which of its devices reply."""
         polled = _configured(sensors)
         first, port = polled[0].settings, sensors[0].port
         names = ", ".join(repr(sensor.name) for sensor in sensors)

@@ -36,7 +36,7 @@ REPORT_INTERVAL_NS = 1_000_000_000
 _REPORTS = {
     "checksum": (EventKind.CHECKSUM, "frame", "with a wrong checksum"),
     "skipped": (EventKind.RESYNCHRONISED, "byte", "skipped between frames"),
-    "repeated": (EventKind.RESYNCHRONISED, "frame", "came twice"),
+    "repeated": (EventKind.RESYNCHRONISED, "frame", "received twice"),
 }
 """Counted faults, and the event that reports each."""
 

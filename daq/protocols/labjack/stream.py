@@ -270,7 +270,7 @@ class StreamDecoder:
             return found
         lost = self._lost_packets(packet, at)
         if lost is None:
-            found.append(Event(self._name, EventKind.RESYNCHRONISED, "a packet came twice", at))
+            found.append(Event(self._name, EventKind.RESYNCHRONISED, "received a packet twice", at))
             return found
         if lost:
             found += self._blocks(rows, at)

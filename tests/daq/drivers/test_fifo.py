@@ -148,9 +148,7 @@ async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch)
     one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
     with serving(spec(one, sampling_rate=RATE)) as (running,):
         slow = sensors(running, one, settings={})[0]
-        with pytest.raises(
-            NoAnswerError, match=r"never read up, 58\d\d words wait: the link is too"
-        ):
+        with pytest.raises(NoAnswerError, match=r"never empty, 58\d\d words left: the link is too"):
             await record(slow, 1)
 
 
@@ -215,7 +213,7 @@ async def test_an_overflow_is_told_and_the_gap_estimated(
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
-        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9: nothing came; check cable"),
+        ({"settings": {"unit": 9}}, NoAnswerError, "of unit 9: nothing received; check cable"),
         ({"sampling_rate": 20_001.0}, WrongDeviceError, "refused setting .*: illegal value"),
         ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
     ],

@@ -123,12 +123,12 @@ async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice
         (
             {"settings": {"streams": ["DEMOZ2", "DEMON2", "OTHER"], "patience": 1.0}},
             NoAnswerError,
-            "streams OTHER of .A. did not come within 1 s; heard DEMOE2",
+            "streams OTHER of .A. not received within 1 s; received DEMOE2",
         ),
         (
             {"settings": {"patience": 1.0}, "channels": ({"name": "Z", "sensitivity": 1.0},)},
             NoAnswerError,
-            "expected 1 streams of one digitizer, heard DEMOE2, DEMON2, DEMOZ2",
+            "expected 1 streams of one digitizer, received DEMOE2, DEMON2, DEMOZ2",
         ),
     ],
 )
@@ -255,8 +255,8 @@ async def test_recovery_that_failed_is_tried_again() -> None:
                     if len(said) == 3 and len(blocks) > recovered_from + 4:
                         break
     assert [text.partition(": ")[0] for text in said[:2]] == [
-        "no recovery of lost packets over TCP, again in 5 s",
-        "no recovery of lost packets over TCP, again in 10 s",
+        "no recovery of lost packets over TCP, next in 5 s",
+        "no recovery of lost packets over TCP, next in 10 s",
     ]
     assert said[2] == "lost packets are recovered over TCP again"
     assert not any(block.reason for block in blocks[recovered_from + 1 :])

@@ -222,7 +222,7 @@ async def test_a_t8_streams(running: tuple[RunningDevice, ...]) -> None:
     ("index", "settings", "said"),
     [
         (2, {"range": 10.0}, "range = 10.0: expected one of 11, 9.6, 4.8, 2.4"),
-        (0, {"range": 9.6}, "range = 9.6: expected one of 10, 1, 0.1, 0.01 V, as a T7 has"),
+        (0, {"range": 9.6}, "range = 9.6: expected one of 10, 1, 0.1, 0.01 V for a T7"),
         (2, {"inputs": [0, 1, 8]}, "a T8 has AIN0 to AIN7"),
         (2, {"negative_inputs": [3, 4, 5]}, "its own negative terminal"),
     ],
@@ -311,7 +311,7 @@ async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
             "AIN0 is already an input of sensor 'A'",
         ),
         ({"settings": {"stream_port": 1}}, {}, NotConnectedError, "nothing listens there"),
-        ({"sampling_rate": 20_000.0}, {}, DeviceError, "does not go on: scan overlap"),
+        ({"sampling_rate": 20_000.0}, {}, DeviceError, "the stream keeps ending: scan overlap"),
         (
             {"settings": {"trigger_index": 1 << 31}},
             {},

@@ -127,7 +127,7 @@ async def test_another_device_on_the_same_port_is_left_out(
                 counts += item.counts[:, 0].tolist()
                 where = host_and_port(one.port)
                 other.sendto(b"{'EHZ', 1582315130.292, 777777777, 777777777}", where)
-    assert said == "datagrams from 127.0.0.2 are left out: another device sends to this port"
+    assert said == "datagrams from 127.0.0.2 are ignored: another device sends to this port"
     assert counts
     assert 777777777 not in counts
 
@@ -180,4 +180,4 @@ async def test_rows_twice_lost_and_late_leave_every_sample_in_its_place() -> Non
         reasons = {block.reason for block in blocks}
         assert reasons == {"", "counter" if one.name == "B" else "time step"}
         assert {event.kind for event in events} == {"status"}
-        assert "came again" in events[-1].text
+        assert "repeated" in events[-1].text

@@ -85,7 +85,7 @@ async def test_a_format_that_matches_nothing_says_what_would(
     )
     with pytest.raises(
         NoAnswerError,
-        match=r"rows came that settings do not match: '.*;.*'; these would: delimiter = \";\", "
+        match=r"received rows that settings do not match: '.*;.*'; these would: delimiter = \";\", "
         r"decimal_comma = true, columns = \[0, 1, 2\]",
     ):
         await reading.record(DRIVER, sensor, 1, speed=SPEED)

@@ -204,7 +204,7 @@ def test_frames_that_come_twice_are_dropped() -> None:
     one = decoder()
     found = one.receive(frames(0, 20) + frames(12, 8) + frames(20, 5), at(0.1))
     assert samples(found) == samples(decoder().receive(frames(0, 25), at(0.1)))
-    assert [e.text for e in found if isinstance(e, Event)] == ["8 frames came twice"]
+    assert [e.text for e in found if isinstance(e, Event)] == ["8 frames received twice"]
 
 
 def test_a_reset_restarts_the_clock_and_estimates_the_gap() -> None:

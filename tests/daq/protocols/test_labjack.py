@@ -404,7 +404,7 @@ def test_a_packet_number_that_host_time_does_not_allow(timed: bool) -> None:
     assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
     assert blocks[-1].end_sample == 400
     events = [item.text for item in found if isinstance(item, Event)]
-    assert events == ["a packet came twice"]
+    assert events == ["received a packet twice"]
 
 
 @pytest.mark.parametrize("timed", [True, False])
