@@ -1,4 +1,4 @@
-"""The motion and noise of the paper, and devices that speak the real protocols.
+"""Simulated motion and noise of the paper, and simulated devices with the real protocols.
 
-Shares `daq.protocols` with daq and nothing else.
+Uses only `daq.protocols` of daq.
 """

@@ -1,4 +1,4 @@
-"""Names for the array types of the simulated world."""
+"""Array types of the simulated world."""
 
 from __future__ import annotations
 

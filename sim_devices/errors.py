@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class SimulationError(Exception):
-    """Root of the errors of this package."""
+    """Base class of the errors of this package."""
 
     is_usage_error = False
     """Whether a scenario or a fault script has an error; otherwise a device cannot be served."""
@@ -16,7 +16,7 @@ class ScenarioError(SimulationError, ValueError):
     Parameters
     ----------
     problems : str
-        One for each error: key, value and expectation.
+        One per error, with key, value and expectation.
     """
 
     is_usage_error = True
@@ -32,9 +32,9 @@ class ServeError(SimulationError, RuntimeError):
     Parameters
     ----------
     message : str
-        That of the device's process, where it has failed there.
+        Message of the device's process, if the process failed.
     is_usage_error : bool
-        Whether its process failed by a scenario or a fault script.
+        Whether a scenario or a fault script is the cause.
     """
 
     def __init__(self, message: str, *, is_usage_error: bool = False) -> None:

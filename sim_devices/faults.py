@@ -6,44 +6,44 @@ file::
     [[faults]]
     kind = "corrupt"        # see below
     sensors = ["A"]         # devices of these sensors (default: all)
-    at = 12.0               # world time of the first, s
+    at = 12.0               # world time of the first occurrence, s
     every = 30.0            # period of repetition, s (default: once)
     count = 3               # bytes, or frames
 
-Kinds that strike the next unit (frame, packet, reply) a device sends, in every family:
+Kinds that affect the next unit (frame, packet, reply) of a device, in every family:
 
 ========== ==========================================================================
 drop       ``count`` units are not sent
-cut        ``count`` bytes are taken out of a unit's middle
+cut        ``count`` bytes are removed from the middle of a unit
 corrupt    ``count`` bytes of a unit are changed
-checksum   one bit of a unit's last byte but one is changed, where most have a checksum
-garbage    ``count`` random bytes go before a unit
+checksum   one bit of a unit's last byte but one is changed, usually in its checksum
+garbage    ``count`` random bytes are sent before a unit
 duplicate  a unit is sent ``1 + count`` times
 merge      the first half of a unit is followed by the second half of the next
-late       a unit, and all behind it, is kept back for ``duration`` s
+late       a unit, and all later ones, are delayed by ``duration`` s
 ========== ==========================================================================
 
 Kinds that last ``duration`` s:
 
 ========== ==========================================================================
-jitter     each unit is kept back for up to ``level`` s
-latency    each unit is kept back for an exponential time with mean ``level`` s
-batching   units leave only every ``level`` s, as through a polled USB adapter
+jitter     each unit is delayed by up to ``level`` s
+latency    each unit is delayed by an exponential time with mean ``level`` s
+batching   units are sent only every ``level`` s, as through a polled USB adapter
 stall      the device sends nothing; its samples are lost
 pause      the device sends nothing; afterwards it sends its buffer of ``level`` s (all samples,
            without ``level``)
-disconnect the cable is pulled, and plugged in again
+disconnect the cable is unplugged, and plugged in again
 silent     one unit of a bus is off, and restarts afterwards
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
 dead       samples are 0 (of ``channel``, or of all)
 ========== ==========================================================================
 
-Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` lets
-its counter wrap ``at`` seconds after sampling starts; ``overflow`` overflows the buffer of the
-device for ``duration``. The last three apply to devices with this function.
+Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` makes
+its counter wrap ``at`` seconds after the start of sampling; ``overflow`` overflows the buffer of
+the device for ``duration``. The last three apply only to devices with this function.
 
-Random numbers come from ``seed``: the same script changes the same stream in the same way. A
-wandering or wrong clock is not a fault but a property of the sensor: ``clock`` in the scenario.
+Random numbers depend only on ``seed``: a script has the same effect in every run. A wandering or
+wrong clock is not a fault but a property of the sensor: ``clock`` in the scenario.
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ LASTING = (*DELAYS, "stall", "pause", "disconnect")
 UNIT_KINDS = ("drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late")
 SAMPLE_KINDS = ("clip", "dead", "spike")
 PATIENCE = 1.0
-"""Seconds after which a fault expires that found no unit."""
+"""Seconds after which a fault expires if no unit is sent."""
 
 
 class Fault(BaseModel):
-    """One line of a fault script."""
+    """One entry of a fault script."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -116,7 +116,7 @@ class Fault(BaseModel):
         return self
 
     def times(self, begin: float = 0.0) -> Iterator[float]:
-        """World times at which it strikes, in s, from ``begin`` on."""
+        """Yield the world times of the fault in s, from ``begin`` on."""
         if self.every is None:
             return iter((self.at,) if self.at >= begin else ())
         first, every = max(0, math.ceil((begin - self.at) / self.every)), self.every
@@ -134,12 +134,12 @@ def parse(script: Any, sensors: Sequence[str] | None = None) -> tuple[Fault, ...
     script
         A list of tables, as in a TOML file's ``[[faults]]``.
     sensors
-        Leave only what strikes one of these.
+        Return only faults of these sensors.
 
     Raises
     ------
     ScenarioError
-        Naming every key that is wrong, its value and what was expected.
+        With every wrong key, its value and the expectation.
     """
     try:
         faults = _SCRIPT.validate_python(script)
@@ -168,7 +168,7 @@ def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
     ScenarioError
         With every unknown sensor and channel, and the known ones.
     """
-    wrong = []  # counted from 1, as in other faults of bench files
+    wrong = []  # numbered from 1, as in other errors of bench files
     for number, fault in enumerate(faults, 1):
         place, named = f"faults[{number}]", fault.sensors or ()
         wrong += [
@@ -185,14 +185,14 @@ def check(faults: Sequence[Fault], n_channels: Mapping[str, int]) -> None:
 
 
 class SampleFaults:
-    """What the script does to samples before the device sends them."""
+    """Faults that change samples before the device sends them."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._faults = [fault for fault in faults if fault.kind in SAMPLE_KINDS]
         self._silences = [fault for fault in faults if fault.kind == "silent"]
 
     def is_silent(self, sensor: str, now: float) -> bool:
-        """Whether the device of a sensor is off at world time ``now``."""
+        """Return whether the device of a sensor is off at world time ``now``."""
         return any(
             (fault.sensors is None or sensor in fault.sensors)
             and now >= fault.at
@@ -203,7 +203,7 @@ class SampleFaults:
     def apply(
         self, sensor: str, counts: NDArray[np.float64], times: FloatArray
     ) -> NDArray[np.float64]:
-        """Return counts (n, n_channels), sampled at world ``times`` (n,), with what went wrong."""
+        """Return counts (n, n_channels), sampled at world ``times`` (n,), with the faults."""
         for fault in self._faults:
             if fault.sensors is not None and sensor not in fault.sensors:
                 continue
@@ -213,7 +213,7 @@ class SampleFaults:
             since = times - fault.at
             period = fault.every or math.inf
             struck = (since >= 0) & (np.mod(since, period) < fault.duration)
-            if fault.kind == "spike":  # the first sample from each strike on
+            if fault.kind == "spike":  # the first sample at or after each time
                 step = times[1] - times[0] if times.size > 1 else 0.0
                 around = np.append(since[0] - step, since)
                 strikes = np.where(around < 0, -1.0, np.floor(around / period))
@@ -229,10 +229,10 @@ class SampleFaults:
 
 
 class LineFaults:
-    """What the script does to one line: to its units, and to the line itself.
+    """Faults of one line: of its units, and of the line itself.
 
-    The line asks :meth:`next_due` when there is something to do, does it with :meth:`act`, and
-    passes all it sends through :meth:`send`.
+    :meth:`next_due` is the time of the next action, :meth:`act` performs due actions, and all sent
+    units pass through :meth:`send`.
     """
 
     def __init__(self, faults: Sequence[Fault], name: str, *, begin: float = 0.0) -> None:
@@ -242,7 +242,7 @@ class LineFaults:
         self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
         for index, fault in enumerate(faults):
             if fault.kind not in (*SAMPLE_KINDS, "silent", "wrap"):
-                # what lasts may have begun before the device was there
+                # lasting faults may have begun before the device started
                 times = fault.times(begin - fault.duration * (fault.kind in LASTING))
                 first = next(times, None)
                 if first is not None:
@@ -254,14 +254,14 @@ class LineFaults:
         self._silent_until = self._delayed_until = -math.inf
         self._paused_until = self._full_at = -math.inf
         self._delay: Fault | None = None
-        self._phase = self._rng.uniform()  # of the polls of an adapter, in polls
+        self._phase = self._rng.uniform()  # of an adapter's polls, in poll intervals
         self.down_until = -math.inf
-        """World time until which the cable is out."""
+        """World time until which the cable is unplugged."""
         self.struck: list[tuple[float, Fault]] = []
-        """What struck, and when, since this was last emptied."""
+        """Times and faults that occurred since this list was last cleared."""
 
     def next_due(self) -> float:
-        """World time of the next action: a fault, or a delayed unit."""
+        """Return the world time of the next action: a fault, or a delayed unit."""
         return min(
             self._schedule[0][0] if self._schedule else math.inf,
             self._held[0][0] if self._held else math.inf,
@@ -294,7 +294,7 @@ class LineFaults:
         return outside, self._released(now)
 
     def send(self, units: Sequence[bytes], now: float) -> list[bytes]:
-        """Return what of these units, and of those kept back, goes out now."""
+        """Apply faults to units; return the units to send now, including delayed ones."""
         if now < self._silent_until:
             return []
         while self._armed and self._armed[0][0] < now:
@@ -363,4 +363,4 @@ class LineFaults:
                 places = self._rng.choice(octets.size, n, replace=False)
                 octets[places] ^= self._rng.integers(1, 256, n, dtype=np.uint8)
                 sent = [octets.tobytes()]
-        return sent  # nothing of one that is dropped
+        return sent  # empty for "drop"

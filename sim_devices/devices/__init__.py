@@ -1,1 +1,1 @@
-"""Simulated devices: each answers as its real counterpart would."""
+"""Simulated devices, with the replies and timing of their real counterparts."""

@@ -1,18 +1,18 @@
 """A simulated Epson M-A352 or M-A370: registers in, bursts out.
 
-Simulated functions: two register windows (with the trap that ``80 xx 0D`` is a burst request in
-one and a register write in the other), the modes and their state bits, rates,
-filters, burst fields, tilt, UART_AUTO and bursts on request, no answers to reads while streaming,
-software reset, flash backup, factory defaults, AUTO_START, busy and not-ready bits that last, COUNT
-wrapping, each burst sent when its last bit would have left the UART, sampling by an external
-trigger, and, on an M-A370, in step with 1PPS. An M-A370 has neither reduced noise nor temperature
-stabilisation, and lacks three filters: it ignores their bits and codes (assumed).
+Simulated functions: two register windows (``80 xx 0D`` is a burst request in one and a register
+write in the other), modes and their state bits, rates, filters, burst fields, tilt, UART_AUTO and
+bursts on request, no replies to reads while streaming, software reset, flash backup, factory
+defaults, AUTO_START, busy and not-ready bits with their durations, wraps of COUNT, transmission
+time of each burst on the UART, external trigger, and on an M-A370 synchronisation with 1PPS. An
+M-A370 has neither reduced noise nor temperature stabilisation, and lacks three filters: it ignores
+their bits and codes (assumed).
 
-The setting ``external`` defines the EXT pin: a trigger generator at the sampling rate, or the
-seconds of UTC. Without it, a device that waits for triggers takes no sample, and one that follows
-the seconds samples by its own clock.
+The setting ``external`` defines the signal at the EXT pin: a trigger generator at the sampling
+rate, or the seconds of UTC. Without a signal, a triggered device takes no samples, and a device
+with 1PPS uses its own clock.
 
-Not simulated: attenuation and delay of the filters, and sleep, which only a reset ends.
+Not simulated: attenuation and delay of the filters, and sleep mode, which only a reset ends.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 FULL_SCALE = 15 * commands.COUNTS_PER_G
 RESET_TIME, FLASH_TIME, FILTER_TIME, TEST_TIME = 0.97, 0.31, 0.005, 0.2
-"""How long the device is not ready or busy, s."""
+"""Durations for which the device is not ready or busy, s."""
 TRIGGER, PPS = 0x40, 0x80
-"""Bits of MSC_CTRL: samples at triggers, or in step with 1PPS (M-A370)."""
+"""Bits of MSC_CTRL: sampling by triggers, or synchronised with 1PPS (M-A370)."""
 _NOT_ON_A370 = {commands.FILTERS[name] for name in commands.NOT_ON_A370}
 AHEAD = 1.0
-"""How much is simulated at a time, s of world time."""
+"""Duration simulated per call, s of world time."""
 
 _DEFAULTS = {
     commands.SIG_CTRL: 0x8E04,
@@ -55,7 +55,7 @@ _PENDING = {commands.FLASH_BACKUP: 0x0008, commands.FACTORY: 0x0010}
 
 
 def temperature_counts(times: NDArray[np.float64] | float) -> NDArray[np.int64]:
-    """Return the sensor's temperature at world times in s: 25 °C ± 0.5 °C in an hour."""
+    """Return temperature counts at world times in s: 25 °C ± 0.5 °C with a period of one hour."""
     celsius = 25.0 + 0.5 * np.sin(2 * np.pi * np.asarray(times) / 3600.0)
     return np.rint((celsius - commands.TEMPERATURE_OFFSET) / commands.TEMPERATURE_SLOPE).astype(
         np.int64
@@ -68,9 +68,9 @@ class EpsonDevice:
     Parameters
     ----------
     device
-        Its sensor and settings; ``first_count`` among them sets the first COUNT.
+        Sensor and settings; the setting ``first_count`` is the first COUNT.
     source
-        What its sensor reads.
+        Readings of the sensor.
     """
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
@@ -106,15 +106,15 @@ class EpsonDevice:
     # --- Endpoint -------------------------------------------------------------------------
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Nothing happens: a UART has no connections."""
+        """Do nothing: a UART has no connections."""
         self.due(now)
         return ()
 
     def disconnected(self, now: float) -> None:
-        """Nothing happens: a UART has no connections."""
+        """Do nothing: a UART has no connections."""
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer reads, obey writes."""
+        """Execute commands; return the replies to reads."""
         answers = list(self.due(now))
         for command in self._commands.receive(received):
             if isinstance(command, Read):
@@ -147,8 +147,8 @@ class EpsonDevice:
 
     # --- commands -------------------------------------------------------------------------
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Suffer a power failure; it has no buffer to overflow."""
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Simulate a power failure; the device has no buffer to overflow."""
         if kind == "reset":
             self._power_on(now)
         return ()
@@ -193,7 +193,7 @@ class EpsonDevice:
         return value
 
     def _measured(self, register: Register, now: float) -> int:
-        """Return a register of window 0 that follows the measurement."""
+        """Return a register of window 0 with a measured value."""
         if register == commands.COUNT:
             return self._count(self._latest(now)) if self._mode == commands.SAMPLING else 0
         high = (
@@ -228,7 +228,7 @@ class EpsonDevice:
 
     def _set(self, register: Register, command: Write, now: float) -> None:
         shift = 8 if command.address & 1 else 0
-        if register == commands.MSC_CTRL and shift:  # self-tests: bits that clear when done
+        if register == commands.MSC_CTRL and shift:  # self-tests: bits clear on completion
             self._busy[register] = (command.value << 8, now + TEST_TIME)
             return
         value = command.value
@@ -284,7 +284,7 @@ class EpsonDevice:
         self._simulate(self._begin)
 
     def _simulate(self, first: int) -> None:
-        """Make the bursts of the next second, the sample of index ``first`` leading."""
+        """Simulate the bursts of the next second, from sample ``first`` on."""
         n = max(1, math.ceil(AHEAD * self._sampled.sampling_rate))
         self._first, self._sent = first, 0
         self._times = self._sampled.times(self._sensor, first, n)

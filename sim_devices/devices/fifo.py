@@ -1,10 +1,10 @@
 """A simulated vibration unit: samples into a FIFO, read in blocks over Modbus RTU.
 
-What the real device is said to do and this one too: slave 1, function 6 on register 1 for the
-sampling rate, function 4 on register 2 for the level and the words behind it, at most 123, in whole
-samples of all channels; new samples dropped when the FIFO is full. ``header`` says what the first
-register means, ``capacity`` (words) how much the FIFO holds. A reply leaves when its last byte
-would have, at the line's rate, after a turnaround of 1 ms.
+Simulated functions, according to public clients: slave 1; function 6 on register 1 for the sampling
+rate; function 4 on register 2 for the level and at most 123 words, in complete samples of all
+channels; a full FIFO drops new samples. The setting ``header`` is the meaning of the first
+register, ``capacity`` the size of the FIFO in words. A reply is returned when its last byte has
+been transmitted at the line's rate, after a turnaround of 1 ms.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ class FifoDevice:
         self._n_channels = self._samples.n_channels
         self._capacity = int(settings.get("capacity") or CAPACITY) // self._n_channels
         self._next = self._samples.first_after(0.0)
-        self._first = self._end = self._next  # what is in the FIFO: from there to there, but for
-        self._holes: deque[tuple[int, int]] = deque()  # samples that had found no room
+        self._first = self._end = self._next  # the FIFO holds samples _first to _end, except
+        self._holes: deque[tuple[int, int]] = deque()  # the dropped samples
         self._to_send: deque[tuple[float, bytes]] = deque()
 
     # --- Endpoint ----------------------------------------------------------------------------
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Nothing happens: a serial line has no connections."""
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Do nothing: a serial line has no connections."""
         return ()
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
-        """Forget what was to be sent."""
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Discard unsent replies."""
         self._to_send.clear()
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer requests to this unit."""
+        """Process requests to this unit."""
         for request in self._requests.receive(received):
             self._advance(now)
             reply = self._answer(request)
@@ -70,8 +70,8 @@ class FifoDevice:
             self._to_send.append((ready + TURNAROUND + len(reply) * self._byte_time, reply))
         return self.due(now)
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Suffer a power failure: the FIFO is lost."""
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Simulate a power failure: the content of the FIFO is lost."""
         if kind == "reset":
             self._advance(now)
             self._first = self._end = self._next
@@ -79,14 +79,14 @@ class FifoDevice:
         return ()
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Return the replies whose last byte has left."""
+        """Return the completely transmitted replies."""
         sent: list[bytes] = []
         while self._to_send and self._to_send[0][0] <= now:
             sent.append(self._to_send.popleft()[1])
         return sent
 
     def next_due(self) -> float:
-        """World time at which the next reply has left."""
+        """Return the world time at which the next reply is completely transmitted."""
         return self._to_send[0][0] if self._to_send else NEVER
 
     # --- registers ---------------------------------------------------------------------------
@@ -111,12 +111,12 @@ class FifoDevice:
         if rate != self._rate:
             self._rate = rate
             self._samples = Samples(self._source.at_rate(float(rate)), self._sensors)
-            self._next = 0  # found anew by the clock
+            self._next = 0  # set again from the clock
             self._holes.clear()
             self._first = self._end = -1
 
     def _advance(self, now: float) -> None:
-        """Take the samples of the time up to ``now``; those that find no room are dropped."""
+        """Take the samples up to ``now``; drop them if the FIFO is full."""
         if self._end < 0:
             self._first = self._end = self._next = self._samples.first_after(now)
         end = self._samples.end_before(now, self._next)
@@ -130,7 +130,7 @@ class FifoDevice:
 
     @property
     def _waiting(self) -> int:
-        """Samples in the FIFO."""
+        """Number of samples in the FIFO."""
         return self._end - self._first - sum(stop - start for start, stop in self._holes)
 
     def _read(self, function: int, n_samples: int) -> bytes:

@@ -1,14 +1,14 @@
 """A simulated Güralp digitizer: GCF over a serial line with block recovery, or a Scream server.
 
-What the real device does and this one too: a stream for each channel in blocks that start on UTC
-(:mod:`daq.protocols.guralp.gcf`), frames numbered, sent one at a time at the line's rate, each
-followed by a wait of 150 ms for its acknowledgement, rewinding to a block that is refused
-(:mod:`daq.protocols.guralp.brp`), blocks of status text; or packets over UDP to whoever asked
-within the last minute and over TCP, blocks sent again by number
+Simulated functions: one stream per channel, in blocks that start on UTC
+(:mod:`daq.protocols.guralp.gcf`); numbered frames, sent one at a time at the line's rate, each with
+a wait of 150 ms for its acknowledgement, and repetition from a refused block on
+(:mod:`daq.protocols.guralp.brp`); blocks of status text. Alternatively: packets over UDP to the
+client of the last minute and over TCP, and repetition of blocks by number
 (:mod:`daq.protocols.guralp.scream`).
 
-The sampling clock is on UTC whatever the scenario says of it: that is what GPS is for. What it does
-not do: commands at its terminal, triggered streams, several taps, memory while nobody listens.
+GPS keeps the sampling clock on UTC, independent of the scenario's clock. Not simulated: terminal
+commands, triggered streams, several taps, memory while disconnected.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from sim_devices.devices.interface import DeviceSpec, Source
 
 FULL_SCALE = (1 << 23) - 1
-MOST_SAMPLES = 248
-"""In a block: as many as any compression holds, in whole records of each."""
+MAX_SAMPLES = 248
+"""Maximum number of samples per block: fits every compression, in complete records."""
 LONGEST_BLOCK = 10
-"""In s, where the sampling rate is low."""
+"""Maximum duration of a block, in s, at low sampling rates."""
 REPLY_TIME = 0.15
 STATUS_INTERVAL = 60.0
 CLIENT_PATIENCE = 60.0
@@ -49,7 +49,7 @@ _ABOVE = sorted(float(rate) for rate, _ in gcf.RATES.values() if rate > 250)
 
 
 def stream_ids(device: DeviceSpec, sensor: str) -> tuple[str, ...]:
-    """Return the stream of each channel, as configured or made from the sensor's name."""
+    """Return the stream ID of each channel, configured or derived from the sensor's name."""
     settings = {**device.settings, **device.sensor_settings.get(sensor, {})}
     if settings.get("streams"):
         return tuple(settings["streams"])
@@ -59,7 +59,7 @@ def stream_ids(device: DeviceSpec, sensor: str) -> tuple[str, ...]:
 
 
 class Digitizer:
-    """Blocks of all streams, as they become complete."""
+    """Source of the blocks of all streams."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
         self._rate = Fraction(device.sampling_rate).limit_denominator(1000)
@@ -69,7 +69,7 @@ class Digitizer:
                 f"sensor {device.sensors[0]!r}: sampling_rate = {device.sampling_rate:g}; GCF has"
                 f" {', '.join(f'{rate:g}' for rate in _ABOVE)} Hz and whole Hz up to 250"
             )
-        self._utc_ns = -(-device.utc_ns // _NS) * _NS  # of sample 0: a whole second
+        self._utc_ns = -(-device.utc_ns // _NS) * _NS  # UTC of sample 0: a full second
         offset = (self._utc_ns - device.utc_ns) / _NS
         self._samples = Samples(source.disciplined(offset), device.sensors)
         self._streams = [s for sensor in device.sensors for s in stream_ids(device, sensor)]
@@ -80,24 +80,24 @@ class Digitizer:
         self._next_status = 0.0
 
     def _length_of_block(self) -> int:
-        unit = self._rate / self._parts  # a block starts on such a part of a second
+        unit = self._rate / self._parts  # samples per permitted interval between block starts
         if unit.denominator > 1:
             return max(1, round(LONGEST_BLOCK * float(self._rate)))
-        most = min(MOST_SAMPLES, int(LONGEST_BLOCK * self._rate))
+        most = min(MAX_SAMPLES, int(LONGEST_BLOCK * self._rate))
         return max(1, most // int(unit)) * int(unit)
 
     def start(self, now: float) -> None:
-        """Begin with the next whole block."""
+        """Start with the next complete block."""
         first = self._samples.first_after(now)
         self._next = -(-first // self._block_samples) * self._block_samples
         self._next_status = now
 
     def next_due(self) -> float:
-        """World time at which the next blocks are complete."""
+        """Return the world time at which the next blocks are complete."""
         return self._samples.time(self._next + self._block_samples - 1)
 
     def blocks(self, now: float) -> list[SampleBlock | StatusBlock]:
-        """Return the blocks completed by ``now``, those of one time together."""
+        """Return the blocks completed by ``now``, in order of time."""
         found: list[SampleBlock | StatusBlock] = []
         while self.next_due() <= now:
             if self.next_due() >= self._next_status:
@@ -115,7 +115,7 @@ class Digitizer:
         return found
 
     def encoded(self, block: SampleBlock | StatusBlock) -> bytes:
-        """Write a block."""
+        """Encode a block."""
         if isinstance(block, StatusBlock):
             return gcf.encode_status(block)
         return gcf.encode_block(block, width=self._width)
@@ -135,29 +135,29 @@ class SerialPort:
         self._byte_time = 10 / float(device.settings.get("baud_rate", 115200))
         self._transmitter = Transmitter()
         self._frame: bytes | None = None
-        self._until = NEVER  # when the frame has left, or the wait for its reply ends
+        self._until = NEVER  # end of the frame's transmission, or of the wait for its reply
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Begin to send."""
+        """Start to send."""
         self._digitizer.start(now)
         self._until = now
         return ()
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
-        """Forget what was to be sent; the sequence number goes on."""
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Discard queued frames; sequence numbers continue."""
         self._transmitter.clear()
         self._frame, self._until = None, NEVER
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Take acknowledgements and refusals."""
+        """Process acknowledgements and refusals."""
         sent = list(self.due(now))
         if self._transmitter.receive(received) and self._frame is None:
             self._until = min(self._until, now)
             sent += self.due(now)
         return sent
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Suffer a power failure: blocks are numbered anew; it has no buffer to overflow."""
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Simulate a power failure: sequence numbers restart. There is no buffer to overflow."""
         if kind == "reset" and self._until != NEVER:
             self._transmitter = Transmitter()
             self._frame = None
@@ -165,7 +165,7 @@ class SerialPort:
         return ()
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Return the frames whose last byte has left up to ``now``."""
+        """Return the frames completely transmitted by ``now``."""
         sent: list[bytes] = []
         if self._until == NEVER:
             return sent
@@ -184,7 +184,7 @@ class SerialPort:
         return sent
 
     def next_due(self) -> float:
-        """World time of the next thing to do."""
+        """Return the world time of the next action."""
         if self._until == NEVER:
             return NEVER
         if self._frame is None and not self._transmitter.waiting:
@@ -202,21 +202,21 @@ class ScreamServer:
         self._version = int(device.settings.get("version", 40))
         self._sent = sent
         self._udp = udp
-        self._until = 0.0  # how long the client wants packets
+        self._until = 0.0  # end of the client's request
         self._sequence = 0
         self._received = bytearray()
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Wait to be asked."""
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Wait for a request."""
         return ()
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
         """Stop sending."""
         self._until = 0.0
         self._received.clear()
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer a request."""
+        """Process a request."""
         if self._udp:
             return self._datagram(received, now)
         answers: list[bytes] = []
@@ -249,8 +249,8 @@ class ScreamServer:
             return ()
         return (scream.ACKNOWLEDGED, *self.due(now))
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Suffer a power failure: packets are numbered anew, and none can be asked for again."""
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Simulate a power failure: packet numbers restart, and old packets are lost."""
         if kind == "reset":
             self._sequence = 0
             self._sent.clear()
@@ -265,7 +265,7 @@ class ScreamServer:
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the packets of the blocks completed by ``now``."""
-        if self._until <= now:  # nobody has asked for long enough
+        if self._until <= now:  # the client's request has expired
             self._until = 0.0
             return ()
         packets: list[bytes] = []
@@ -277,7 +277,7 @@ class ScreamServer:
         return packets
 
     def next_due(self) -> float:
-        """World time at which the next block is complete."""
+        """Return the world time at which the next block is complete."""
         return self._digitizer.next_due() if self._until else NEVER
 
 

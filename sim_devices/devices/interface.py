@@ -2,9 +2,9 @@
 
 A family module (``sim_devices/devices/<family>.py``) has ``create(spec, source) -> list[Line]``. An
 endpoint is sans-IO and uses world time in seconds. :mod:`sim_devices.server.serve` puts each on a
-pseudo-terminal or a port, calls it for received bytes and at due times, and writes what it returns.
-Bytes are returned in units of the device (a frame, a packet, a datagram), so that a fault can
-strike exactly one.
+pseudo-terminal or a port, calls it for received bytes and at due times, and writes the returned
+bytes. Bytes are returned in units of the device (a frame, a packet, a datagram), so that a fault
+can affect exactly one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sim_devices.faults import SampleFaults
 
 Kind: TypeAlias = Literal["pty", "tcp", "udp", "udp-server"]
-"""What a line is served on; "udp" sends, "udp-server" answers whoever spoke last."""
+"""Kind of a line; "udp" only sends, "udp-server" sends to the last client."""
 
 NEVER = math.inf
 
@@ -37,29 +37,29 @@ class Endpoint(Protocol):
     """One end of a line: bytes in, bytes out; ``now`` is world time in seconds."""
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Somebody opened the line."""
+        """Handle a client that opened the line."""
         ...
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Return the answer to received bytes."""
+        """Process received bytes; return the reply."""
         ...
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Return what the device has sent by itself up to ``now`` and not returned before."""
+        """Return the units that the device has sent by itself since the last call."""
         ...
 
     def next_due(self) -> float:
-        """World time at which :meth:`due` will have something; ``NEVER`` until spoken to."""
+        """Return the world time of the next unit of :meth:`due`; ``NEVER`` before a request."""
         ...
 
     def disconnected(self, now: float) -> None:
-        """Nobody has the line open any more."""
+        """Handle the last client that closed the line."""
         ...
 
 
 @runtime_checkable
 class Faulty(Protocol):
-    """An endpoint whose device can suffer faults of its own."""
+    """An endpoint of a device with faults of its own."""
 
     def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
         """Perform the fault "reset" or "overflow"; return the bytes that it sends immediately."""
@@ -68,10 +68,10 @@ class Faulty(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """An endpoint and the kind of wire it is to be served on.
+    """An endpoint and the kind of line to serve it on.
 
-    ``scheme`` begins the address printed for a TCP or UDP line. The first line of a device is its
-    port; of a further one, ``setting`` names the driver's setting that is to hold its port number.
+    ``scheme`` is the start of the printed address of a TCP or UDP line. The first line of a device
+    is its port; for others, ``setting`` is the driver's setting for the port number.
     """
 
     endpoint: Endpoint
@@ -79,7 +79,7 @@ class Line:
     scheme: str = "socket"
     setting: str = ""
     carries_samples: bool = True
-    """Whether the faults of the script strike here; a pulled cable takes every line of a device."""
+    """Whether faults of the script affect this line; a pulled cable affects all lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,26 +102,26 @@ class DeviceSpec:
     channels: Mapping[str, tuple[ChannelSpec, ...]]
     settings: Mapping[str, Any] = field(default_factory=dict)
     sensor_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Where the sensors of one port differ in their settings (slaves on one bus)."""
+    """Settings by sensor, if the sensors of one port differ (slaves on one bus)."""
     utc_ns: int = 0
-    """UTC at world time 0, for devices that know it."""
+    """UTC at world time 0 in ns, for devices with UTC."""
     model: str = ""
     serial_number: str = ""
 
 
 class Source:
-    """What the sensors of a device read, in counts, and when.
+    """Readings of a device's sensors in counts, and their times.
 
     Parameters
     ----------
     scenario
-        The world, as handed over in the specification.
+        The world in the specification.
     device
-        The device whose sensors are read.
+        The device with the sensors.
     sampling_rate
-        In Hz; the device's own when not given. The world stays the same at any rate.
+        In Hz; default: the device's rate. The simulated motion does not depend on the rate.
     faults
-        What goes wrong with the samples.
+        Faults that change samples.
     """
 
     def __init__(
@@ -143,11 +143,11 @@ class Source:
         self._world = World(Scenario.from_dict(table))
 
     def at_rate(self, sampling_rate: float) -> Source:
-        """Return the same world read at another rate."""
+        """Return a source with the same world and another sampling rate."""
         return Source(self._scenario, self.device, sampling_rate, faults=self._faults)
 
     def disciplined(self, offset: float) -> Source:
-        """Return the same sensors, sampled ``offset`` s after world time 0 and without drift."""
+        """Return a source sampled without drift, from ``offset`` s after world time 0 on."""
         table = self._scenario.to_dict()
         for sensor in self.device.sensors:
             table["sensors"][sensor]["clock"] = {"offset": offset}
@@ -155,22 +155,22 @@ class Source:
         return Source(scenario, self.device, self.sampling_rate, faults=self._faults)
 
     def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
-        """Return the main channels in counts, not yet rounded or clipped: (n, n_channels)."""
+        """Return the main channels in counts, neither rounded nor clipped, (n, n_channels)."""
         counts = self._world.samples(sensor, first_sample, n) * self._sensitivities[sensor]
         if self._faults is None:
             return counts
         return self._faults.apply(sensor, counts, self.times(sensor, first_sample, n))
 
     def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
-        """World time of each sample in s, shape (n,)."""
+        """Return the world time of each sample in s, shape (n,)."""
         return self._world.sample_times(sensor, first_sample, n)
 
     def is_silent(self, sensor: str, now: float) -> bool:
-        """Whether a fault switches this unit of a shared line off at world time ``now``."""
+        """Return whether a fault switches this unit of a shared line off at ``now``."""
         return self._faults is not None and self._faults.is_silent(sensor, now)
 
     def first_sample_after(self, sensor: str, now: float) -> int:
-        """Index of the first sample taken at or after world time ``now``."""
+        """Return the index of the first sample taken at or after world time ``now``."""
         guess = max(0, math.floor((now - float(self.times(sensor, 0, 1)[0])) * self.sampling_rate))
         while guess > 0 and float(self.times(sensor, guess, 1)[0]) >= now:
             guess = max(0, guess - max(1, round(guess * 1e-4)))

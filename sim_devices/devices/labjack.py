@@ -1,16 +1,15 @@
 """A simulated LabJack T7 or T8: registers over Modbus TCP, streams over port 702 or by command.
 
-What the real device does and this one too: functions 3, 4, 6, 16 and 76, exceptions with their
-reason in register 55000; scan lists of analog inputs, CORE_TIMER, SYSTEM_TIMER_20HZ, the upper
-half of a 32-bit channel, and the channel's own position; a scan interval of whole 100 ns; packets
-of the wanted size; a buffer that overflows when nobody takes the samples (2940, then 2941 and one
-scan of 0xFFFF), 2943 when it lasts, 2942 when the rate is too high, bursts (2944); calibration in
-flash; temperature; CORE_TIMER, which stood at 0 at world time 0 and after each power failure (the
-fault ``reset``), and SYSTEM_TIMER_20HZ, which begins anew with the process, too.
+Simulated functions: functions 3, 4, 6, 16 and 76; exceptions with their reason in register 55000;
+scan lists of analog inputs, CORE_TIMER, SYSTEM_TIMER_20HZ, and the upper half of a 32-bit channel;
+scan intervals in multiples of 100 ns; the configured packet size; overflow of a buffer that is not
+read (2940, then 2941 and one scan of 0xFFFF), 2943 if it lasts, 2942 if the rate is too high,
+bursts (2944); calibration in flash; temperature; CORE_TIMER, which is 0 at world time 0 and after
+each power failure (the fault ``reset``); SYSTEM_TIMER_20HZ, which also restarts with the process.
 
-An analog input reads its channel's counts above the centre of the converter. Of ``settings`` it
-takes beyond the driver's: ``ends_with``, a fatal status with which the first stream breaks off
-after ``ends_after`` scans.
+An analog input reads the counts of its channel relative to the centre of the converter. Settings
+besides those of the driver: ``ends_with``, a fatal status that ends the first stream after
+``ends_after`` scans.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ _READ_ONLY = range(55000, 61810)
 
 
 class RefusedError(Exception):
-    """The device answers with an exception; the reason goes to register 55000."""
+    """The device replies with an exception; register 55000 gets the reason."""
 
     def __init__(self, exception: int, reason: int = 0) -> None:
         super().__init__(exception, reason)
@@ -122,14 +121,14 @@ class LabJack:
             self._store(reg.AIN_NEGATIVE_CHANNEL + n, struct.pack(">H", reg.SINGLE_ENDED))
             self._store(41500 + n, bytes(2))  # AINn_RESOLUTION_INDEX
         self.stream: Stream | None = None
-        self.stream_started = 0  # how many times
-        self._core_began = 0  # CORE_TIMER at world time 0, below 0, in ticks
-        self._system_began: float | None = None  # world time; the first time it is spoken to
+        self.stream_started = 0  # number of starts
+        self._core_began = 0  # CORE_TIMER at world time 0, zero or negative, in ticks
+        self._system_began: float | None = None  # world time of the first request
 
     # --- registers ---------------------------------------------------------------------------
 
     def answer(self, adu: Adu, now: float) -> bytes:
-        """Answer a request."""
+        """Return the reply to a request."""
         if self._system_began is None:
             self._system_began = now
         function = adu.pdu[0] if adu.pdu else 0
@@ -229,12 +228,12 @@ class LabJack:
 
     @property
     def targets(self) -> int:
-        """Where stream samples go."""
+        """Targets of stream samples (register STREAM_AUTO_TARGET)."""
         return self._value(reg.STREAM_AUTO_TARGET)
 
     @property
     def packet_size(self) -> int:
-        """Samples in a packet."""
+        """Number of samples per packet."""
         return min(max(1, self._value(reg.STREAM_SAMPLES_PER_PACKET)), MAX_SAMPLES)
 
     def _enable(self, value: int, now: float) -> None:
@@ -271,7 +270,7 @@ class LabJack:
             stream.breaks_off = (1, SCAN_OVERLAP)
         elif self._ends_with and not self.stream_started:
             stream.breaks_off = (self._ends_after, int(self._ends_with))
-        # a trigger is waited for, and never comes
+        # with a trigger index, the stream waits for a trigger that never occurs
         self.stream = None if self._value(reg.STREAM_TRIGGER_INDEX) else stream
         self.stream_started += 1
         self._store(reg.STREAM_ENABLE, struct.pack(">I", 1))
@@ -281,7 +280,7 @@ class LabJack:
         self._store(reg.STREAM_START_TIME_STAMP, started.to_bytes(4, "big"))
 
     def fault(self, kind: str, now: float, duration: float) -> None:
-        """Suffer a power failure, or an overflow that lasts."""
+        """Simulate a power failure, or an overflow of ``duration`` s."""
         if kind == "reset":
             self.stop()
             first = self._source.first_sample_after(self._sensors[0], now)
@@ -292,7 +291,7 @@ class LabJack:
             self.stream.overflow(now + duration)
 
     def stop(self) -> None:
-        """End the stream."""
+        """Stop the stream."""
         self.stream = None
         self._store(reg.STREAM_ENABLE, bytes(4))
 
@@ -313,16 +312,16 @@ class ControlPort:
         self._labjack = labjack
         self._finder = AduFinder()
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
         """Wait for requests."""
         self._finder = AduFinder()
         return ()
 
     def disconnected(self, now: float) -> None:
-        """Nothing happens: a stream goes on."""
+        """Do nothing: a stream continues."""
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer requests."""
+        """Process requests; return the replies."""
         try:
             requests = self._finder.receive(received)
         except RemoteProtocolError:
@@ -334,12 +333,12 @@ class ControlPort:
         self._labjack.fault(kind, now, duration)
         return ()
 
-    def due(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Return nothing: it answers only."""
+    def due(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Return nothing: the port only replies."""
         return ()
 
     def next_due(self) -> float:
-        """Return never: it answers only."""
+        """Return ``NEVER``: the port only replies."""
         return NEVER
 
 
@@ -347,7 +346,7 @@ class StreamPort:
     """Port 702; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     LOOK_INTERVAL = 0.05
-    """How often a stream that another port may have started is looked for, s of world time."""
+    """Interval of checks for a stream started over another port, s of world time."""
 
     def __init__(self, labjack: LabJack) -> None:
         self._labjack = labjack
@@ -356,16 +355,16 @@ class StreamPort:
         self._looked = 0.0
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Send what waits."""
+        """Send the samples in the buffer."""
         self._connected = True
         return self.due(now)
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
         """Keep the samples: the buffer may overflow."""
         self._connected = False
 
-    def receive(self, received: bytes, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Ignore what comes: the port sends only."""
+    def receive(self, received: bytes, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Ignore received bytes: the port only sends."""
         return self.due(now)
 
     def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:
@@ -374,7 +373,7 @@ class StreamPort:
         return ()
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Return the packets that are full."""
+        """Return the full packets."""
         self._looked = now
         stream = self._labjack.stream
         if stream is None or not self._connected or not self._labjack.targets & reg.TARGET_ETHERNET:
@@ -401,7 +400,7 @@ class StreamPort:
         return sent
 
     def next_due(self) -> float:
-        """World time at which the next packet is full, or at which to look for a stream."""
+        """Return the world time of the next full packet, or of the next check for a stream."""
         stream = self._labjack.stream
         if not self._connected:
             return NEVER
@@ -411,7 +410,7 @@ class StreamPort:
 
 
 def _t8_calibrations() -> list[reg.Calibration]:
-    """Return the calibrations of a T8 whose inputs are each off by a little."""
+    """Return the calibrations of a T8 with a small error in each input."""
     nominal = reg.nominal_t8_calibrations()
     per_input = len(reg.T8_RANGES)
     return [

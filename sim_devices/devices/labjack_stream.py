@@ -1,4 +1,4 @@
-"""The stream of a simulated LabJack: scans into its buffer, packets out of it."""
+"""The stream of a simulated LabJack: a buffer of scans, read in packets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CENTER = 33523
 
 
 class Stream:
-    """Scans taken into a buffer, and taken out of it in packets."""
+    """A buffer that is filled with scans and read in packets."""
 
     def __init__(
         self, samples: Samples, columns: Columns, *, capacity: int, packet_size: int, now: float
@@ -44,17 +44,17 @@ class Stream:
         self._full_until = -NEVER
         self._skipped = 0
         self.is_due = False
-        """Whether a packet is, though it is not full."""
-        self._mark: int | None = None  # scans skipped before the mark that is in the buffer
+        """Whether a packet is due that is not full."""
+        self._mark: int | None = None  # scans skipped before the mark in the buffer
         self.wanted: int | None = None
-        """Scans of a burst."""
+        """Number of scans of a burst; None for a continuous stream."""
         self.breaks_off: tuple[int, int] | None = None
-        """After how many scans, and with what status."""
+        """Number of scans after which the stream ends, and its status then."""
         self.ended = 0
-        """The status of its end."""
+        """Status at the end of the stream; 0 while it runs."""
 
     def advance(self, now: float) -> None:
-        """Take the scans of the time up to ``now``."""
+        """Take the scans up to ``now``."""
         end = self._samples.end_before(now, self._next)
         if self.wanted is not None and end >= self.first + self.wanted:
             end, self.ended = self.first + self.wanted, self.ended or BURST_COMPLETE
@@ -64,9 +64,9 @@ class Stream:
             self._take(end)
 
     def overflow(self, until: float) -> None:
-        """Take no more scans before world time ``until``, as if the buffer were full.
+        """Take no scans before world time ``until``, as if the buffer were full.
 
-        What is in it goes out at once, however little, and says so.
+        The scans in the buffer become due immediately, with the status of an overflow.
         """
         self._recovering = self.is_due = True
         self._full_until = until
@@ -96,11 +96,11 @@ class Stream:
 
     @property
     def n_waiting(self) -> int:
-        """Samples in the buffer."""
+        """Number of samples in the buffer."""
         return len(self._buffer)
 
     def next_full(self) -> float:
-        """World time at which the next packet is full, or the stream ends."""
+        """Return the world time at which the next packet is full or the stream ends."""
         rows = -(-(self._packet_size - self.n_waiting) // self._columns.n)
         if self.ended or self.is_due or rows <= 0:
             return -NEVER
@@ -111,7 +111,7 @@ class Stream:
         return self._samples.time(max(last, self.first))
 
     def take_out(self, n_samples: int) -> Packet:
-        """Return at most so many samples, with the status that goes with them."""
+        """Remove at most ``n_samples`` samples; return them with their status."""
         taken, self._buffer = self._buffer[:n_samples], self._buffer[n_samples:]
         self.is_due = False
         status = information = 0
@@ -126,7 +126,7 @@ class Stream:
 
 
 class Columns:
-    """What the addresses of a scan list read."""
+    """Values of the addresses of a scan list."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class Columns:
         self._system_began = system_began
 
     def timer(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """CORE_TIMER at each scan."""
+        """Return CORE_TIMER at each scan."""
         return (index * self._ticks - self._core_began) % (1 << 32)
 
     def scans(self, samples: Samples, first: int, n: int) -> NDArray[np.uint16]:
@@ -154,7 +154,7 @@ class Columns:
         counts = whole(samples.counts(first, n) + CENTER, 0, 65535)
         index = np.arange(first, first + n)
         rows = np.zeros((n, self.n), np.int64)
-        wide = np.zeros(n, np.int64)  # the 32-bit value whose upper half may be captured
+        wide = np.zeros(n, np.int64)  # the last 32-bit value, for its upper half
         for column, address in enumerate(self._addresses):
             if address == reg.STREAM_DATA_CAPTURE_16:
                 rows[:, column] = wide >> 16

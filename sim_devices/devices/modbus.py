@@ -1,4 +1,4 @@
-"""A simulated Modbus slave on any line, RTU or TCP: pymodbus's server codec without its sockets."""
+"""Simulated Modbus slaves, RTU or TCP, with pymodbus's server codec and no sockets."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ class Slave(Protocol):
     """One device on the bus."""
 
     def is_off(self, now: float) -> bool:
-        """Whether it answers nothing now."""
+        """Return whether the slave is off and does not reply."""
         ...
 
     def read(self, function: int, address: int, count: int, now: float) -> Sequence[int] | ExcCodes:
-        """Return ``count`` registers, or why not."""
+        """Return ``count`` registers, or an exception code."""
         ...
 
     def write(self, address: int, values: Sequence[int], now: float) -> ExcCodes | None:
-        """Set registers, or say why not."""
+        """Set registers; return an exception code on failure."""
         ...
 
 
 class ModbusEndpoint:
-    """Slaves behind one line; an :class:`~sim_devices.devices.interface.Endpoint`.
+    """Slaves on one line; an :class:`~sim_devices.devices.interface.Endpoint`.
 
-    Requests to other slaves are not answered on RTU, as on a real bus, and answered with exception
-    11 on TCP, as a gateway does.
+    Requests to other slaves get no reply on RTU, as on a real bus, and exception 11 on TCP, as from
+    a gateway.
     """
 
     def __init__(self, slaves: Mapping[int, Slave], framing: Literal["rtu", "tcp"]) -> None:
@@ -55,32 +55,32 @@ class ModbusEndpoint:
         self._now = 0.0
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Forget half a request."""
+        """Discard an incomplete request."""
         self._now, self._waiting = now, b""
         return ()
 
     def disconnected(self, now: float) -> None:
-        """Forget half a request."""
+        """Discard an incomplete request."""
         self._now, self._waiting = now, b""
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Nothing: a slave speaks when spoken to."""
+        """Return nothing: slaves only reply."""
         self._now = now
         return ()
 
     def next_due(self) -> float:
-        """Never."""
+        """Return ``NEVER``: slaves only reply."""
         return NEVER
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer every complete request."""
+        """Process requests; return the replies."""
         self._now = now
         self._waiting += received
         answers = []
         while self._waiting:
             try:
                 used, request = self._framer.handleFrame(self._waiting, 0, 0)
-            except ModbusIOException as error:  # a request pymodbus does not know
+            except ModbusIOException as error:  # a request unknown to pymodbus
                 self._waiting = b""
                 refusal = ExceptionResponse(error.fcode or 0, ExcCodes.ILLEGAL_FUNCTION)
                 refusal.dev_id, refusal.transaction_id = error.dev_id, error.transaction_id
@@ -105,19 +105,19 @@ class ModbusEndpoint:
                 request.function_code, ExcCodes.GATEWAY_NO_RESPONSE
             )
         else:
-            # pymodbus writes its store as coroutines; ours never waits, so one step is all of it
+            # pymodbus's store has coroutines; these never wait, so one step completes them
             answer = _finished(
                 request.datastore_update(cast("ModbusServerContext", self), request.dev_id)
             )
         answer.dev_id, answer.transaction_id = request.dev_id, request.transaction_id
         return answer
 
-    # --- what pymodbus's requests ask of a store --------------------------------------------
+    # --- the store for pymodbus's requests ---------------------------------------------------
 
     async def async_getValues(  # noqa: N802 -- pymodbus's name
         self, device_id: int, func_code: int, address: int, count: int = 1
     ) -> list[int] | ExcCodes:
-        """Read registers of a slave; functions 6 and 16 read back what they wrote."""
+        """Read registers of a slave; functions 6 and 16 read back the written values."""
         slave = self._slaves[device_id]
         values = slave.read(4 if func_code == 4 else 3, address, count, self._now)
         return values if isinstance(values, ExcCodes) else list(values)

@@ -1,7 +1,7 @@
-"""A simulated device with its readings in Modbus registers, and several of them on one bus.
+"""Simulated devices with readings in Modbus registers, one or several on a bus.
 
-It samples at its own rate and holds the latest reading, with its counter and time where the map
-has them. It writes into any register it has; WitMotion's unlock and rate registers are there.
+A device samples at its own rate and holds the latest reading, with counter and time if the map has
+them. All its registers are writable, including WitMotion's unlock and rate registers.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from sim_devices.devices.interface import DeviceSpec, Source
 
 BEGINNING = np.datetime64("2026-11-21T00:00:00", "ns").astype(np.int64).item()
-"""UTC that the device's clock tells at world time 0, in ns."""
+"""UTC of the device's clock at world time 0, in ns."""
 AHEAD = 256
-"""Samples simulated at a time."""
+"""Number of samples simulated per call."""
 
 
 class RegisterDevice:
@@ -44,7 +44,7 @@ class RegisterDevice:
         self._counts = np.empty((0, 0))
 
     def is_off(self, now: float) -> bool:
-        """Whether the fault script has it off; what was set is then lost."""
+        """Return whether the fault script switches the device off; its settings are then lost."""
         off = self._source.is_silent(self._sensor, now)
         if off:
             self._written = dict(self._at_first)
@@ -61,7 +61,7 @@ class RegisterDevice:
         return [held[register] for register in wanted]
 
     def write(self, address: int, values: Sequence[int], now: float) -> ExcCodes | None:
-        """Set registers the device can be set up by, and, to no effect, its time."""
+        """Set configuration registers; writes to the time have no effect."""
         held = {**self._written, **self._latest(now)}
         if any(address + k not in held for k in range(len(values))):
             return ExcCodes.ILLEGAL_ADDRESS

@@ -1,4 +1,4 @@
-"""The samples of a device's sensors as time passes, simulated a stretch at a time."""
+"""The samples of a device's sensors, simulated in stretches."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from sim_devices.devices.interface import Source
 
 AHEAD = 1.0
-"""How much is simulated at a time, s of world time."""
+"""Duration of a stretch, s of world time."""
 
 
 class Samples:
-    """Samples of sensors that one clock takes, by index, their channels side by side.
+    """Samples of sensors with one clock, by index; the columns are the channels of all sensors.
 
-    Times and counts are held apart: a device that buffers looks at the time of the samples it takes
-    and at the counts of those it gives.
+    Times and counts are cached separately, because a device with a buffer needs the times of new
+    samples and the counts of older ones.
 
     Parameters
     ----------
     source
-        What the sensors read. Sample times are those of the first sensor.
+        Readings of the sensors. Sample times are those of the first sensor.
     sensors
-        Their names, in the order of the columns.
+        Names of the sensors, in the order of the columns.
     """
 
     def __init__(self, source: Source, sensors: Sequence[str]) -> None:
@@ -43,22 +43,22 @@ class Samples:
 
     @property
     def n_channels(self) -> int:
-        """Columns."""
+        """Number of columns."""
         return int(self.counts(0, 1).shape[1])
 
     def first_after(self, now: float) -> int:
-        """Index of the first sample taken at or after world time ``now``."""
+        """Return the index of the first sample taken at or after world time ``now``."""
         return self._source.first_sample_after(self._sensors[0], now)
 
     def time(self, index: int) -> float:
-        """World time at which a sample is taken, s."""
+        """Return the world time of a sample, s."""
         self._hold_times(index)
         return float(self._times[index - self._first_time])
 
     def end_before(self, now: float, start: int) -> int:
-        """Index after the last sample, from ``start`` on, that has been taken by ``now``."""
+        """Return the index after the last sample taken by ``now``; at least ``start``."""
         self._hold_times(start)
-        if self._times[-1] <= now:  # not stretch by stretch: nobody may have asked for hours
+        if self._times[-1] <= now:  # skip stretches: the last call may have been hours ago
             self._hold_times(self.first_after(now))
         return self._first_time + int(np.searchsorted(self._times, now, side="right"))
 
@@ -74,13 +74,13 @@ class Samples:
         return np.concatenate(pieces) if pieces else self._counts[:0]
 
     def _hold_times(self, index: int) -> None:
-        """Work out the times of the stretch that holds a sample."""
+        """Compute the times of the stretch with a sample."""
         if not 0 <= index - self._first_time < len(self._times):
             self._first_time = index // self._length * self._length
             self._times = self._source.times(self._sensors[0], self._first_time, self._length)
 
     def _hold_counts(self, index: int) -> None:
-        """Simulate the stretch that holds a sample."""
+        """Simulate the stretch with a sample."""
         if not 0 <= index - self._first_count < len(self._counts):
             first = self._first_count = index // self._length * self._length
             columns = [self._source.counts(s, first, self._length) for s in self._sensors]
@@ -88,5 +88,5 @@ class Samples:
 
 
 def whole(counts: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
-    """Round counts to what a converter from ``low`` to ``high`` gives."""
+    """Round counts to integers and clip them to ``low`` and ``high``."""
     return np.clip(np.rint(counts), low, high).astype(np.int64)

@@ -1,10 +1,10 @@
 """A simulated SeedLink server with the stations of a bench, in protocol versions 3 and 4.
 
-What it does: ``HELLO``, ``SLPROTO``, ``STATION``, ``SELECT``, ``DATA`` with a sequence number,
-``END``, ``INFO ID``, ``CAT``, ``BYE``; a ring of packets that goes on while nobody is connected and
-keeps the last ``keep`` seconds. Each sensor is a station; a record holds 100 samples of a channel.
-Records of a channel whose name is in ``delays`` come as many records later as said there. The fault
-``reset`` restarts the server: its ring is empty, and sequence numbers begin again at 1.
+Simulated functions: ``HELLO``, ``SLPROTO``, ``STATION``, ``SELECT``, ``DATA`` with a sequence
+number, ``END``, ``INFO ID``, ``CAT``, ``BYE``; a ring of packets that is filled also while no
+client is connected and holds the last ``keep`` seconds. Each sensor is a station; a record holds
+100 samples of a channel. The setting ``delays`` delays the records of a channel by a number of
+records. The fault ``reset`` restarts the server with an empty ring and sequence number 1.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 RECORD_SAMPLES = 100
 KEEP = 600.0
-"""Seconds that the ring holds."""
+"""Default duration of the packets in the ring, s."""
 HELLO = "SeedLink v3.1 (simulated) :: SLPROTO:4.0 SLPROTO:3.1"
 _CAPABILITIES = ("multistation", "window-extraction", "info:id", "info:capabilities")
 _INFO = (
@@ -45,7 +45,7 @@ _NS = 1_000_000_000
 
 
 class Station:
-    """One station: its records in the order in which they are sent."""
+    """One station: its records in the order of sending."""
 
     def __init__(self, device: DeviceSpec, source: Source, sensor: str) -> None:
         settings = {**device.settings, **device.sensor_settings.get(sensor, {})}
@@ -68,15 +68,15 @@ class Station:
         self._keep = float(settings.get("keep", KEEP))
         self._turn: int | None = None
         self.began = 0
-        """First turn that the ring holds; each channel sends a record in each turn."""
+        """First turn in the ring; in each turn every channel sends one record."""
 
     @property
     def n_channels(self) -> int:
-        """Packets of a turn."""
+        """Number of packets per turn."""
         return len(self.channels)
 
     def turn_at(self, now: float) -> int:
-        """Return the first turn that is not complete at world time ``now``."""
+        """Return the first incomplete turn at world time ``now``."""
         if self._turn is None:
             self._turn = max(0, self._samples.first_after(now) // RECORD_SAMPLES - 1)
         while self.due(self._turn) <= now:
@@ -84,7 +84,7 @@ class Station:
         return self._turn
 
     def due(self, turn: int) -> float:
-        """World time at which a turn is complete."""
+        """Return the world time at which a turn is complete."""
         return self._samples.time((turn + 1) * RECORD_SAMPLES - 1)
 
     def oldest(self, now: float) -> int:
@@ -93,7 +93,7 @@ class Station:
         return max(self.began, self.turn_at(now) - kept)
 
     def start(self, sequence: int | None, now: float, version: Version) -> int:
-        """Return the index of the packet to begin with, counted from the first turn of all."""
+        """Return the index of the first packet to send, counted from turn 0."""
         current = self.turn_at(now) * self.n_channels
         if sequence is None:
             return current
@@ -105,7 +105,7 @@ class Station:
         return index if oldest <= index <= current else oldest
 
     def packet(self, index: int) -> Packet | None:
-        """Return a packet; None where a delayed channel has not begun."""
+        """Return a packet; None if its channel is delayed and has not started."""
         turn, column = divmod(index, self.n_channels)
         record = turn - self._delays[column]
         if record < self.began:
@@ -127,7 +127,7 @@ class Station:
         return Packet(sequence, payload, f"{self.network}_{self.station}")
 
     def is_selected(self, index: int, selectors: Sequence[str]) -> bool:
-        """Whether a packet's channel is among the selected ones."""
+        """Return whether a packet's channel is selected."""
         code = self.channels[index % self.n_channels]
         wanted = [selector.replace("_", "") for selector in selectors]
         return not wanted or any(
@@ -159,16 +159,16 @@ class SeedLinkServer:
         self._next: dict[int, int] = {}
         self._sends = False
 
-    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+    def connected(self, now: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
         """Wait for commands."""
         self._forget()
         return ()
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
-        """Send nothing."""
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Stop sending."""
         self._forget()
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
         """Restart with an empty ring."""
         if kind == "reset":
             for station in self._stations:
@@ -179,7 +179,7 @@ class SeedLinkServer:
         return ()
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Answer commands."""
+        """Process commands; return the replies."""
         self._received += received
         *lines, self._received = self._received.replace(b"\n", b"\r").split(b"\r")
         answers: list[bytes] = []
@@ -233,7 +233,7 @@ class SeedLinkServer:
         return encode_packet(Packet(None, encode_log(text)), 3)
 
     def due(self, now: float) -> Sequence[bytes]:
-        """Return the packets that are complete."""
+        """Return the complete packets."""
         sent: list[bytes] = []
         if not self._sends:
             return sent
@@ -252,7 +252,7 @@ class SeedLinkServer:
         return sent
 
     def next_due(self) -> float:
-        """World time at which the next packet is complete."""
+        """Return the world time at which the next packet is complete."""
         if not self._sends:
             return NEVER
         times = (

@@ -1,9 +1,9 @@
 """A simulated device that sends delimited text: rows on a line, or datacast packets over UDP.
 
-What it does: writes the samples of its sensor in the format its settings describe, as the driver
-reads it (:mod:`daq.protocols.text.decoder`): a row a sample with time, counter, tag and checksum
-where the format has them, or packets of 25 samples of a channel with the time of the first, as a
-Raspberry Shake casts them. With ``start`` and ``stop`` in the settings a line is quiet until told.
+The device sends the samples of its sensor in the format of its settings
+(:mod:`daq.protocols.text.decoder`): one row per sample, with time, counter, tag and checksum if the
+format has them, or packets of 25 samples of a channel with the time of the first, like a Raspberry
+Shake. With the settings ``start`` and ``stop``, the device sends only between these commands.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _NS = 1_000_000_000
 
 
 def format_of(device: DeviceSpec) -> TextFormat:
-    """Return the format that the device's settings describe."""
+    """Return the format of the device's settings."""
     settings = device.settings
     given = {
         f.name: settings[f.name] for f in fields(TextFormat) if settings.get(f.name) is not None
@@ -65,18 +65,18 @@ class TextDevice:
         self._n_rows = PACKET_SAMPLES if self._format.layout == "channel" else 1
 
     def connected(self, now: float) -> Sequence[bytes]:
-        """Begin to send, unless it is to be told."""
+        """Start to send, unless a command is required."""
         self._received = b""
         if not self._start:
             self._begin(now)
         return ()
 
-    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- of the seam
-        """Stop."""
+    def disconnected(self, now: float) -> None:  # noqa: ARG002 -- interface
+        """Stop sending."""
         self._sends = False
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
-        """Begin and end as told."""
+        """Start and stop on commands."""
         self._received = (self._received + received)[-200:]
         stop = self._received.rfind(self._stop) if self._stop else -1
         start = self._received.rfind(self._start) if self._start else -1
@@ -87,8 +87,8 @@ class TextDevice:
                 self._begin(now)
         return self.due(now)
 
-    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- of the seam
-        """Suffer a power failure: the counter begins anew; it has no buffer to overflow."""
+    def fault(self, kind: str, now: float, duration: float) -> Sequence[bytes]:  # noqa: ARG002 -- interface
+        """Simulate a power failure: the counter restarts. There is no buffer to overflow."""
         if kind == "reset" and self._sends:
             self._next = self._counted_from = self._samples.first_after(now)
         return ()
@@ -107,7 +107,7 @@ class TextDevice:
         return messages
 
     def next_due(self) -> float:
-        """World time of the last sample of the next message."""
+        """Return the world time of the last sample of the next message."""
         return self._samples.time(self._next + self._n_rows - 1) if self._sends else NEVER
 
     def _time(self, index: int) -> str:

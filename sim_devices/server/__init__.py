@@ -1,1 +1,1 @@
-"""Serves simulated devices on pseudo-terminals, TCP and UDP, in processes of their own."""
+"""Serves simulated devices on pseudo-terminals, TCP and UDP, in separate processes."""

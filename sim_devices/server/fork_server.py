@@ -1,13 +1,13 @@
 """The process that serves simulated devices: ``python -m sim_devices.server.fork_server``.
 
-It loads what devices need once and forks a process for each device: loading takes most of a second,
-forking a few milliseconds. Requests come on standard input, one JSON object a line, and each is
-answered by one line on standard output:
+It imports modules once and forks a process for each device: importing takes most of a second,
+forking a few milliseconds. It reads requests from standard input, one JSON object per line, and
+writes one line to standard output for each:
 
-- ``{"serve": FILE}``: serve every device of a specification. The answer's ``devices`` holds what
-  each device announced (see :mod:`sim_devices.server.serve`) and its ``pid``; or the answer is
-  ``{"error": TEXT}``, and none of the devices is served.
-- ``{"stop": FILE}``: end the devices of a specification. The answer is ``{}``.
+- ``{"serve": FILE}``: serve every device of a specification. The reply has ``devices``: the
+  announcement of each device (see :mod:`sim_devices.server.serve`) and its ``pid``. If the reply is
+  ``{"error": TEXT}``, none of the devices is served.
+- ``{"stop": FILE}``: end the devices of a specification. The reply is ``{}``.
 
 All devices end when standard input is closed, and when this process is killed.
 """
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 STOP_TIMEOUT = 5.0
-"""Seconds that a device may take to end before it is killed."""
+"""Seconds after which a device that does not end is killed."""
 
 
 class ForkServer:
@@ -44,7 +44,7 @@ class ForkServer:
 
     def __init__(self) -> None:
         self._devices: dict[str, list[int]] = {}
-        # Every device reads one end. The other end closes with this process, however it ends.
+        # Every device reads one end. The system closes the other end when this process ends.
         self._lifeline, self._held = os.pipe()
 
     def answer(self, request: Mapping[str, str]) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class ForkServer:
         for device in spec["devices"]:
             import_module(FAMILIES[device["driver"]].partition(":")[0])
         gc.collect()
-        gc.freeze()  # else a collection in a device would copy the pages that all of them share
+        gc.freeze()  # otherwise a collection in a device would copy the shared pages
         self._devices[file] = pids = []
         pipes = []
         for index in range(len(spec["devices"])):
@@ -96,7 +96,9 @@ class ForkServer:
             pids.append(pid)
             pipes.append(reading)
         announced = [_read_all(pipe) for pipe in pipes]
-        devices = [json.loads(text or '{"error": "it ended without a word"}') for text in announced]
+        devices = [
+            json.loads(text or '{"error": "it ended without a message"}') for text in announced
+        ]
         for device, pid in zip(devices, pids, strict=True):
             if "error" in device:
                 wrong = device.get("is_usage_error", False)
@@ -105,7 +107,7 @@ class ForkServer:
         return devices
 
     def _run(self, spec: Mapping[str, Any], index: int, folder: Path, writing: int) -> NoReturn:
-        """Serve one device in this process, which was forked for it; never return."""
+        """Serve one device in this forked process; never return."""
         with os.fdopen(writing, "w", encoding="utf-8") as pipe:
 
             def announce(table: Mapping[str, Any]) -> None:
@@ -114,7 +116,7 @@ class ForkServer:
 
             os.close(self._held)
             os.dup2(self._lifeline, 0)
-            tempfile.tempdir = str(folder)  # removed by the caller, also after a device was killed
+            tempfile.tempdir = str(folder)  # the caller removes it, also if the device is killed
             code = 0
             try:
                 clock = PacedClock(spec["clock"])
@@ -132,7 +134,7 @@ class ForkServer:
                     traceback.print_exc()
             finally:
                 sys.stderr.flush()
-                os._exit(code)  # what is buffered for standard output belongs to the server
+                os._exit(code)  # without flushing the server's buffered output
 
 
 def _read_all(pipe: int) -> bytes:
@@ -141,7 +143,7 @@ def _read_all(pipe: int) -> bytes:
 
 
 def main() -> None:
-    """Answer requests until standard input is closed."""
+    """Process requests until standard input is closed."""
     server = ForkServer()
     try:
         for line in sys.stdin:

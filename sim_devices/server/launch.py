@@ -1,4 +1,4 @@
-"""Start the processes that serve a specification's devices, and stop them again."""
+"""Starts and stops the processes that serve a specification's devices."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 HEAD_START_NS = 200_000_000
-"""World time 0 lies this far ahead, so that every device is there when it begins."""
+"""Delay of world time 0, in ns, so that every device has started by then."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunningDevice:
-    """One served device: where it can be connected to, and its process."""
+    """One served device: its address and its process."""
 
     sensors: tuple[str, ...]
     driver: str
@@ -38,14 +38,14 @@ class RunningDevice:
     """File of the clock by which the device runs (:mod:`sim_devices.server.paced_clock`)."""
 
     def kill(self) -> None:
-        """Kill the device's process: the device has lost its power."""
+        """Kill the device's process, like a power failure."""
         os.kill(self.pid, signal.SIGKILL)
 
 
 class DeviceServer:
     """A process that serves simulated devices (:mod:`sim_devices.server.fork_server`).
 
-    It can serve several specifications at once, and is safe to use from several threads.
+    It serves several specifications concurrently, and is thread-safe.
     """
 
     def __init__(self) -> None:
@@ -55,9 +55,9 @@ class DeviceServer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            # A device multiplies no large matrices: more threads would only fight for the cores.
+            # A device multiplies no large matrices, so more threads would only compete for cores.
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            start_new_session=True,  # a Ctrl-C at the terminal is for the parent; it ends them
+            start_new_session=True,  # Ctrl-C reaches only the parent, which ends the devices
         )
 
     @property
@@ -83,13 +83,13 @@ class DeviceServer:
         Parameters
         ----------
         spec
-            As described in :mod:`sim_devices.server.serve`. Without ``clock``, the devices get one
-            of their own; without ``epoch_ns``, their world begins when all of them are there.
+            As described in :mod:`sim_devices.server.serve`. Without ``clock``, the devices get a
+            new clock; without ``epoch_ns``, their world begins when all devices have started.
 
         Raises
         ------
         ServeError
-            A device could not be served; the message says why.
+            If a device cannot be served; the message has the cause.
         """
         with tempfile.TemporaryDirectory(prefix="huddle-") as folder:
             path = spec.get("clock") or f"{folder}/clock"
@@ -97,7 +97,7 @@ class DeviceServer:
             epoch = {"clock": path, "epoch_ns": clock.now_ns() + HEAD_START_NS}
             file = Path(folder) / "spec.json"
             file.write_text(json.dumps({**epoch, **spec}), encoding="utf-8")
-            with clock.participate():  # it waits for the devices, however long they take to start
+            with clock.participate():  # the clock waits until the devices have started
                 answer = self._ask({"serve": str(file)})
             clock.close()
             if "error" in answer:
@@ -116,7 +116,7 @@ class DeviceServer:
                     for device in answer["devices"]
                 )
             finally:
-                if self._process.poll() is None:  # else every device has ended with it
+                if self._process.poll() is None:  # otherwise the devices ended with the process
                     self._ask({"stop": str(file)})
 
     def _ask(self, request: Mapping[str, str]) -> dict[str, Any]:

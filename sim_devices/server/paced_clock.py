@@ -1,23 +1,23 @@
-"""The clock of a simulated bench: it waits for everybody who takes part.
+"""The clock of a simulated bench: it waits for all its participants.
 
 Theory of operation
 -------------------
 A simulated device and the recorder that reads it are processes with deadlines: a FIFO must be read
-before it is full, a reply must come before the driver's time limit. On a busy computer any of them
-may not run for a second. By the system's clock a second of samples would be lost; by this clock
-only time is.
+before it is full, a reply must arrive before the driver's timeout. A busy computer may suspend any
+of them for a second. With the system's clock, a second of samples would be lost. The paced clock
+stops instead.
 
-The paced clock is the system's monotonic clock, except that it stands still while a participant is
-behind. Participants are event loops (:class:`PacedLoop`), in any number of processes. Each time
-that a loop has dealt with everything that was due, it writes down the instant until which the clock
-may run before the loop has looked again: ``SHORTEST`` later, or half as long as the loop has had
-nothing to do, but no more than ``LONGEST``, nor than ``SHORTEST`` beyond its next timer. So what
-comes for a loop that the computer does not let run is delayed by little, measured by how often
-something comes. What the clock would be beyond the earliest of those instants is left out for good.
-Nothing else is agreed on: whoever reads the clock works out where it is, from a small file that all
-participants map.
+The paced clock is the system's monotonic clock, except that it stops while a participant is behind.
+Participants are event loops (:class:`PacedLoop`), in any number of processes. Each time that a loop
+has handled all due events, it stores a limit: the instant up to which the clock may run before the
+loop reads the clock again. The limit is ``SHORTEST`` ahead, or half of the time for which the loop
+has been idle, but at most ``LONGEST``, and at most ``SHORTEST`` beyond the loop's next timer. The
+delay of an event for a suspended loop is therefore small against the interval between its events.
+The time by which the system's clock exceeds the earliest limit is left out permanently. Every
+process computes the time from a small file that all participants map; there is no other
+communication.
 
-A participant that was killed no longer holds its lock, and is then no longer waited for.
+A killed participant releases its lock, and the clock no longer waits for it.
 """
 
 from __future__ import annotations
@@ -38,17 +38,18 @@ if TYPE_CHECKING:
 
 NS = 1_000_000_000
 SHORTEST, LONGEST = 2_000_000, 40_000_000
-"""How far the clock may run ahead of a participant, ns: less than any time limit of a driver."""
+"""Limits of the clock's lead over a participant, ns: shorter than any timeout of a driver."""
 LOOKS = 2
-"""How often at least a participant that has nothing to do looks at the clock in that time."""
+"""Minimum number of times that an idle participant reads the clock in this lead."""
 LONGEST_PAUSE = 0.01
-"""Between two looks at a clock that stands still, s of the system's clock."""
+"""Maximum interval between two reads of a stopped clock, s of the system's clock."""
 MOST_PARTICIPANTS = 1024
 _FREE = 2**63 - 1
 _LOOK_FOR_THE_DEAD = NS // 10
 _ORIGIN, _RATE, _UTC, _LEFT_OUT, _N_SLOTS, _SLOTS = range(6)
-"""Places in the file, each a signed 64-bit integer: instant of the system's clock at which both
-clocks agreed, rate in 1e-6, UTC less monotonic time in ns, time left out in ns, and slots."""
+"""Positions in the file, each a signed 64-bit integer: instant of the system's clock at which both
+clocks agreed, rate in 1e-6, UTC minus monotonic time in ns, time left out in ns, number of slots,
+first slot."""
 
 
 class PacedClock:
@@ -57,7 +58,7 @@ class PacedClock:
     Parameters
     ----------
     path : path
-        The clock's file, made by :meth:`create`. Locks of participants are files beside it.
+        The clock's file, made by :meth:`create`. Locks of participants are files in its folder.
     system_ns : callable
         The system's monotonic clock.
     """
@@ -77,7 +78,7 @@ class PacedClock:
 
     @classmethod
     def create(cls, path: str | Path, *, rate: float = 1.0) -> Self:
-        """Make a clock that shows the system's monotonic time and runs ``rate`` times as fast."""
+        """Create a clock that starts at the system's monotonic time and runs at ``rate``."""
         now = time.monotonic_ns()
         head = [now, round(rate * 1e6), utc_of(now) - now, 0, 0]
         table = memoryview(bytearray(8 * (_SLOTS + MOST_PARTICIPANTS))).cast("q")
@@ -87,7 +88,7 @@ class PacedClock:
         return cls(path)
 
     def now_ns(self) -> int:
-        """Return the time in ns; it never goes back."""
+        """Return the time in ns, which never decreases."""
         table = self._table
         origin = table[_ORIGIN]
         left_out = table[_LEFT_OUT]
@@ -95,7 +96,7 @@ class PacedClock:
             system = self._system_ns()
             before, left_out = left_out, table[_LEFT_OUT]
             if before == left_out:
-                break  # else more was left out after ``system``: the time would go back
+                break  # otherwise time was left out after ``system``, and now would decrease
         elapsed = (system - origin) * table[_RATE] // 1_000_000
         now = origin + elapsed - left_out
         n_slots = table[_N_SLOTS]
@@ -104,8 +105,8 @@ class PacedClock:
         earliest = min(table[_SLOTS : _SLOTS + n_slots])
         if now <= earliest:
             return now
-        # Set, not added to: another process may have left out the same meanwhile. If it left out
-        # more, that is undone, and left out again at the next look.
+        # Set, not added: another process may have left out the same time. If that process left out
+        # more, this assignment undoes it, and the next read leaves it out again.
         table[_LEFT_OUT] = left_out + now - earliest
         if system > self._looked + _LOOK_FOR_THE_DEAD:
             self._looked = system
@@ -117,31 +118,31 @@ class PacedClock:
         return self.now_ns() / NS
 
     def utc_of(self, monotonic_ns: int) -> int:
-        """Return the UTC of an instant of this clock, in ns since 1970."""
+        """Return the UTC in ns since 1970 of an instant of this clock."""
         return monotonic_ns + self._table[_UTC]
 
     def utc_ns(self) -> int:
-        """Return the present UTC in ns since 1970."""
+        """Return the current UTC in ns since 1970."""
         return self.utc_of(self.now_ns())
 
     @property
     def left_out(self) -> float:
-        """Seconds that the system's clock has counted and this one has not."""
+        """Total time left out, in s of the system's clock."""
         return self._table[_LEFT_OUT] / NS
 
     @property
     def rate(self) -> float:
-        """Seconds of this clock in one of the system's, while nobody is behind."""
+        """Seconds of this clock per second of the system's clock, while it does not wait."""
         return self._table[_RATE] / 1e6
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._table.release()
         self._map.close()
 
     @contextlib.contextmanager
     def participate(self) -> Iterator[Participant]:
-        """Hold the clock while behind, until the context ends."""
+        """Make the clock wait for this participant until the context ends."""
         slot, lock = self._take_slot()
         participant = Participant(self._table, _SLOTS + slot)
         self._table[_SLOTS + slot] = self.now_ns() + LONGEST
@@ -152,9 +153,9 @@ class PacedClock:
             os.close(lock)
 
     def _take_slot(self) -> tuple[int, int]:
-        """Return the first slot that nobody has, and the descriptor that holds its lock."""
+        """Return the first free slot, and the descriptor that holds its lock."""
         joining = None
-        while joining is None:  # one after the other, for they all may raise the number of slots
+        while joining is None:  # one process at a time, because each may add a slot
             joining = _locked(f"{self.path}.join")
         try:
             for slot in range(MOST_PARTICIPANTS):
@@ -174,25 +175,25 @@ class PacedClock:
         for slot in range(self._table[_N_SLOTS]):
             if self._table[_SLOTS + slot] == earliest:
                 lock = _locked(self._lock_path(slot))
-                if lock is not None:  # its owner has ended without a word
+                if lock is not None:  # its owner was killed
                     self._table[_SLOTS + slot] = _FREE
                     os.close(lock)
 
 
 @dataclass(frozen=True, slots=True)
 class Participant:
-    """Somebody whom a clock waits for."""
+    """An event loop that a clock waits for."""
 
     table: memoryview[int]
     place: int
 
     def let_run_until(self, now_ns: int) -> None:
-        """Let the clock run until an instant; an earlier one takes nothing back."""
+        """Allow the clock to run up to an instant; an earlier limit has no effect."""
         self.table[self.place] = max(self.table[self.place], now_ns)
 
 
 def _locked(path: str) -> int | None:
-    """Return a descriptor that holds the lock of a file; None if somebody else holds it."""
+    """Return a descriptor that holds the lock of a file; None if another process holds it."""
     import fcntl  # noqa: PLC0415  (absent on Windows, where no device is simulated)
 
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -207,7 +208,7 @@ def _locked(path: str) -> int | None:
 def utc_of(monotonic_ns: int) -> int:
     """Return the UTC of an instant of the system's monotonic clock, in ns since 1970.
 
-    The best of several looks at both clocks: processes agree to a few microseconds.
+    Uses the best of several readings of both clocks: processes agree to a few microseconds.
     """
     looks = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(20)]
     before, utc, after = min(looks, key=lambda look: look[2] - look[0])
@@ -215,9 +216,9 @@ def utc_of(monotonic_ns: int) -> int:
 
 
 class _Selector(selectors.SelectSelector):
-    """Waits for I/O, lets the clock run meanwhile, and looks at it often.
+    """Waits for I/O while the clock runs, and reads the clock often.
 
-    Of the system calls, ``select`` alone takes time limits of less than a millisecond.
+    Uses ``select``, the only such system call with timeouts below a millisecond.
     """
 
     participant: Participant | None = None
@@ -227,10 +228,10 @@ class _Selector(selectors.SelectSelector):
         self._clock = clock
         self._only_answers = only_answers
         self._busy = clock.now_ns()
-        """Instant at which something came last, or a timer ended that an answer may follow."""
+        """Instant of the last received bytes, or of the last timer that a reply may follow."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return what is ready, or nothing once ``timeout`` is over by the clock."""
+        """Return the ready files, or an empty list after ``timeout`` s of the clock."""
         clock, rate = self._clock, self._clock.rate
         now = clock.now_ns()
         if not self._only_answers:
@@ -251,20 +252,20 @@ class _Selector(selectors.SelectSelector):
                 self._busy = now
             if ready or now >= until:
                 return ready
-            # While somebody is behind, everybody else's looks would only take the computer's time.
+            # While the clock waits for a participant, frequent reads would only load the computer.
             pause = min(max(2 * pause, seconds), LONGEST_PAUSE) if now == before else 0.0
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
-    """An event loop that runs by a paced clock, and that the clock waits for while it runs.
+    """An event loop with the time of a paced clock, and a participant of it while running.
 
     Parameters
     ----------
     clock : PacedClock
         The clock.
     only_answers : bool
-        Whether the loop never waits for an answer to what it sends, as a device: it need not look
-        at the clock between its timers.
+        Whether the loop never waits for a reply, like a device: it then need not read the clock
+        between its timers.
     """
 
     def __init__(self, clock: PacedClock, *, only_answers: bool = False) -> None:

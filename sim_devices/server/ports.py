@@ -1,8 +1,8 @@
 """Pseudo-terminals, TCP and UDP ports on which simulated devices are served.
 
-A line reports when a reader opens it, passes on received bytes, accepts bytes to send, and can hang
-up like a pulled cable. Like a cable it stores nothing: bytes sent while no reader has the line open
-are lost, and so are bytes beyond ``MOST_WAITING`` that a reader does not fetch.
+A line reports when a reader opens it, forwards received bytes, accepts bytes to send, and can hang
+up like an unplugged cable. It stores nothing: bytes sent while no reader has the line open are
+lost, and so are bytes beyond ``MAX_UNREAD`` that a reader does not read.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from sim_devices.devices.interface import Kind
 
-MOST_WAITING = 1 << 20
-"""Bytes waiting to be read at which further units are lost."""
+MAX_UNREAD = 1 << 20
+"""Number of unread bytes above which further units are lost."""
 LOOK_INTERVAL = 0.02
 """Interval of checks of a pseudo-terminal without a reader, s."""
 
@@ -35,13 +35,13 @@ class Listener(Protocol):
     """Receives the events of a line."""
 
     def connected(self) -> None:
-        """Somebody opened the line."""
+        """Handle a reader that opened the line."""
 
     def received(self, received: bytes) -> None:
-        """Bytes were received."""
+        """Handle received bytes."""
 
     def disconnected(self) -> None:
-        """Nobody has the line open any more."""
+        """Handle the last reader that closed the line."""
 
 
 class Wire(Protocol):
@@ -79,12 +79,12 @@ class PseudoTerminal:
         self._look: asyncio.TimerHandle | None = None
 
     async def open(self) -> None:
-        """Make the pseudo-terminal and wait for a reader."""
+        """Create the pseudo-terminal and wait for a reader."""
         self._make()
 
     def _make(self) -> None:
         self._master, slave = os.openpty()
-        tty.setraw(slave)  # else the terminal would echo the device's own bytes back to it
+        tty.setraw(slave)  # otherwise the terminal echoes the device's bytes
         os.set_blocking(self._master, False)
         link = Path(self.address)
         link.unlink(missing_ok=True)
@@ -95,8 +95,8 @@ class PseudoTerminal:
         self._look_for_somebody()
 
     def _look_for_somebody(self) -> None:
-        # While nobody has the slave open the master reports a hang-up, and a reader on it would
-        # spin: look now and then instead.
+        # While the slave is closed, the master reports a hang-up, and the event loop would call a
+        # reader continuously: poll instead.
         events = self._poll.poll(0)
         if events and events[0][1] & select.POLLHUP and not events[0][1] & select.POLLIN:
             self._look = self._loop.call_later(LOOK_INTERVAL, self._look_for_somebody)
@@ -111,7 +111,7 @@ class PseudoTerminal:
             received = os.read(self._master, 65536)
         except BlockingIOError:
             return
-        except OSError:  # EIO: the last one who had it open closed it
+        except OSError:  # EIO: the last reader closed the slave
             received = b""
         if received:
             self._listener.received(received)
@@ -132,7 +132,7 @@ class PseudoTerminal:
             return
         was_waiting = bool(self._waiting)
         for unit in units:
-            if len(self._waiting) + len(unit) <= MOST_WAITING:
+            if len(self._waiting) + len(unit) <= MAX_UNREAD:
                 self._waiting += unit
         if self._waiting and not was_waiting:
             self._write()
@@ -142,7 +142,7 @@ class PseudoTerminal:
             del self._waiting[: os.write(self._master, self._waiting)]
         except BlockingIOError:
             pass
-        except OSError:  # nobody there: the reader will say so
+        except OSError:  # the slave is closed: reading reports this
             self._waiting.clear()
         if self._waiting:
             self._loop.add_writer(self._master, self._write)
@@ -150,7 +150,7 @@ class PseudoTerminal:
             self._loop.remove_writer(self._master)
 
     def hang_up(self) -> None:
-        """Pull the cable of a USB adapter: the port goes away."""
+        """Unplug the cable of a USB adapter: the port disappears."""
         self._destroy()
 
     def restore(self) -> None:
@@ -164,14 +164,14 @@ class PseudoTerminal:
             self._look.cancel()
         if self._open:
             self._nobody()
-        # First: the system gives the terminal's number to the next one that is made anywhere, and
-        # the address would lead whoever tries it again to a device of somebody else's.
+        # First: the system may reuse the terminal's number for any new terminal, and the address
+        # would then lead to another device.
         Path(self.address).unlink()
         os.close(self._master)
         self._master = -1
 
     async def close(self) -> None:
-        """Take the port away."""
+        """Remove the port."""
         self._destroy()
         shutil.rmtree(self._folder)
 
@@ -179,7 +179,7 @@ class PseudoTerminal:
 class TcpPort:
     """A TCP port that serves one connection at a time, as serial servers do.
 
-    ``number`` is the port's; any that is free, if 0.
+    ``number`` is the port number; 0 for any free one.
     """
 
     def __init__(self, listener: Listener, scheme: str, number: int = 0) -> None:
@@ -197,8 +197,8 @@ class TcpPort:
             self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._number)
         except OSError as error:
             raise ServeError(
-                f"port {self._number} of this machine cannot be listened on: {error.strerror};"
-                " give the bench file's port another number, or a host that is not this machine"
+                f"cannot listen on port {self._number} of this machine: {error.strerror};"
+                " in the bench file, set another port number, or a host that is not this machine"
             ) from error
         self.address = f"{self._scheme}://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
@@ -225,7 +225,7 @@ class TcpPort:
         """Send each unit, or lose it whole."""
         if self._writer is None or self._writer.is_closing():
             return
-        room = MOST_WAITING - self._writer.transport.get_write_buffer_size()
+        room = MAX_UNREAD - self._writer.transport.get_write_buffer_size()
         kept = bytearray()
         for unit in units:
             if len(kept) + len(unit) <= room:
@@ -252,7 +252,7 @@ class TcpPort:
 
 
 class UdpPort:
-    """Sends each unit as a datagram to the address it names, where the driver is to listen."""
+    """Sends each unit as a datagram to its own address, on which the driver must listen."""
 
     def __init__(self, listener: Listener, scheme: str) -> None:
         self._listener = listener
@@ -261,7 +261,7 @@ class UdpPort:
         self.address = ""
 
     async def open(self) -> None:
-        """Choose a free port of this machine and begin to send to it."""
+        """Select a free port of this machine and start to send to it."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             self._to = probe.getsockname()
@@ -291,7 +291,7 @@ class UdpPort:
 
 
 class UdpServer(asyncio.DatagramProtocol):
-    """A UDP port that hears requests and sends each unit to whoever spoke last."""
+    """A UDP port that receives requests and sends each unit to the last client."""
 
     def __init__(self, listener: Listener, scheme: str) -> None:
         self._listener = listener
@@ -311,24 +311,24 @@ class UdpServer(asyncio.DatagramProtocol):
         self._listener.connected()
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Pass on a received datagram."""
+        """Forward a received datagram."""
         if self._down:
             return
         self._to = addr
         self._listener.received(data)
 
     def send(self, units: Iterable[bytes]) -> None:
-        """Send each unit as a datagram to the last sender, which may be gone."""
+        """Send each unit as a datagram to the last client, which may be closed."""
         if self._transport is not None and self._to is not None:
             for unit in units:
                 self._transport.sendto(unit, self._to)
 
     def hang_up(self) -> None:
-        """Ignore datagrams, and forget the last sender."""
+        """Ignore datagrams, and forget the last client."""
         self._down, self._to = True, None
 
     def restore(self) -> None:
-        """Hear again."""
+        """Receive again."""
         self._down = False
 
     async def close(self) -> None:

@@ -10,11 +10,11 @@ The specification is one JSON object::
      "fault_log": "FILE",          log of faults, one JSON object per line
      "sent_log": "FILE",           log of units sent on an open line, in hexadecimal
      "devices": [
-       {"sensors": ["A"],          sensors behind this device's port, as named in the scenario
+       {"sensors": ["A"],          sensors of this device, as named in the scenario
         "driver": "epson",         its protocol, a key of FAMILIES
         "port": "pty",             or "tcp", "udp"
-        "number": 0,               of a TCP port, and of further ones those that the settings name;
-                                   any that are free if it is 0
+        "number": 0,               TCP port number, 0 for any free one; numbers of further ports
+                                   are in the settings
         "sampling_rate": 200.0,    Hz
         "settings": {...},         as the driver's settings in the bench file
         "sensor_settings": {"A": {...}},      settings of single sensors
@@ -26,11 +26,11 @@ accepts connections::
 
     {"sensors": ["A"], "driver": "epson", "port": "/tmp/huddle-x/tty", "settings": {}}
 
-``settings`` holds what must be added to the sensors' settings (further port numbers). ``python -m
-sim_devices`` prints one such line for each device and ends when its standard input is closed.
+``settings`` has additions to the sensors' settings (numbers of further ports). ``python -m
+sim_devices`` prints one such line per device and ends when its standard input is closed.
 
-Device families (``FAMILIES``) are named here and imported when served; see
-:mod:`sim_devices.devices.interface` for what a family offers.
+Device families (``FAMILIES``) are imported when served; :mod:`sim_devices.devices.interface`
+describes their interface.
 """
 
 from __future__ import annotations
@@ -71,19 +71,19 @@ FAMILIES = {
     "text": "sim_devices.devices.text:create",
     "seedlink": "sim_devices.devices.seedlink:create",
 }
-"""Driver name → ``module:function`` that makes its simulated device."""
+"""Driver name → ``module:function`` that creates its simulated device."""
 
 LEAST_INTERVAL = 0.004
-"""Least time between two sends of one line, s: what is due in between goes together.
+"""Minimum time between two sends of one line, s: units due in between are sent together.
 
-Not between two answers: who asks is not held up.
+Replies are not delayed.
 """
 
 
 class Served:
     """One endpoint on its line: calls the endpoint for received bytes and at due times.
 
-    Sends are made at absolute instants of world time, so that lateness never adds up.
+    Units are sent at absolute instants of world time, so that delays do not accumulate.
     """
 
     def __init__(
@@ -110,25 +110,25 @@ class Served:
         self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme, number=number)
 
     def connected(self) -> None:
-        """Somebody opened the line."""
+        """Handle a reader that opened the line."""
         self._is_open = True
         self._send(self._endpoint.connected(self._clock.now()))
         self._schedule()
 
     def received(self, received: bytes) -> None:
-        """Bytes were received."""
+        """Handle received bytes."""
         self._last = 0.0
         self._send(self._endpoint.receive(received, self._clock.now()))
         self._schedule()
 
     def disconnected(self) -> None:
-        """Nobody has the line open any more."""
+        """Handle the last reader that closed the line."""
         self._is_open = False
         self._endpoint.disconnected(self._clock.now())
         self._schedule()
 
     async def close(self) -> None:
-        """Take the line away."""
+        """Remove the line."""
         await self.wire.close()
         if self._timer is not None:
             self._timer.cancel()
@@ -195,11 +195,11 @@ async def serve(
     spec : mapping
         As described in this module.
     index : int
-        Of the device in the specification.
+        Index of the device in the specification.
     paced : PacedClock
-        By which the running event loop runs.
+        Clock of the running event loop.
     announce : callable
-        Called once, when the device can be connected to.
+        Called once, when the device accepts connections.
     lifeline : int
         File descriptor, open for reading.
     """
@@ -211,11 +211,11 @@ async def serve(
     module, _, function = FAMILIES[device.driver].partition(":")
     faults = parse(spec.get("faults", ()), device.sensors)
     for fault in faults:
-        if fault.kind == "wrap":  # of a 16-bit counter
+        if fault.kind == "wrap":  # the counter has 16 bits
             first = round(-fault.at * device.sampling_rate) % 65536
             device = replace(device, settings={**device.settings, "first_count": first})
     source = Source(scenario, device, faults=SampleFaults(faults))
-    for sensor in device.sensors:  # the first sample takes its time: before anybody waits for it
+    for sensor in device.sensors:  # the first sample is slow: compute it before clients wait
         source.counts(sensor, source.first_sample_after(sensor, clock.now()), 1)
     lines: Sequence[Line] = getattr(import_module(module), function)(device, source)
     loop = asyncio.get_running_loop()
@@ -263,7 +263,7 @@ async def serve(
 
 
 class _Log:
-    """Lines of JSON that the processes of a bench append to one file; nothing without a file."""
+    """Lines of JSON that all processes of a bench append to one file; optional."""
 
     def __init__(self, path: str | None, device: DeviceSpec) -> None:
         self._path = path
@@ -271,13 +271,13 @@ class _Log:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether there is a file."""
+        """Whether the log has a file."""
         return bool(self._path)
 
-    def write(self, **told: object) -> None:
-        """Append one line, whole."""
+    def write(self, **fields: object) -> None:
+        """Append one line atomically."""
         if self._path:
-            line = json.dumps({"sensors": self._sensors, **told}) + "\n"
+            line = json.dumps({"sensors": self._sensors, **fields}) + "\n"
             with Path(self._path).open("ab", buffering=0) as file:
                 file.write(line.encode())
 
@@ -294,7 +294,7 @@ def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any
 
 
 def device_spec(table: Mapping[str, Any]) -> DeviceSpec:
-    """Read one entry of ``devices``."""
+    """Parse one entry of ``devices``."""
     return DeviceSpec(
         sensors=tuple(table["sensors"]),
         driver=table["driver"],

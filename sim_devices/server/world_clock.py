@@ -32,9 +32,9 @@ class WorldClock:
     monotonic_ns: Callable[[], int] = time.monotonic_ns
 
     def now(self) -> float:
-        """World time in s."""
+        """Return the world time in s."""
         return (self.monotonic_ns() - self.epoch_ns) / NS * self.speed
 
     def monotonic(self, world_time: float) -> float:
-        """Instant of the monotonic clock, in s, at which it is ``world_time``."""
+        """Return the instant of the monotonic clock, in s, of a world time."""
         return self.epoch_ns / NS + world_time / self.speed

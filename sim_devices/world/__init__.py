@@ -1,1 +1,1 @@
-"""The simulated motion, sensors, clocks and noise: functions of time, alike in every process."""
+"""Simulated motion, sensors, clocks and noise: functions of time, equal in every process."""

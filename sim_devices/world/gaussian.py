@@ -1,8 +1,8 @@
-"""Stationary Gaussian series with random access, the same in every process.
+"""Stationary Gaussian series with random access, equal in every process.
 
-White sources come in blocks, each from a counter-based generator whose counter is the index of the
-block: block 10 million costs as much as block 0, and two processes compute the same block. A series
-is the sources through a matrix of finite impulse responses, convolved by overlap-save, so it is
+White sources are generated in blocks, each by a counter-based generator whose counter is the index
+of the block: block 10 million costs as much as block 0, and two processes compute the same block. A
+series is the sources filtered by a matrix of finite impulse responses (overlap-save), so it is
 exactly stationary. Its PSD is the target PSD at the resolution of the impulse response, half a
 block to either side.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _Kept = TypeVar("_Kept")
 
 LONGEST_BLOCK = 2**16
-LARGEST_SPECTRUM = 2**19  # sources times samples: keeps a field of many waves in memory
+LARGEST_SPECTRUM = 2**19  # n_sources × n_samples: limits the memory of a field of many waves
 
 
 class WhiteSources:
@@ -31,9 +31,9 @@ class WhiteSources:
     Parameters
     ----------
     key
-        Two numbers that name the sources: a seed, and what the seed is used for.
+        Two numbers that identify the sources: a seed, and its use.
     n_sources
-        How many.
+        Number of sources.
     """
 
     def __init__(self, key: tuple[int, int], n_sources: int) -> None:
@@ -44,7 +44,7 @@ class WhiteSources:
         self._spectra: dict[int, ComplexArray] = {}
 
     def samples(self, index: int) -> FloatArray:
-        """Block `index` (any integer), shape (n_sources, block)."""
+        """Return block `index` (any integer), shape (n_sources, block)."""
         if index not in self._samples:
             counter = np.array([0, 0, index % 2**64, 0], dtype=np.uint64)
             random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
@@ -52,7 +52,7 @@ class WhiteSources:
         return self._samples[index]
 
     def spectrum(self, index: int) -> ComplexArray:
-        """Fourier transform of the block before and block `index`, shape (n_sources, block + 1)."""
+        """Return the transform of blocks `index` - 1 and `index`, shape (n_sources, block + 1)."""
         if index not in self._spectra:
             both = np.concatenate([self.samples(index - 1), self.samples(index)], axis=1)
             _keep(self._spectra, index, fft.rfft(both))
@@ -60,14 +60,14 @@ class WhiteSources:
 
 
 class GaussianSeries:
-    """White sources through a matrix of filters, sampled at `sampling_rate`.
+    """White sources filtered by a matrix of responses.
 
     Parameters
     ----------
     sources
-        Shared by all series that are to be coherent.
+        Shared by all coherent series.
     response
-        From frequency (Hz, shape (n_freqs,)) to complex amplitude per root of one-sided PSD,
+        Maps frequency (Hz, shape (n_freqs,)) to the complex amplitude per root of one-sided PSD,
         shape (n_freqs, n_outputs, n_sources): the cross-spectral matrix of the outputs is
         ``response @ response^H``.
     sampling_rate
@@ -95,11 +95,11 @@ class GaussianSeries:
 
     @property
     def n_outputs(self) -> int:
-        """Series side by side."""
+        """Number of output series."""
         return len(self._filters)
 
     def read(self, first: int, n: int) -> FloatArray:
-        """Make samples `first` to `first + n` (any integers), shape (n_outputs, n)."""
+        """Return samples `first` to `first + n` (any integers), shape (n_outputs, n)."""
         block = self._sources.block
         first += block // 2  # the filters delay by half a block
         out = np.empty((self.n_outputs, n))
@@ -123,13 +123,13 @@ class GaussianSeries:
 
 
 def _faded(length: int) -> FloatArray:
-    """Window that is one in its middle half and a cosine towards both ends (Tukey)."""
+    """Return a Tukey window: one in its middle half, cosine tapers at both ends."""
     outward = np.abs(np.arange(length) - length / 2) / (length / 2)
     return np.asarray((1 + np.cos(2 * np.pi * np.maximum(outward - 0.5, 0))) / 2)
 
 
 def _keep(cache: dict[int, _Kept], index: int, value: _Kept) -> None:
-    """Remember the last two: a reader goes forward, and may straddle a block's end."""
+    """Keep the last two blocks: reads advance in time, and may span two blocks."""
     cache[index] = value
     while len(cache) > 2:
         del cache[next(iter(cache))]

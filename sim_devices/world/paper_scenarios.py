@@ -1,7 +1,7 @@
 """Named scenarios: the studies of the paper, and some others.
 
-Levels are in (m/s²)²/Hz; the paper's numerical studies have noise of 1e-15 g²/Hz and motion that
-is white, 1.5 times as strong along y as along x.
+Levels are in (m/s²)²/Hz. The paper's numerical studies have noise of 1e-15 g²/Hz and white motion,
+with 1.5 times the PSD along y as along x.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CASES: Mapping[str, tuple[str, tuple[str, str, str]]] = {
     "2": ("setup1", ("E", "A", "B")),
     "3": ("setup2", ("E", "A", "B")),
 }
-"""Table 1: set-up and sensors of each case, the target first."""
+"""Table 1: set-up and sensors of each case, with the target first."""
 
 
 def _white_motion(along_x: float, ratio: float = 1.5) -> CommonMotion:
@@ -42,14 +42,14 @@ def _white_motion(along_x: float, ratio: float = 1.5) -> CommonMotion:
 def three_channels(
     *, turned: tuple[float, float, float], snr: float, ratio: float = 1.5, seed: int = 0
 ) -> Scenario:
-    """Fig. 3: uniaxial sensors i, j, k in a plane, each turned from x by an angle in degrees.
+    """Return Fig. 3: uniaxial sensors i, j, k in a plane, each rotated from x by an angle.
 
     Parameters
     ----------
     turned
-        Directions of the three sensors.
+        Directions of the three sensors, in degrees.
     snr
-        Of sensor i: its motion's PSD over its noise's.
+        PSD of the motion over PSD of the noise, for sensor i.
     ratio
         S_y over S_x.
     """
@@ -73,9 +73,10 @@ def three_channels(
 def biaxial(
     *, theta: float, channel_angles: tuple[float, float, float], snr: float, seed: int = 0
 ) -> Scenario:
-    """Figs. 8 and 11: biaxial sensors, j and k turned by theta, channels at an angle (degrees).
+    """Return Figs. 8 and 11: biaxial sensors, j and k rotated by `theta` (degrees).
 
-    Channel 1 of sensor i points along x; `snr` is its own.
+    `channel_angles` are the angles between the channels of each sensor in degrees. Channel 1 of
+    sensor i points along x; `snr` is that of this channel.
     """
     return Scenario(
         seed=seed,
@@ -96,35 +97,35 @@ def biaxial(
 
 
 def fig4(*, theta: float = 10.0, snr: float = 100.0, ratio: float = 1.5) -> Scenario:
-    """Sensor i at 10°, j and k together `theta` further: its bias is that of (13)."""
+    """Return Fig. 4: sensor i at 10°, j and k rotated by `theta` from it; the bias is (13)."""
     return three_channels(turned=(10.0, 10.0 + theta, 10.0 + theta), snr=snr, ratio=ratio)
 
 
 def fig5(*, theta: float = 30.0, snr: float = 100.0) -> Scenario:
-    """Sensor j along i, k turned by `theta`: no bias, but variance."""
+    """Return Fig. 5: sensor j parallel to i, k rotated by `theta`: no bias, but variance."""
     return three_channels(turned=(10.0, 10.0, 10.0 + theta), snr=snr)
 
 
 def fig9(*, theta: float = 10.0, snr: float = 100.0) -> Scenario:
-    """Biaxial sensors with channels at 80°, 70° and 60° (the paper's angles are in a drawing)."""
+    """Return Fig. 9: biaxial sensors with channels at 80°, 70° and 60° (read from a drawing)."""
     return biaxial(theta=theta, channel_angles=(80.0, 70.0, 60.0), snr=snr)
 
 
 def fig12(*, alpha: float = 30.0, snr: float = 100.0) -> Scenario:
-    """All three sensors with channels at `alpha`, j and k turned by 5°."""
+    """Return Fig. 12: all three sensors with channels at `alpha`, j and k rotated by 5°."""
     return biaxial(theta=5.0, channel_angles=(alpha, alpha, alpha), snr=snr)
 
 
 def fig13(*, alpha: float = 30.0, theta: float = 60.0) -> Scenario:
-    """All three sensors with channels at `alpha`, j and k turned by `theta`, SNR 100."""
+    """Return Fig. 13: all three sensors with channels at `alpha`, j and k rotated by `theta`."""
     return biaxial(theta=theta, channel_angles=(alpha, alpha, alpha), snr=100.0)
 
 
 def hexagon(spacing: float = SPACING) -> dict[str, tuple[float, float, float]]:
-    """Fig. 6: E in the middle, A to D around it at 60° from one to the next.
+    """Return the positions of Fig. 6 in m: E in the middle, A to D around it, 60° apart.
 
-    So C-D-E, B-C-E and A-B-E are equilateral triangles; in A-C-E and A-D-E the outer two stand
-    √3 and 2 spacings apart.
+    C-D-E, B-C-E and A-B-E are equilateral triangles. A and C are √3 spacings apart, A and D two
+    spacings.
     """
     around = {
         name: (
@@ -138,7 +139,7 @@ def hexagon(spacing: float = SPACING) -> dict[str, tuple[float, float, float]]:
 
 
 SERVO_NOISE = Mixed(level=2e-13)
-"""Servo-accelerometers: pink below 20 Hz, rising above 30 Hz."""
+"""Noise of servo-accelerometers: pink below 20 Hz, increasing above 30 Hz."""
 
 LABORATORY: Spectrum = Sum(
     terms=(
@@ -153,11 +154,11 @@ LABORATORY: Spectrum = Sum(
         Resonance(level=2e-9, frequency=37.0, damping=0.03),
     )
 )
-"""Motion of a laboratory floor: below the noise at 2 Hz, with the structure's modes above."""
+"""Motion of a laboratory floor: below the noise at 2 Hz, with structural modes above."""
 
 
 def laboratory(turned: Mapping[str, float], *, speed: float = 1000.0, seed: int = 0) -> Scenario:
-    """Five triaxial servo-accelerometers on a floor that waves of a finite speed cross."""
+    """Return five triaxial servo-accelerometers on a floor with waves of finite speed."""
     return Scenario(
         seed=seed,
         motion=PlaneWaves(spectrum=LABORATORY, speed=speed),
@@ -174,20 +175,20 @@ def laboratory(turned: Mapping[str, float], *, speed: float = 1000.0, seed: int 
 
 
 def setup1(*, seed: int = 0) -> Scenario:
-    """C, D and E alike; A and B turned together by 60°."""
+    """Return set-up 1: C, D and E parallel; A and B rotated by 60°."""
     return laboratory({"A": 60.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
 
 
 def setup2(*, seed: int = 1) -> Scenario:
-    """As set-up 1, A turned back by 15°."""
+    """Return set-up 2: set-up 1 with A rotated back by 15°."""
     return laboratory({"A": 45.0, "B": 60.0, "C": 0.0, "D": 0.0, "E": 0.0}, seed=seed)
 
 
 def waves(*, snr: float = 1e3, speed: float = 150.0, seed: int = 0) -> Scenario:
-    """Five triaxial sensors of arbitrary directions where the motion is far from coherent.
+    """Return five triaxial sensors of arbitrary directions in strongly incoherent motion.
 
-    White motion and noise; at 150 m/s the incoherence biases a three-sensor estimate several
-    times over from 20 Hz on.
+    Motion and noise are white. At 150 m/s the incoherence biases a three-sensor estimate by several
+    times the noise from 20 Hz on.
     """
     angles = np.random.default_rng(9).uniform(-180.0, 180.0, (5, 3))
     return Scenario(
@@ -218,12 +219,12 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
 
 
 def named(name: str) -> Scenario:
-    """Return the scenario of this name, with the values its function has by default.
+    """Return the scenario with this name, with the default values of its function.
 
     Raises
     ------
     ScenarioError
-        If there is none.
+        If no scenario has this name.
     """
     if name not in SCENARIOS:
         raise ScenarioError(f"no scenario {name!r}; expected one of {', '.join(SCENARIOS)}")

@@ -1,8 +1,9 @@
-"""Motion of a floor crossed by plane waves: coherence decreases with distance.
+"""Motion of a floor by plane waves: coherence decreases with distance.
 
-Rayleigh waves (horizontal along their way, vertical a quarter period behind) and Love waves
-(horizontal across it) come from directions all around at one speed; shear and pressure waves
-arrive from below. All are independent, and each reaches a sensor at its own time.
+Rayleigh waves (horizontal along their direction, vertical with a delay of a quarter period) and
+Love waves (horizontal across their direction) propagate in all directions at one speed; shear and
+pressure waves arrive from below. All waves are independent, and each reaches a sensor at its own
+time.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def field(
     Returns
     -------
     complex128, shape (n_freqs, 3, n_sources)
-        Amplitude A with ``A(f, x) A(f, y)^H`` the coherence between places x and y: the unit
-        matrix where x = y.
+        Amplitude A with ``A(f, x) A(f, y)^H`` the coherency between positions x and y: the unit
+        matrix for x = y.
     """
     n = waves.n_directions
     bearing = 2 * np.pi * (np.arange(n) + 0.5) / n
@@ -47,8 +48,8 @@ def field(
     across = np.array([-np.sin(bearing), np.cos(bearing), np.zeros(n)])
     up = np.array([[0.0], [0.0], [1.0]])
 
-    surface = 1 - waves.from_below  # share of the vertical motion that Rayleigh waves make
-    rayleigh = surface * waves.ellipticity**2 / 2  # and what that brings to each horizontal
+    surface = 1 - waves.from_below  # share of Rayleigh waves in the vertical motion
+    rayleigh = surface * waves.ellipticity**2 / 2  # and in each horizontal direction
     shape = np.concatenate(
         [
             np.sqrt(surface / n) * (waves.ellipticity * along - 1j * up),
@@ -57,7 +58,7 @@ def field(
         ],
         axis=1,
     )
-    shape = np.where(frequency[:, None, None] > 0, shape, shape.real)  # no phase at rest
+    shape = np.where(frequency[:, None, None] > 0, shape, shape.real)  # real at 0 Hz
     slowness = np.concatenate([along, along, np.tile(up, 3)], axis=1) / waves.speed
     delay = np.asarray(position) @ slowness
     return np.asarray(shape * np.exp(-2j * np.pi * frequency[:, None, None] * delay))

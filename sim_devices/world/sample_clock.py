@@ -1,4 +1,4 @@
-"""When a free-running sensor takes its samples."""
+"""Sample times of a free-running sensor."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ KNOTS_PER_BLOCK = 4096
 
 
 class SampleClock:
-    """World time of each of a sensor's samples.
+    """World time of each sample of a sensor.
 
-    The rate of the oscillator is `ppm`, plus a random walk (straight between knots), plus an
-    exponential step; the time is its exact integral, so it is smooth. The random walk is zero
-    at sample 0; what goes before runs without it.
+    The rate error of the oscillator is `ppm`, plus a random walk (linear between knots), plus an
+    exponential step. The time is its exact integral, and so it is smooth. The random walk is zero
+    up to sample 0.
     """
 
     def __init__(self, clock: SensorClock, *, sampling_rate: float, key: tuple[int, int]) -> None:
@@ -27,10 +27,10 @@ class SampleClock:
         self._sampling_rate = sampling_rate
         self._key = np.array(key, dtype=np.uint64)
         self._rate = np.zeros(1)  # random walk of the rate at each knot, s/s
-        self._time = np.zeros(1)  # and its integral, s
+        self._time = np.zeros(1)  # its integral, s
 
     def times(self, first_sample: int, n: int) -> FloatArray:
-        """World time in seconds of samples `first_sample` to `first_sample + n`, shape (n,)."""
+        """Return the world time in s of samples `first_sample` to `first_sample + n`, (n,)."""
         clock = self._clock
         nominal = (first_sample + np.arange(n)) / self._sampling_rate
         times = clock.offset + nominal / (1 + clock.ppm * 1e-6)

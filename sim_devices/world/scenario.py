@@ -1,14 +1,14 @@
 """The simulated motion and sensors: the table `[simulation]` of a bench file.
 
-A scenario describes one common motion and all sensors in it. All processes with the same table
-simulate the same world: every quantity is the same function of time.
+A scenario describes one common motion and its sensors. All processes with the same table simulate
+the same world: every quantity is the same function of time.
 
 Example from a bench file (SI units, angles in degrees, spectra one-sided)::
 
     [simulation]
     seed = 7
 
-    [simulation.motion]                     # three directions: x, y, z (up)
+    [simulation.motion]                     # three directions: x, y, z (upwards)
     spectra = [
         {shape = "white", level = 1e-9},
         {shape = "white", level = 1.5e-9},
@@ -18,7 +18,7 @@ Example from a bench file (SI units, angles in degrees, spectra one-sided)::
     ]
 
     [simulation.sensors.A]                  # the sensor's name in the bench file
-    noise = {shape = "mixed", level = 1e-13}            # one for all channels, or one for each
+    noise = {shape = "mixed", level = 1e-13}            # one for all channels, or one per channel
 
     [simulation.sensors.B]
     rotation = 10.0                         # about z; or [about z, about y, about x]
@@ -28,12 +28,12 @@ Example from a bench file (SI units, angles in degrees, spectra one-sided)::
     clock = {offset = 0.3, ppm = 15.0, wander = 0.05}
 
     [simulation.sensors.C]
-    directions = [[1, 0, 0], [1, 2, 0], [0, 0, 1]]      # a row a channel, any angles between
+    directions = [[1, 0, 0], [1, 2, 0], [0, 0, 1]]      # one row per channel, at any angles
     noise = [{shape = "white", level = 1e-13}, {shape = "pink", level = 1e-13},
              {shape = "white", level = 2e-13}]
     seed = 3                                # of this sensor's noise and clock
 
-A field of plane waves instead of one common motion; sensors apart are not coherent::
+A field of plane waves instead of one common motion; distant sensors are not coherent::
 
     [simulation.motion]
     kind = "plane-waves"
@@ -66,7 +66,7 @@ ELSEWHERE = frozenset({"speed", "clock", "devices", "faults"})
 
 
 class Scenario(Table):
-    """A motion and the sensors in it."""
+    """A motion and its sensors."""
 
     seed: NonNegativeInt = 0
     motion: MotionModel
@@ -81,7 +81,7 @@ class Scenario(Table):
         table
             The schema of this module; `speed`, `clock`, `devices` and `faults` are ignored.
         sampling_rate
-            Of the sensors that do not state their own, in Hz.
+            Sampling rate in Hz of sensors without their own.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class Scenario(Table):
             raise ScenarioError(*_problems(error, own)) from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the scenario as a table: plain TOML and JSON values, `None` left out."""
+        """Return the scenario as a table of TOML and JSON values, without `None`."""
         return self.model_dump(mode="json", exclude_none=True)
 
     @property
@@ -115,23 +115,23 @@ class Scenario(Table):
         return tuple(self.sensors)
 
     def n_channels(self, sensor: str) -> int:
-        """Channels of a sensor."""
+        """Return the number of channels of a sensor."""
         directions = self.sensor(sensor).directions
         return self.motion.n_dims if directions is None else len(directions)
 
     def noise_spectra(self, sensor: str) -> tuple[Spectrum, ...]:
-        """Noise of every channel of a sensor."""
+        """Return the noise of every channel of a sensor."""
         noise = self.sensor(sensor).noise
         return noise if isinstance(noise, tuple) else (noise,) * self.n_channels(sensor)
 
     def gains(self, sensor: str) -> FloatArray:
-        """Gain of every channel, shape (n_channels,)."""
+        """Return the gain of every channel, shape (n_channels,)."""
         return np.broadcast_to(
             np.asarray(self.sensor(sensor).gain, dtype=float), self.n_channels(sensor)
         )
 
     def directions(self, sensor: str) -> FloatArray:
-        """Direction cosines in the world, shape (n_channels, n_dims): R of (16)."""
+        """Return the direction cosines of the channels, shape (n_channels, n_dims): R of (16)."""
         model, d = self.sensor(sensor), self.motion.n_dims
         rows = np.eye(d) if model.directions is None else np.array(model.directions)
         rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -139,13 +139,13 @@ class Scenario(Table):
 
     @property
     def bandwidth(self) -> float:
-        """The motion is whole to this frequency (Hz), and gone a ninth above it."""
+        """Return the bandwidth of the motion in Hz: complete up to it, zero from 10/9 of it on."""
         if self.motion.bandwidth is not None:
             return self.motion.bandwidth
         return USABLE * min(sensor.sampling_rate for sensor in self.sensors.values()) / 2
 
     def true_noise_psd(self, sensor: str, channel: int, frequency: FloatArray) -> FloatArray:
-        """One-sided noise PSD of a channel (by index) in (m/s²)²/Hz, shape of `frequency` (Hz)."""
+        """Return the one-sided noise PSD of a channel in (m/s²)²/Hz at `frequency` (Hz)."""
         return self.noise_spectra(sensor)[channel].psd(np.asarray(frequency, dtype=float))
 
     def sensor(self, name: str) -> SensorModel:
@@ -154,7 +154,7 @@ class Scenario(Table):
         Raises
         ------
         ScenarioError
-            There is no such sensor; the message names those there are.
+            If no sensor has this name; the message lists all names.
         """
         try:
             return self.sensors[name]
@@ -172,7 +172,7 @@ class Scenario(Table):
             if sensor.directions is not None:
                 faults += [
                     f"sensors.{name}.directions: {list(row)} has {len(row)} values;"
-                    f" expected {d}, as the motion has, not all zero"
+                    f" expected {d}, like the motion, not all zero"
                     for row in sensor.directions
                     if len(row) != d or not any(row)
                 ]
@@ -180,7 +180,7 @@ class Scenario(Table):
                 if isinstance(value, tuple) and len(value) != n_channels:
                     faults.append(
                         f"sensors.{name}.{key}: {len(value)} values;"
-                        f" expected one, or {n_channels}, one for each channel"
+                        f" expected one, or {n_channels}, one per channel"
                     )
             turned = np.flatnonzero(np.atleast_1d(sensor.rotation)).tolist()
             if d < 3 and any(axis > 0 or d == 1 for axis in turned):
@@ -194,7 +194,7 @@ class Scenario(Table):
 
 
 def _rotation(angles: float | tuple[float, float, float]) -> FloatArray:
-    """Matrix (3, 3) that turns about z, then the new y, then the new x, by degrees."""
+    """Return the rotation (3, 3) about z, then the new y, then the new x, by angles in degrees."""
     yaw, pitch, roll = np.radians(angles if isinstance(angles, tuple) else (angles, 0.0, 0.0))
     (cz, cy, cx), (sz, sy, sx) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
@@ -209,7 +209,7 @@ def _problems(error: ValidationError, table: Mapping[str, Any]) -> list[str]:
     for fault in error.errors(include_url=False):
         key = "simulation"
         given: Any = table
-        for part in fault["loc"]:  # a path holds names of alternatives too: those are no keys
+        for part in fault["loc"]:  # a path also has names of alternatives, which are no keys
             if isinstance(given, dict) and part in given:
                 key, given = f"{key}.{part}", given[part]
             elif isinstance(given, list | tuple) and isinstance(part, int):

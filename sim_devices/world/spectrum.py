@@ -1,6 +1,6 @@
 """Shapes of one-sided power spectral densities, in (m/s²)²/Hz.
 
-Each shape is a frozen table, as in a bench file::
+Each shape is a frozen table, written in a bench file as::
 
     {shape = "white", level = 1e-13}
     {shape = "mixed", level = 2e-14, low_corner = 20.0, high_corner = 30.0}
@@ -32,7 +32,7 @@ class Shape(BaseModel):
 
 
 class White(Shape):
-    """The same `level` at every frequency."""
+    """Constant `level` at every frequency."""
 
     shape: Literal["white"] = "white"
     level: NonNegativeFloat
@@ -43,7 +43,7 @@ class White(Shape):
 
 
 class Pink(Shape):
-    """`level` at 1 Hz, falling as `frequency**-exponent`; flat well below `flat_below` (Hz)."""
+    """`level` at 1 Hz, times `frequency**-exponent`; constant far below `flat_below` (Hz)."""
 
     shape: Literal["pink"] = "pink"
     level: NonNegativeFloat
@@ -56,11 +56,10 @@ class Pink(Shape):
 
 
 class Mixed(Shape):
-    """Servo-accelerometers of §2.4: pink below `low_corner`, rising above `high_corner` (Hz).
+    """Servo-accelerometers of §2.4: pink below `low_corner`, increasing above `high_corner` (Hz).
 
-    Between the corners the PSD is about `level`; it falls as 1/f below and rises as
-    `f**rise` above: ``level (low_corner / f + 1 + (f / high_corner)**rise)``, flat well below
-    `flat_below`.
+    The PSD is ``level (low_corner / f + 1 + (f / high_corner)**rise)``: about `level` between the
+    corners, proportional to 1/f below and to `f**rise` above; constant far below `flat_below`.
     """
 
     shape: Literal["mixed"] = "mixed"
@@ -77,10 +76,10 @@ class Mixed(Shape):
 
 
 class Resonance(Shape):
-    """One structural mode: `level` at its `frequency` (Hz), with a fraction `damping` of critical.
+    """One structural mode: `level` at its `frequency` (Hz), `damping` as a fraction of critical.
 
-    The acceleration of an oscillator under a white force, so it falls as f⁴ below and is flat
-    at `level (2 damping)²` above.
+    This is the acceleration of an oscillator under a white force: proportional to f⁴ below the
+    mode, and constant at `level (2 damping)²` above.
     """
 
     shape: Literal["resonance"] = "resonance"
@@ -107,7 +106,7 @@ class Tabulated(Shape):
         if len(self.frequency) != len(self.level):
             raise ValueError(
                 f"{len(self.frequency)} frequencies and {len(self.level)} levels;"
-                " expected as many of one as of the other"
+                " expected equal numbers"
             )
         if any(second <= first for first, second in pairwise(self.frequency)):
             raise ValueError(f"frequency = {list(self.frequency)} must increase strictly")
@@ -120,7 +119,7 @@ class Tabulated(Shape):
 
 
 class Sum(Shape):
-    """Several independent contributions together."""
+    """Sum of independent contributions."""
 
     shape: Literal["sum"] = "sum"
     terms: tuple[Spectrum, ...] = Field(min_length=1)

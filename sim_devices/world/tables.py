@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from typing import Self
 
 USABLE = 0.9
-"""The motion is complete up to this share of the lowest Nyquist frequency, and zero above it."""
+"""The motion ends at this fraction of the lowest Nyquist frequency."""
 
 
 class Table(BaseModel):
@@ -31,7 +31,7 @@ class Table(BaseModel):
 
 
 class TemperatureStep(Table):
-    """At `time` (s) the oscillator begins to settle `ppm` away, with `time_constant` (s)."""
+    """Exponential change of the rate by `ppm` from `time` (s) on, with `time_constant` (s)."""
 
     time: float
     ppm: float
@@ -39,11 +39,11 @@ class TemperatureStep(Table):
 
 
 class SensorClock(Table):
-    """When a sensor takes its samples.
+    """Clock of a sensor.
 
-    Sample n is taken `offset + n / (sampling_rate (1 + ppm 1e-6))` seconds after the world's
-    zero, further moved by the wander (a random walk of the rate: its standard deviation in ppm
-    after one hour) and by a temperature step.
+    Sample n is taken at world time `offset + n / (sampling_rate (1 + ppm 1e-6))` in s, plus the
+    effects of `wander` (a random walk of the rate; standard deviation in ppm after one hour) and of
+    a temperature step.
     """
 
     offset: float = 0.0
@@ -81,8 +81,8 @@ class SensorModel(Table):
 class CommonMotion(Table):
     """One motion for all sensors: independent components with these PSDs, then mixed.
 
-    With `mixing` (a row for each direction of the world, a column for each spectrum) the
-    directions become correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ.
+    With `mixing` (one row per direction of the world, one column per spectrum) the directions are
+    correlated: their cross-PSD matrix is mixing · diag(spectra) · mixingᵀ.
     """
 
     kind: Literal["common"] = "common"
@@ -101,7 +101,7 @@ class CommonMotion(Table):
             raise ValueError(f"{self.n_dims} directions of motion; the world has at most 3")
         if self.mixing is not None and any(len(row) != len(self.spectra) for row in self.mixing):
             raise ValueError(
-                f"each row of mixing must have {len(self.spectra)} values, one for each spectrum"
+                f"each row of mixing must have {len(self.spectra)} values, one per spectrum"
             )
         return self
 
@@ -110,8 +110,8 @@ class PlaneWaves(Table):
     """Rayleigh, Love and vertically arriving waves from all directions at one finite speed.
 
     `spectrum` is the PSD of each direction (x, y, z). A share `from_below` of it arrives
-    vertically, alike at all sensors on a level floor; Rayleigh waves, with `ellipticity` the
-    ratio of their horizontal to their vertical axis, and Love waves make up the rest.
+    vertically, equal at all sensors on a level floor. The rest are Rayleigh waves, with
+    `ellipticity` the ratio of their horizontal to their vertical axis, and Love waves.
     """
 
     kind: Literal["plane-waves"] = "plane-waves"

@@ -23,23 +23,23 @@ if TYPE_CHECKING:
     from sim_devices.world.scenario import Scenario
     from sim_devices.world.tables import Response
 
-GRID_OVERSAMPLING = 4  # master grid rate over the frequency where the motion has ended
+GRID_OVERSAMPLING = 4  # rate of the master grid over the highest frequency of the motion
 N_TAPS = 22
 KAISER_BETA = 13.4
-"""Of a window with 130 dB (0.1102 times what exceeds 8.7 dB)."""
+"""Beta of a window with 130 dB attenuation: 0.1102 (130 - 8.7)."""
 POLYNOMIAL_DEGREE = 13
-CHUNK = 4096  # instants interpolated at a time: their windows stay in the cache
+CHUNK = 4096  # instants interpolated per step: their windows fit into the cache
 
 
 class Motion:
-    """Motion at the channels of one sensor: a function of time, the same in every process."""
+    """Motion at the channels of one sensor: a function of time, equal in every process."""
 
     def __init__(self, series: GaussianSeries, *, sampling_rate: float) -> None:
         self._series = series
         self._rate = sampling_rate
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Motion at world `times` (s, shape (n,), in any order), shape (n, n_channels)."""
+        """Return the motion at world `times` (s, shape (n,), any order), shape (n, n_channels)."""
         out = np.empty((len(times), self._series.n_outputs))
         for start in range(0, len(times), CHUNK):
             place = times[start : start + CHUNK] * self._rate
@@ -68,13 +68,13 @@ class World:
         self._clocks: dict[str, SampleClock] = {}
 
     def samples(self, sensor: str, first_sample: int, n: int) -> FloatArray:
-        """Make what the sensor reads, noise included, in m/s², shape (n, n_channels)."""
+        """Return the sensor's readings, including noise, in m/s², shape (n, n_channels)."""
         felt = self.motion(sensor).at(self.sample_times(sensor, first_sample, n))
         felt += self.noise(sensor, first_sample, n)
         return felt
 
     def sample_times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
-        """World time in seconds of the sensor's samples, shape (n,)."""
+        """Return the world time in s of the sensor's samples, shape (n,)."""
         if sensor not in self._clocks:
             model = self._scenario.sensor(sensor)
             self._clocks[sensor] = SampleClock(
@@ -93,7 +93,7 @@ class World:
         return self._motions[sensor]
 
     def noise(self, sensor: str, first_sample: int, n: int) -> FloatArray:
-        """Make the sensor's own noise in m/s², shape (n, n_channels)."""
+        """Return the sensor's own noise in m/s², shape (n, n_channels)."""
         if sensor not in self._noises:
             spectra = self._scenario.noise_spectra(sensor)
             self._noises[sensor] = GaussianSeries(
@@ -104,7 +104,7 @@ class World:
         return self._noises[sensor].read(first_sample, n).T
 
     def motion_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
-        """Cross-spectral matrix that perfect clocks and no noise would give.
+        """Return the cross-spectral matrix for perfect clocks and no noise.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class World:
         return np.asarray(rows @ rows.conj().transpose(0, 2, 1))
 
     def true_csm(self, sensors: tuple[str, ...], frequency: FloatArray) -> ComplexArray:
-        """`motion_csm` and the sensors' true noise on its diagonal."""
+        """Return `motion_csm` plus the sensors' true noise on its diagonal."""
         csm = self.motion_csm(sensors, frequency)
         noise = [
             self._scenario.true_noise_psd(sensor, channel, frequency)
@@ -138,7 +138,7 @@ class World:
         return self._scenario.seed if own is None else own, crc32(f"{use} {sensor}".encode()) + 1
 
     def _response(self, sensor: str, frequency: FloatArray) -> ComplexArray:
-        """Amplitude of every channel for every source, shape (n_freqs, n_channels, n_sources)."""
+        """Return the amplitude of each source in each channel, (n_freqs, n_channels, n_sources)."""
         scenario = self._scenario
         model = scenario.sensor(sensor)
         channel = scenario.gains(sensor)[:, None] * scenario.directions(sensor)
@@ -152,7 +152,7 @@ class World:
         )
 
     def _ground(self, position: tuple[float, float, float], frequency: FloatArray) -> ComplexArray:
-        """Amplitude of the world's directions, shape (n_freqs, n_dims, n_sources)."""
+        """Return the amplitude of each source in each direction, (n_freqs, n_dims, n_sources)."""
         motion = self._scenario.motion
         if isinstance(motion, PlaneWaves):
             asd = np.sqrt(motion.spectrum.psd(frequency))
@@ -162,12 +162,12 @@ class World:
 
 
 def _diagonal(rows: FloatArray) -> ComplexArray:
-    """Rows (n, n_freqs) on the diagonals of matrices (n_freqs, n, n)."""
+    """Return matrices (n_freqs, n, n) with rows (n, n_freqs) on their diagonals."""
     return np.asarray(rows.T[:, :, None] * np.eye(len(rows)), dtype=complex)
 
 
 def _whole_to(bandwidth: float, frequency: FloatArray) -> FloatArray:
-    """One up to `bandwidth`, none from a ninth above it: a raised cosine between."""
+    """Return a low-pass: one up to `bandwidth`, zero from 10/9 of it on, raised cosine between."""
     beyond = (frequency / bandwidth - 1) / (1 / USABLE - 1)
     return np.asarray((1 + np.cos(np.pi * np.clip(beyond, 0, 1))) / 2)
 
@@ -185,10 +185,10 @@ def _poles_and_zeros(response: Response, frequency: FloatArray) -> ComplexArray:
 
 
 def _interpolator() -> FloatArray:
-    """Weights of the taps as polynomials in the place between two grid samples, −1 to 1.
+    """Return the weights of the taps as polynomials in the position between grid samples, −1 to 1.
 
-    Shape (POLYNOMIAL_DEGREE + 1, N_TAPS), highest power first. A sinc under a Kaiser window,
-    flat to a quarter of the grid rate and 130 dB down from three quarters.
+    Shape (POLYNOMIAL_DEGREE + 1, N_TAPS), highest power first. The filter is a sinc with a Kaiser
+    window, flat to a quarter of the grid rate, with 130 dB attenuation from three quarters on.
     """
     node = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
     tap = np.arange(N_TAPS) - N_TAPS // 2 + 1

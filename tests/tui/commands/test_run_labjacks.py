@@ -147,7 +147,7 @@ def test_a_port_that_is_taken_is_named() -> None:
         held.bind(("127.0.0.1", number))
         held.listen()
         with (
-            pytest.raises(ServeError, match=f"port {number} of this machine cannot be listened on"),
+            pytest.raises(ServeError, match=f"cannot listen on port {number} of this machine"),
             serving({**told, "devices": told["devices"][:1]}),
         ):
             pass
