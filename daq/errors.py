@@ -1,6 +1,6 @@
-"""Errors of acquisition and of everything that reads recordings.
+"""Errors of acquisition and of all modules that read recordings.
 
-Each is a `HuddleError`, and also of the standard kind that it is.
+Each is a `HuddleError`, and also an instance of the matching standard exception.
 """
 
 from __future__ import annotations
@@ -12,33 +12,33 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ABSENT: object = object()
-"""In place of a value that a file does not give."""
+"""Stands for a value that is missing in a file."""
 _SHOWN_LENGTH = 60
 
 
 class HuddleError(Exception):
-    """Root of every error that huddle raises on purpose; its message says what to do."""
+    """Base class of all errors that huddle raises on purpose; the message has the remedy."""
 
     is_usage_error = False
-    """Whether a command line, a setting or a file that a person wrote is wrong; otherwise a device
-    or a recording is in trouble."""
+    """Whether the cause is a command line, a setting or a file written by the user, not a device or
+    a recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileFault:
-    """One thing wrong with a bench file or a fault script.
+    """One error in a bench file or a fault script.
 
     Attributes
     ----------
     key : str
-        Such as ``estimate.segment``; within a sensor's table where `sensor` is given; empty for
-        the file, or the sensor, as a whole.
+        Such as ``estimate.segment``; relative to the sensor's table if `sensor` is given; empty for
+        the whole file or sensor.
     expected : str
-        What was expected, and what is wrong where the value does not show it.
+        The expected value, and the error if `value` does not show it.
     value : object
-        What the file gives; `ABSENT` if nothing.
+        The value in the file, or `ABSENT`.
     sensor : str
-        Name of the sensor that the key belongs to, if to one.
+        Name of the sensor that the key belongs to; empty otherwise.
     """
 
     key: str
@@ -55,7 +55,7 @@ class FileFault:
 
 
 def toml_value(value: object) -> str:
-    """Return a value on one line, as a TOML file has it, cut where it is long."""
+    """Return a value as TOML on one line, shortened if long."""
     if isinstance(value, bool):
         text = str(value).lower()
     elif isinstance(value, str):
@@ -68,13 +68,13 @@ def toml_value(value: object) -> str:
 
 
 class BenchFileError(HuddleError, ValueError):
-    """A bench file or a fault script is wrong; the message has a line for each fault.
+    """A bench file or a fault script is wrong; the message has one line per error.
 
     Parameters
     ----------
     faults : FileFault
     source : path or str
-        Name of the file, for the message; drivers do not know it.
+        Name of the file, for the message; empty if unknown, as in drivers.
     """
 
     is_usage_error = True
@@ -87,11 +87,11 @@ class BenchFileError(HuddleError, ValueError):
 
 
 class DriverError(HuddleError, ImportError):
-    """An installed driver cannot be used; the message names it, its package and why."""
+    """An installed driver cannot be used; the message names driver, package and cause."""
 
 
 class DeviceError(HuddleError):
-    """A device cannot be used; the message names sensor, port, what was expected and what came."""
+    """A device cannot be used; the message has sensor, port, expected and received values."""
 
 
 class NotConnectedError(DeviceError, ConnectionError):
@@ -99,16 +99,16 @@ class NotConnectedError(DeviceError, ConnectionError):
 
 
 class NoAnswerError(DeviceError, TimeoutError):
-    """The port is there, but no device answers."""
+    """The port is open, but no device replies."""
 
 
 class WrongDeviceError(DeviceError, ValueError):
-    """Something answers, but it is not the device that the bench file names."""
+    """The device that replies is not the one in the bench file."""
 
     def __init__(self, message: str, *, found: object = None) -> None:
         super().__init__(message)
         self.found = found
-        """What was found instead, such as a serial number, to tell wrong devices apart."""
+        """Identity of the device found, such as a serial number, to distinguish wrong devices."""
 
 
 class RecordingError(HuddleError, OSError):
@@ -116,11 +116,11 @@ class RecordingError(HuddleError, OSError):
 
 
 class DiskError(RecordingError):
-    """The disk refused to take a recording, again and again."""
+    """The disk repeatedly refused to store a recording."""
 
 
 class NotARecordingError(RecordingError):
-    """The file is not a huddle recording, or of a format newer than this program."""
+    """The file is not a huddle recording, or has a newer format than this version reads."""
 
 
 class ArchiveError(HuddleError, OSError):
@@ -128,13 +128,13 @@ class ArchiveError(HuddleError, OSError):
 
 
 class WrongArchiveError(ArchiveError):
-    """A store is not one, of a newer format, or of other settings or sensors than asked for."""
+    """A file is no store, has a newer format, or has other settings or sensors than requested."""
 
     is_usage_error = True
 
 
 class CannotAlignError(HuddleError, ValueError):
-    """The sensors of a recording cannot be brought onto one grid."""
+    """The sensors of a recording cannot be aligned on one grid."""
 
 
 class WrongSettingError(CannotAlignError):
@@ -144,10 +144,10 @@ class WrongSettingError(CannotAlignError):
 
 
 class ImportFormatError(HuddleError, ValueError):
-    """A foreign file cannot be understood."""
+    """A file of another program cannot be read."""
 
 
 class ArrayError(HuddleError, ValueError):
-    """An array of samples, or its labels, cannot be understood."""
+    """An array of samples, or its labels, are invalid."""
 
     is_usage_error = True

@@ -1,7 +1,7 @@
-"""The host's clock, injected wherever time is read.
+"""The host's clock, passed to all code that reads time.
 
-Simulated benches may run faster than life (``huddle devices --speed 8``): then host time runs
-faster by the same factor, so that everything downstream sees the times of a bench at speed 1.
+Simulated benches may run faster than real time (``huddle devices --speed 8``). Host time then runs
+faster by the same factor, so that all later processing sees the times of a bench at speed 1.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from daq.protocols.block import HostTime
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Counts on while the computer is suspended, unlike time.monotonic_ns.
+# Continues while the computer is suspended, unlike time.monotonic_ns.
 _always: Callable[[], int] = (
     partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
     if hasattr(time, "CLOCK_BOOTTIME")
@@ -24,7 +24,7 @@ _always: Callable[[], int] = (
 
 
 class HostClock(Protocol):
-    """Where host times come from."""
+    """Source of host times."""
 
     @property
     def speed(self) -> float:
@@ -33,7 +33,7 @@ class HostClock(Protocol):
 
     @property
     def suspended(self) -> float:
-        """Seconds for which the computer has been suspended so far; they have passed as well."""
+        """Return the total time for which the computer was suspended, in s; part of host time."""
         ...
 
     def now(self) -> HostTime:
@@ -44,19 +44,19 @@ class HostClock(Protocol):
 class SystemClock:
     """The system's monotonic clock and UTC, both ``speed`` times as fast from construction on.
 
-    UTC is read once: it then follows the monotonic clock, so that a step of the system's UTC in
-    the middle of a run neither tears the recording nor moves its times. While the computer is
-    suspended its monotonic clock stands still (Linux, ``CLOCK_MONOTONIC``); sensors do not, and
-    where the system tells for how long, this one does not either.
+    UTC is read once and then follows the monotonic clock, so that a step of the system's UTC during
+    a run has no effect on the recording. The monotonic clock stops while the computer is suspended
+    (Linux, ``CLOCK_MONOTONIC``), but sensors continue. This clock adds the time of suspension if
+    the system has a clock that includes it.
 
     Parameters
     ----------
     speed : float
         Host seconds that pass in one second of the monotonic clock.
     monotonic_ns : callable
-        The monotonic clock, which stands still while the computer is suspended.
+        The monotonic clock, which stops while the computer is suspended.
     always_ns : callable
-        A clock of the same rate that counts on while the computer is suspended.
+        A clock of the same rate that continues while the computer is suspended.
     utc_ns : callable
         UTC in ns since 1970.
     """
@@ -75,7 +75,7 @@ class SystemClock:
 
     @property
     def suspended(self) -> float:
-        """Seconds for which the computer has been suspended since construction."""
+        """Return the time for which the computer was suspended since construction, in s."""
         awake = self._now_ns() - self._monotonic_ns
         return (self._always_ns() - self._began_ns - awake) * 1e-9
 

@@ -1,4 +1,4 @@
 """The recorder: keeps devices connected; validates, indexes and writes their blocks.
 
-Knows drivers and recordings. Knows no alignment and no estimate.
+Uses drivers and recordings, but no alignment or estimates.
 """

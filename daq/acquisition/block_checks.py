@@ -1,7 +1,7 @@
-"""Validates what a driver yields, so that an error in one driver does not harm other devices.
+"""Validates the items of drivers, so that an error in one driver does not affect other devices.
 
-Drivers may come from any package. A block that the file cannot hold would end the whole recording;
-validated here, it ends the session of its own port, with an error that says what was wrong.
+Drivers may come from any package. A block that the file cannot hold would end the whole recording.
+Validation ends only the session of its port, with an error that names the fault.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class BlockValidator:
         Raises
         ------
         FaultyDriverError
-            If it is not; the message names what was yielded and what was expected.
+            If it is not; the message has the yielded and the expected item.
         """
         if isinstance(item, Block):
             problem = self._block_problem(item)

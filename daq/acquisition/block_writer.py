@@ -1,6 +1,6 @@
-"""Writes the items of all connections into the recording: places blocks, adds gaps and events.
+"""Writes the items of all connections into the recording: blocks, gaps and events.
 
-Has no clock and no event loop; the recorder calls it from its writing thread.
+It has no clock and no event loop; the recorder calls it from its writing thread.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ _ROUTINE = {
 """Kinds of events that are logged as information; all others are warnings."""
 _REPORT_INTERVAL_NS = 1_000_000_000
 MAX_EVENTS_PER_SECOND = 20
-"""Events of one kind of one sensor that are written in each second."""
+"""Maximum number of events of one kind and sensor written per second."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorProgress:
-    """How much of one sensor is recorded, and its state."""
+    """Recorded samples and state of one sensor."""
 
     state: SensorState
     samples: int
-    """Safe on disk."""
+    """Number of samples safe on disk."""
     gaps: int
     missing: int
-    """Samples that were not received, as far as known."""
+    """Known number of samples that were not received."""
 
 
 class _Sensor:
@@ -66,15 +66,15 @@ class _Sensor:
 
 
 class _Unsafe:
-    """What one sensor has in the current file and no commit has acknowledged.
+    """Blocks and gaps of one sensor in the current file that no commit has acknowledged.
 
-    Needed where a file cannot be written any more, and the recording goes on in another.
+    Needed if the file can no longer be written and the recording continues in another file.
     """
 
     def __init__(self) -> None:
         self._blocks: deque[tuple[int, Block]] = (
             deque()
-        )  # with the file's rows up to each one's end
+        )  # each with the number of rows of the file up to its end
         self._gaps: deque[Gap] = deque()
         self._n_rows = self._n_gaps = 0
         self.safe = SensorCounts(0, 0, 0)
@@ -88,7 +88,7 @@ class _Unsafe:
             self._blocks.append((self._n_rows, item))
 
     def are_safe(self, counts: SensorCounts) -> None:
-        """Forget what a commit has acknowledged."""
+        """Drop the acknowledged items."""
         self.safe = counts
         while self._blocks and self._blocks[0][0] <= counts.rows:
             self._blocks.popleft()
@@ -96,7 +96,7 @@ class _Unsafe:
             self._gaps.popleft()
 
     def taken(self) -> list[Block | Gap]:
-        """Return the rest, for another file, which has nothing yet."""
+        """Return and remove the unacknowledged items, for another file."""
         rest: list[Block | Gap] = [*self._gaps, *(block for _, block in self._blocks)]
         self._blocks.clear()
         self._gaps.clear()
@@ -113,8 +113,8 @@ class _RateLimit:
         self._n = 0
 
     def passed(self, event: Event) -> Iterator[Event]:
-        """Yield the events to be written now: this one, and how many were left out before."""
-        if event.kind == EventKind.MARK:  # a person's words are never left out
+        """Yield the events to write now: this one, after the number of omitted ones."""
+        if event.kind == EventKind.MARK:  # a user's remark is never omitted
             yield event
             return
         now_ns = event.received.monotonic_ns
@@ -126,7 +126,7 @@ class _RateLimit:
             yield event
 
     def left_out(self, event: Event) -> Iterator[Event]:
-        """Yield an event like this one that says how many were left out, if any were."""
+        """Yield an event with the number of omitted events of this kind, if there are any."""
         n = self._n - MAX_EVENTS_PER_SECOND
         if n > 0:
             yield replace(event, text=f"{n} more events of this kind before")
@@ -144,7 +144,7 @@ class BlockWriter:
         self._ended = False
 
     def write(self, items: Iterable[Item]) -> None:
-        """Write items in order, after those that an error has left.
+        """Write items in order, after those left by an earlier error.
 
         Raises
         ------
@@ -172,11 +172,11 @@ class BlockWriter:
 
     @property
     def n_written(self) -> int:
-        """Rows of samples of all sensors in the file: those that a commit now would make safe."""
+        """Rows of samples of all sensors in the file, including uncommitted ones."""
         return self._writer.n_written
 
     def commit(self) -> Committed:
-        """Make what was written safe."""
+        """Make all written items safe on disk."""
         committed = self._writer.commit()
         for name, counts in committed.sensors.items():
             self._sensors[name].unsafe.are_safe(counts)
@@ -184,9 +184,9 @@ class BlockWriter:
         return committed
 
     def continue_in(self, writer: RecordingWriter) -> None:
-        """Go on in another file, and write there what is not safe in the one before."""
+        """Continue in another file, and write the unacknowledged items there."""
         before, self._writer = self._writer, writer
-        before.abandon()  # only now: a follower that sees it ended finds where it goes on
+        before.abandon()  # last: a follower that sees its end looks for the next file
         events, self._unsafe_events = self._unsafe_events, []
         for event in events:
             self._unsafe_events.append(event)
@@ -205,9 +205,9 @@ class BlockWriter:
                     self._append_gap(name, item)
 
     def close(self, now: HostTime, reason: str) -> Committed:
-        """Record the last gap of lost sensors and why the run ended, and close the file.
+        """Record the last gap of lost sensors and the reason of the end, and close the file.
 
-        After an error it may be called again.
+        May be called again after an error.
         """
         if not self._ended:
             self._ended = True
@@ -248,7 +248,7 @@ class BlockWriter:
         return {name: sensor.state for name, sensor in self._sensors.items()}
 
     def recorded_seconds(self) -> float:
-        """Return the recorded length, gaps included, of the sensor that has least."""
+        """Return the recorded duration in s, with gaps, of the sensor with the shortest one."""
         return min(s.indexer.next_sample / s.rate for s in self._sensors.values())
 
     def _write_event(self, event: Event) -> None:
@@ -258,7 +258,7 @@ class BlockWriter:
     def _set_late(self, item: SensorLate) -> None:
         """Keep the event of a late sensor until it is lost.
 
-        Blocks that are a little late now and then would fill the file with events.
+        Otherwise blocks that are slightly late would fill the file with events.
         """
         sensor = self._sensors[item.event.sensor]
         if sensor.state is SensorState.LIVE:
@@ -298,7 +298,7 @@ class BlockWriter:
         self._writer.append(replace(block, first_sample=block.first_sample - sensor.base))
 
     def _report_repeated(self, sensor: _Sensor, block: Block) -> None:
-        """Report at most once a second: a device may repeat everything, for weeks."""
+        """Report at most once a second: a device may repeat all samples for weeks."""
         at = block.received
         if at.monotonic_ns - sensor.repeats_reported_ns >= _REPORT_INTERVAL_NS:
             sensor.repeats_reported_ns = at.monotonic_ns

@@ -1,4 +1,4 @@
-"""Whether the clock that says how old recordings are can be believed."""
+"""Plausibility of the system's clock, which determines the age of recordings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 RELEASED = datetime(2026, 11, 1, tzinfo=UTC)
-"""No clock that is right shows an earlier time to this software."""
+"""Release of this software; a correct clock shows no earlier time."""
 JUMP = timedelta(hours=1)
 """Difference between the system's clock and elapsed time that counts as a jump of the clock."""
 DISTRUST = timedelta(days=1)
@@ -17,14 +17,14 @@ DISTRUST = timedelta(days=1)
 
 
 class ClockTrust:
-    """Whether the system's clock can be believed, from how it went since it was looked at.
+    """Plausibility of the system's clock, from its progress between calls.
 
     Parameters
     ----------
     now : callable
         The system's clock.
     monotonic : callable
-        Seconds of a clock that is never set.
+        Time in s of a clock that is never set.
     """
 
     def __init__(self, now: Callable[[], datetime], monotonic: Callable[[], float]) -> None:
@@ -33,7 +33,7 @@ class ClockTrust:
         self._jumped: float | None = None
 
     def doubt(self) -> str:
-        """Return why the clock cannot be believed, or an empty text."""
+        """Return why the clock is not plausible; empty if it is."""
         now, at = self._now(), self._monotonic()
         before, at_before = self._last
         self._last = now, at

@@ -1,8 +1,8 @@
 """Keeps the device on one port connected until the run ends.
 
-Connects, reads, and passes on what the driver yields. Reports a sensor whose block is late, and one
-that is lost; after a loss connects again, with a delay that grows from attempt to attempt. Items
-are validated (:mod:`daq.acquisition.block_checks`) and keep the sample indices of their session;
+Connects, reads, and forwards the driver's items. Reports late and lost sensors. After a loss it
+reconnects, with a delay that grows from attempt to attempt. Items are validated
+(:mod:`daq.acquisition.block_checks`) and keep the sample indices of their session;
 :mod:`daq.acquisition.sample_index` converts these to indices of the recording.
 """
 
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from daq.transport.serial_ports import SerialPort
 
 FIRST_RETRY_DELAY, MAX_RETRY_DELAY = 0.2, 5.0
-"""Seconds before a device is tried again: after its first failure, and at most."""
+"""Delay in s before the next attempt: after the first failure, and at most."""
 CLOSE_TIMEOUT = 5.0
 """Seconds that a driver may take to close its session."""
 MIN_SUSPENSION = 0.5
-"""Shortest suspension of the computer, s; a busy one reads its two clocks this far apart."""
+"""Shortest detected suspension, s: on a busy computer, readings of two clocks differ by this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +47,9 @@ class Connected:
 
     sensors: tuple[str, ...]
     reason: str
-    """Why the session before ended; empty for the first."""
+    """Why the previous session ended; empty for the first."""
     resumed: bool = False
-    """Whether the sample indices of the session before continue."""
+    """Whether the sample indices of the previous session continue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class SensorLost:
     """A sensor is lost until its next block."""
 
     event: Event
-    """To be recorded; its kind says which state the sensor is in."""
+    """To be recorded; its kind determines the sensor's state."""
 
     @property
     def state(self) -> SensorState:
@@ -78,7 +78,7 @@ Item = Block | Event | Connected | SensorLate | SensorLost
 
 @dataclass(slots=True)
 class BackOff:
-    """Delay before a device is tried again; doubles with each failure."""
+    """Delay before the next attempt to connect; doubles with each failure."""
 
     delay: float = FIRST_RETRY_DELAY
     """Seconds before the next attempt."""
@@ -114,13 +114,13 @@ class Connection:
         self.driver = driver
         self.sensors = tuple(sensors)
         self.port = self.sensors[0].port
-        """As the bench file names it, until its adapter is found under another name."""
+        """Port of the bench file, until its adapter is found under another name."""
         self._places = PortPlaces(self.port, find_ports)
         self.names = tuple(sensor.name for sensor in self.sensors)
         self.information: tuple[DeviceInformation, ...] = ()
-        """What the devices reported about themselves when they were first connected."""
+        """Information of the devices when they were first connected."""
         self.connected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Done when the first session is open, or failed to open."""
+        """Done when the first session is open or could not be opened."""
         self._is_connected = False
         self._back_off = BackOff()
         self._reported: tuple[EventKind | None, object] = None, None
@@ -152,14 +152,14 @@ class Connection:
                         reason = await self._report_lost(error, queue)
                         raise
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
-            # Drivers may come from anywhere. An error in one must not end the recording of other
-            # devices: it is raised at the start of a run, and recorded later.
+            # Third-party drivers may raise anything. An error in one must not end the recording of
+            # other devices: it is raised at the start of a run, and recorded later.
             except Exception as error:  # noqa: BLE001
                 failure = error
             if not self.connected.done():
                 self.connected.set_exception(failure)
                 return
-            # Of failed attempts, which may go on for weeks, only another wrong device is recorded.
+            # Failed attempts may continue for weeks: only another wrong device is recorded.
             if self._is_connected:
                 reason = await self._report_lost(failure, queue)
             elif isinstance(failure, WrongDeviceError) and _summary(failure) != self._reported:
@@ -226,7 +226,7 @@ class Connection:
         return kind
 
     async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
-        """Pass on what the session yields; raise NoAnswerError if it stalls."""
+        """Forward the items of the session; raise NoAnswerError if it stalls."""
 
         def report(name: str, state: OverdueState, seconds: float) -> bool:
             now = self._clock.now()
@@ -282,13 +282,13 @@ class Connection:
     async def _after_suspension(
         self, block: Block, before: float, queue: asyncio.Queue[Item]
     ) -> float:
-        """Report that the computer was suspended; return for how long in all.
+        """Report a suspension of the computer; return the total time of suspension in s.
 
         Raises
         ------
         NoAnswerError
-            If the device has neither counter nor sample times, so that nothing tells how many
-            samples are missing: a new session lets the host's clock tell.
+            If the device has neither counter nor sample times, so that the number of missing
+            samples is unknown. A new session estimates it from the host's clock.
         """
         now = self._clock.suspended
         text = f"the computer was suspended for {now - before:.3g} s"
@@ -298,7 +298,7 @@ class Connection:
         return now
 
     def _check_identity(self, session: Session) -> None:
-        """Refuse another device than the bench file names, or than was recorded before."""
+        """Refuse a device that is not the one in the bench file or the one recorded before."""
         found = tuple(session.information)
         known = {information.sensor: information for information in self.information}
         for sensor in self.sensors:
@@ -311,13 +311,13 @@ class Connection:
             if self._places.is_moved(self.port) and not now.serial_number:
                 raise WrongDeviceError(
                     f"sensor {sensor.name!r} on {self.port}: a device without a serial number; it"
-                    f" may be another than the one that was on {self._places.home}"
+                    f" may not be the device that was on {self._places.home}"
                 )
             check_identity(sensor, now, serial_number=before.serial_number if before else "")
         self.information = self.information or found
 
     def _first_item(self, session: Session, name: str) -> Event | SensorLost:
-        """Return that a sensor is connected, or that it does not answer while others do."""
+        """Return the event of a connected sensor, or of one that does not reply while others do."""
         now = self._clock.now()
         found = next((i for i in session.information if i.sensor == name), None)
         if found is not None and found.trouble:
@@ -328,12 +328,12 @@ class Connection:
 
 
 def patience_of(session: Session) -> float:
-    """Return the seconds without a block, of the device's time, after which a port is lost."""
+    """Return the time without a block, in s of the device, after which a port is lost."""
     return float(getattr(session, "patience", DEFAULT_PATIENCE))
 
 
 async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:
-    """Return the items of a session as a generator, which can be closed."""
+    """Return the items of a session as a generator that can be closed."""
     items = session.read()
     try:
         async for item in items:
@@ -345,7 +345,7 @@ async def _generator(session: Session) -> AsyncGenerator[Block | Event, None]:
 
 
 def _summary(failure: Exception) -> tuple[EventKind, object]:
-    """Return the kind of event that a failure becomes, and the device found instead."""
+    """Return the kind of event for a failure, and the identity of a wrong device."""
     if isinstance(failure, WrongDeviceError):
         return EventKind.REFUSED, failure.found
     kind = EventKind.STALLED if isinstance(failure, NoAnswerError) else EventKind.DISCONNECTED

@@ -1,4 +1,4 @@
-"""Checks that the device that answers is the one that the bench file names."""
+"""Checks that the connected device is the one in the bench file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from daq.drivers.interface import DeviceInformation
 
 RATE_TOLERANCE = 0.02
-"""As a fraction of the sampling rate: devices round it to what their clocks can divide."""
+"""Tolerance as a fraction of the sampling rate: devices round it to divisors of their clocks."""
 
 
 def check_identity(sensor: Sensor, found: DeviceInformation, *, serial_number: str = "") -> None:
@@ -22,9 +22,9 @@ def check_identity(sensor: Sensor, found: DeviceInformation, *, serial_number: s
     Parameters
     ----------
     sensor, found
-        The expected sensor, and what the device reports about itself.
+        The expected sensor, and the device's information.
     serial_number
-        Expected where the bench file names none: that of the device recorded before.
+        Serial number of the device recorded before; expected if the bench file names none.
 
     Raises
     ------
@@ -50,12 +50,12 @@ _Error = TypeVar("_Error", bound=Exception)
 
 
 def with_owner(error: _Error, sensors: Sequence[Sensor]) -> _Error | WrongDeviceError:
-    """Return an error that also says which sensor of the bench the device that was found is.
+    """Return an error that also names the sensor of the bench that the found device belongs to.
 
     Parameters
     ----------
     error
-        As a port was opened. Other errors than of wrong devices are returned unchanged.
+        Raised when a port was opened. Errors other than of wrong devices are returned unchanged.
     sensors
         All sensors of the bench.
     """

@@ -1,8 +1,8 @@
-"""Names under which a lost serial port may come back.
+"""Names under which a lost serial port may reappear.
 
-The same adapter is looked for first. Where the adapter has no identity, or is not present, ports
-are tried that were not there when the run began; whether the device is the right one its own serial
-number says, without which another port than that of the bench file is refused.
+The same adapter is looked for first. If the adapter has no identity, or is absent, ports are tried
+that did not exist at the start of the run. The device's serial number then confirms the device;
+without a serial number, only the port of the bench file is accepted.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class PortPlaces:
-    """Where to look for the device of one port of the bench file.
+    """Possible ports of the device on one port of the bench file.
 
     Parameters
     ----------
     home : str
-        The port as the bench file names it.
+        The port in the bench file.
     find_ports : callable
         Returns the serial ports that are present.
     """
@@ -35,7 +35,7 @@ class PortPlaces:
         self._n_tried = 0
 
     def is_moved(self, port: str) -> bool:
-        """Whether a port is another than that of the bench file, by name and by adapter."""
+        """Return whether a port differs from that of the bench file, by name and adapter."""
         if port == self.home:
             return False
         return not self._identity or self._identity not in {
@@ -43,7 +43,7 @@ class PortPlaces:
         }
 
     def connected(self, port: str) -> None:
-        """Note that the device is on this port."""
+        """Store the port at which the device was found."""
         if not self._is_serial:
             return
         ports = self._find_ports()

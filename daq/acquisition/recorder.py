@@ -1,12 +1,12 @@
-"""The recorder: all devices of a bench into one recording, until it is stopped.
+"""The recorder: writes all devices of a bench into one recording, until it is stopped.
 
 Theory of operation
 -------------------
-One task a port (:class:`daq.acquisition.connection.Connection`) puts items into one bounded queue.
-The recorder takes them from the queue in batches and writes them in a thread of its own
+One task per port (:class:`daq.acquisition.connection.Connection`) puts items into one bounded
+queue. The recorder takes them from the queue in batches and writes them in a separate thread
 (:class:`daq.acquisition.block_writer.BlockWriter`), so that neither compression nor ``fsync``
-delays a port. It commits about twice a second, sooner where a whole chunk of samples is waiting,
-and acknowledges only what is committed. When writing lags, the queue fills, the ports' tasks wait,
+delays a port. It commits about twice a second, sooner if a complete chunk of samples is waiting,
+and acknowledges only committed samples. If writing lags, the queue fills, the ports' tasks wait,
 and the operating system's buffers hold the data.
 """
 
@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 QUEUE_LENGTH = 4096
 COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 0.5, 0.25
-"""Seconds between commits: usually, and where a whole chunk of samples is waiting."""
+"""Seconds between commits: usually, and if a complete chunk of samples is waiting."""
 CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
 """Seconds that all connections may take to end."""
 _BATCH_INTERVAL = 0.1
 MIN_CONTINUATION = 60.0
-"""Seconds that a file that continues another must last; a disk that fails sooner ends the run."""
+"""Seconds that a continuation file must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0
 """Seconds after the end of a run in which its last blocks may arrive."""
 _Result = TypeVar("_Result")
@@ -62,7 +62,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class RecorderStatus:
-    """An acknowledgment: everything it counts is safe on disk."""
+    """An acknowledgment: all counted samples are safe on disk."""
 
     path: str
     elapsed: float
@@ -126,29 +126,29 @@ async def record(
     path : path
         The new file.
     duration : float, optional
-        Seconds to record of every sensor, by its own samples; the run ends after this much host
-        time even if a sensor is lost. Without it the run ends by ``stop``.
+        Seconds to record of every sensor, counted by its samples; the run ends after this host time
+        even if a sensor is lost. Without a duration, ``stop`` ends the run.
     clock : HostClock, optional
-        Source of host times; by default the system's, at the bench's speed.
+        Source of host times; default: the system's clock, at the bench's speed.
     stop : asyncio.Event, optional
         Ends the run properly when set.
     acknowledged : callable, optional
         Called after every commit, and when the state of a sensor has changed.
     drivers : callable
-        Returns the driver of a name.
+        Returns the driver with a given name.
 
     Returns
     -------
     RecorderStatus
-        Of the closed recording; not ``closed``, and without a file, if ``stop`` was set before all
-        devices were connected.
+        Status of the closed recording; not ``closed``, and without a file, if ``stop`` was set
+        before all devices were connected.
 
     Raises
     ------
     ExceptionGroup of DeviceError
-        If devices cannot be used at the start: one error for each, naming its sensor.
+        If devices cannot be used at the start: one error per device, naming its sensor.
     RecordingError
-        If no file can be written; everything acknowledged is safe.
+        If no file can be written; all acknowledged samples are safe.
     """
     clock = SystemClock(bench.speed) if clock is None else clock
     recorder = _Recorder(bench, Path(path), clock, stop or asyncio.Event(), acknowledged)
@@ -281,7 +281,7 @@ class _Recorder:
         duration: float | None,
         tasks: Sequence[asyncio.Task[None]],
     ) -> None:
-        """Write and commit what the connections deliver until the run ends."""
+        """Write and commit the items of the connections until the run ends."""
         loop = asyncio.get_running_loop()
         last_commit, n_committed = -math.inf, 0
         while not self._stop.is_set():
@@ -290,7 +290,7 @@ class _Recorder:
                 writer, thread, partial(writer.write, batch), partial(writer.write, ())
             )
             for task in tasks:
-                if task.done():  # a connection ends only by an error in the program
+                if task.done():  # only an error in the program ends a connection
                     task.result()
             chunk_waits = writer.n_written > n_committed
             interval = MIN_COMMIT_INTERVAL if chunk_waits else COMMIT_INTERVAL
@@ -305,7 +305,7 @@ class _Recorder:
                 return
 
     async def _batch(self) -> list[Item]:
-        """Return the items of the next moment: one call of the writing thread for many blocks."""
+        """Return the items of a short interval, so that one call of the thread writes many."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_BATCH_INTERVAL):
                 await self._stop.wait()
@@ -330,7 +330,7 @@ class _Recorder:
         action: Callable[[], _Result],
         again: Callable[[], _Result] | None = None,
     ) -> _Result:
-        """Do something with the file; if the disk refuses, do it `again` in another file."""
+        """Run `action` on the file; if the disk refuses, run `again` on another file."""
         try:
             return await thread.run(action)
         except DiskError as error:
@@ -343,7 +343,7 @@ class _Recorder:
         Raises
         ------
         DiskError
-            The one given, if there cannot be another file, or if this one has not lasted.
+            The given error, if no other file can be created, or if this one did not last.
         """
         now, before = self._clock.now(), self._file
         lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
@@ -361,7 +361,7 @@ class _Recorder:
             raise error from None
         self._file, self._file_started = path, now
         _LOGGER.error("%s; the recording continues in %s", error, path)
-        text = f"continues {before.name}, which could not be written any more"
+        text = f"continues {before.name}, which could no longer be written"
         writer.write([Event("", EventKind.STATUS, text, now)])
 
     def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
@@ -374,7 +374,7 @@ class _Recorder:
             self._acknowledged(status)
 
     def _with_current_states(self, writer: BlockWriter) -> dict[str, SensorProgress]:
-        """Return the counts acknowledged last with the current states."""
+        """Return the last acknowledged counts with the current states."""
         states = writer.states()
         return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
 
@@ -385,7 +385,7 @@ class _Recorder:
         return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
 
     async def _answer(self, command: Command, text: str) -> dict[str, Any]:
-        """Carry out a command of the control channel."""
+        """Execute a command of the control channel."""
         if command is Command.STOP:
             self._end_reason = "stopped by command"
             self._stop.set()

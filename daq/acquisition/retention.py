@@ -1,4 +1,4 @@
-"""Removes recordings with all that belongs to them."""
+"""Removes recordings with their files."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 OF_A_RUN = (".json", ".csv", ".html", ".pdf")
-"""Suffixes of the other files of a recording, which are removed with it."""
+"""Suffixes of the other files of a recording, which are also removed."""
 
 
 def remove_run(path: Path) -> None:
-    """Remove a recording and its files, itself last: by it the others are found again.
+    """Remove the files of a recording, then the recording: after an error it leads to the rest.
 
     Raises
     ------

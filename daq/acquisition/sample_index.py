@@ -5,15 +5,15 @@ Theory of operation
 A driver counts samples from 0 at the start of each session. A recording has one index per sensor:
 it counts the samples that the sensor took, or should have taken, since its first one. Within a
 session the two indices differ by a constant, and a jump is a gap of exactly that length (unless the
-protocol itself marks the length as an estimate).
+protocol marks the length as an estimate).
 
-Where a session begins, or a device restarts its sampling (``BlockFlag.CLOCK_RESTART``), the length
+When a session begins, or a device restarts its sampling (``BlockFlag.CLOCK_RESTART``), the length
 of the gap comes from the device's UTC, if the blocks on both sides have it and the host's clock
 agrees within an hour: a device may send stored data, or return with a wrong date. Otherwise it
-comes from the host's clock and is marked as an estimate. The block after such a gap carries
+comes from the host's clock and is marked as an estimate. The block after such a gap has the flag
 ``CLOCK_RESTART``, because the phase of the sampling is new.
 
-A session may also continue the index of the session before, where the device kept counting
+A session may also continue the index of the previous session, if the device kept counting
 (``daq.drivers.interface``, ``Resuming``). Then only the reason of the gap changes.
 
 Samples that were recorded before (in late or repeated blocks) are not recorded again.
@@ -67,7 +67,10 @@ class SampleIndexer:
         self._last: Block | None = None
 
     def new_session(self, reason: str) -> None:
-        """Begin a new session with the next block; ``reason`` is why the last one ended."""
+        """Begin a new session with the next block.
+
+        ``reason`` is the reason for the end of the last session.
+        """
         self._offset = None
         self._reason = reason
 
@@ -139,6 +142,6 @@ class SampleIndexer:
         if both and last.device_counter is not None and block.device_counter is not None:
             elapsed = (block.device_counter - last.device_counter) / _NS
             if abs(elapsed - waited) <= _MAX_DISAGREEMENT:
-                # Negative where the device sends samples again.
+                # Negative if the device sends samples again.
                 return round(elapsed * self._rate) - last.n_samples, False
         return max(0, round(waited * self._rate) - block.n_samples), True

@@ -1,6 +1,6 @@
-"""When scheduled runs are due.
+"""Due times of scheduled runs.
 
-Times are in the time zone of their entry, also on the days when its clocks change.
+Times are in the time zone of their entry, also on days with a change of clocks.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ def due_times(run: ScheduledRun, after: datetime) -> Iterator[datetime]:
             yield at
     if run.cron is not None:
         times = CronSim(run.cron, after.astimezone(run.zone))
-        # By instant: in the hour that is repeated, different instants compare equal as datetimes.
+        # By instant: in a repeated hour, different instants compare equal as datetimes.
         for _, same in groupby(times, key=datetime.timestamp):
             yield next(same)
 
 
 def all_due(schedule: Schedule, after: datetime) -> Iterator[tuple[datetime, ScheduledRun]]:
-    """Yield what is due after an instant, with its entry, in order."""
+    """Yield due times after an instant, each with its entry, in order."""
 
     def of(run: ScheduledRun) -> Iterator[tuple[datetime, ScheduledRun]]:
         return ((due, run) for due in due_times(run, after))

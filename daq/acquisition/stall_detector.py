@@ -10,13 +10,13 @@ session states (``daq.drivers.interface``, ``PatientSession``), and never sooner
 longest recent intervals between blocks and a margin. Then, if no other sensor on the port delivers,
 the task that waits for the port is interrupted; otherwise the stall is only reported.
 
-A stall that opening the port again does not end is no stall of the connection: the device delivers
-that seldom. The interval therefore counts across sessions where the last one ended by a stall, and
-the longest interval is handed from session to session (:class:`BlockInterval`).
+If reopening the port does not end a stall, the connection is sound and the device sends blocks less
+often than expected. The interval therefore counts across sessions if the last one ended by a stall,
+and the longest interval is passed from session to session (:class:`BlockInterval`).
 
-Nothing is overdue while the event loop is blocked, or while nobody waits for blocks because writing
-lags. A device that reports its recovery from a buffer overflow is late, but not stalled, for up to
-``MAX_RECOVERY``.
+Blocks are not overdue while the event loop is blocked, or while no task waits for blocks because
+writing lags. A device that reports its recovery from a buffer overflow is late, but not stalled,
+for up to ``MAX_RECOVERY``.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 FIRST_BLOCK_TIMEOUT = 10.0
 """Seconds to wait for a short first block of a session; drivers have tighter limits."""
 MAX_FIRST_BLOCK_SAMPLES = 1100
-"""Samples of the longest first block: a GCF block holds up to a thousand."""
+"""Number of samples in the longest first block: a GCF block holds up to 1000."""
 LATE_PERIODS = 2
-"""Block periods after the last block at which the next one is late."""
+"""Block periods after the last block after which the next one is late."""
 MIN_LATE_AFTER = 0.1
 STALL_MARGIN = 0.25
-"""Seconds that a late block may still take: one lost block must not look like a stall."""
+"""Additional time for a late block, in s: one lost block must not count as a stall."""
 MAX_LEARNED = 60.0
 """Longest interval between blocks, in seconds, that is learned across a stall."""
 MEMORY = 8.0
-"""The longest interval is forgotten over this many times itself."""
+"""Time over which the longest interval decays, in units of this interval."""
 MAX_RECOVERY = 10.0
-"""Seconds without blocks that a device may spend on its recovery."""
+"""Maximum duration of a device's recovery without blocks, in s."""
 BUSY_HOST_DELAY = 0.2
 """A timer that fires this many seconds late shows that the event loop was blocked."""
 _MIN_TIMER_INTERVAL = 0.02
@@ -59,16 +59,16 @@ OverdueState: TypeAlias = Literal[SensorState.LATE, SensorState.STALLED]
 
 
 class BlockInterval:
-    """Time that the next block may take, learned from earlier blocks; seconds of one clock.
+    """Allowed time until the next block, learned from earlier blocks; seconds of one clock.
 
     Parameters
     ----------
     now
-        When the session begins.
+        Start of the session.
     first_block_timeout
-        Time that the first block may take.
+        Allowed time until the first block.
     patience
-        Time that any other block may take, at least.
+        Minimum allowed time until any other block.
     before
         The interval of the port's last session, if there was one.
     """
@@ -82,7 +82,7 @@ class BlockInterval:
         before: BlockInterval | None = None,
     ) -> None:
         self.last = now
-        """When the last block arrived; before the first, when the session began."""
+        """Arrival of the last block; before the first block, start of the session."""
         self._first_block_timeout = max(first_block_timeout, patience)
         self._patience = patience
         self._has_blocks = False
@@ -94,12 +94,12 @@ class BlockInterval:
 
     @property
     def late_after(self) -> float:
-        """Seconds from the last block until the next is late; infinite before the first block."""
+        """Seconds after the last block when the next is late; infinite before the first block."""
         return max(MIN_LATE_AFTER, LATE_PERIODS * self._period) if self._has_blocks else math.inf
 
     @property
     def stalled_after(self) -> float:
-        """Seconds from the last block until the sensor is stalled."""
+        """Seconds after the last block when the sensor is stalled."""
         if not self._has_blocks:
             return self._first_block_timeout
         return max(self._patience, LATE_PERIODS * self._longest + STALL_MARGIN)
@@ -140,16 +140,16 @@ class StallDetector:
     Parameters
     ----------
     sampling_rates : mapping of str to float
-        Of each sensor, in samples per second of the event loop's clock.
+        Sampling rate of each sensor, in Hz of the event loop's clock.
     report : callable of sensor, state and seconds since its last block
-        Called once for each state; returns whether it could take the report, and is called again
-        if not.
+        Called once for each state; returns whether it accepted the report, and is called again if
+        not.
     patience : float
-        Seconds of the event loop's clock that the session states.
+        Patience of the session, in s of the event loop's clock.
     before : StallDetector, optional
-        Of the port's last session.
+        Detector of the port's last session.
     is_recovering : callable
-        Whether the device has reported that it works, though it sends no samples for now.
+        Returns whether the device has reported its recovery from an overflow.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class StallDetector:
             self._is_waiting = False
 
     def block_received(self, block: Block) -> None:
-        """Note the arrival of a block."""
+        """Record the arrival of a block."""
         now = self._loop.time()
         duration = block.n_samples / self._rates[block.sensor]
         self._port.block_received(now, duration)
@@ -254,7 +254,7 @@ class StallDetector:
                 interval.reported.add(state)
 
     def _set_timer(self, now: float) -> None:
-        """Set the timer to when a block could next be overdue; blocks before then cost nothing."""
+        """Set the timer to the next time at which a block can be overdue."""
         due = self._port.last + self._port.stalled_after
         for interval in self._sensors.values():
             if SensorState.LATE not in interval.reported:

@@ -11,7 +11,7 @@ def host_and_port(url: str) -> tuple[str, int]:
     Raises
     ------
     ValueError
-        Saying what was expected.
+        If ``url`` has another form.
     """
     parts = urlsplit(url)
     try:
@@ -24,17 +24,17 @@ def host_and_port(url: str) -> tuple[str, int]:
 
 
 SERIAL_SCHEMES: tuple[str, ...] = ("socket://", "rfc2217://", "hwgrep://")
-"""URLs that pyserial may open. Its others write files (``spy://``), load modules (``alt://``), or
-are no device (``loop://``)."""
+"""Allowed URLs of pyserial. Others write files (``spy://``), load modules (``alt://``), or are no
+device (``loop://``)."""
 
 
 def check_serial(port: str) -> None:
-    """Refuse a URL that pyserial would open but that is no device.
+    """Check that a port is a device or an allowed URL.
 
     Raises
     ------
     ValueError
-        Saying what was expected.
+        If it is neither.
     """
     scheme, found, _ = port.partition("://")
     if found and f"{scheme.lower()}://" not in SERIAL_SCHEMES:

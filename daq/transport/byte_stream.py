@@ -1,4 +1,4 @@
-"""The bytes of one open port, whatever carries them."""
+"""The bytes of one open port, for every kind of transport."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ if TYPE_CHECKING:
 
 
 class Transport(Protocol):
-    """What a kind of port must be able to do; it feeds the stream by itself."""
+    """One kind of port. It passes received bytes to :meth:`ByteStream.feed`."""
 
     most_expected: int
-    """Bytes that can be waited for together."""
+    """Maximum number of bytes to wait for."""
 
     async def write(self, payload: bytes) -> None:
-        """Send it all; raises OSError."""
+        """Send all bytes; raise OSError on failure."""
         ...
 
     def expect(self, n_bytes: int) -> None:
-        """Feed only when so many bytes are there."""
+        """Feed only when at least ``n_bytes`` are available."""
         ...
 
     def pause(self) -> None:
-        """Leave what comes to the kernel."""
+        """Stop reading; the kernel buffers received bytes."""
         ...
 
     def resume(self) -> None:
-        """Feed again."""
+        """Continue reading."""
         ...
 
     async def close(self) -> None:
@@ -41,11 +41,11 @@ class Transport(Protocol):
 
 
 HIGH_WATER = 4 * 1024 * 1024
-"""Bytes received and not yet asked for at which reading pauses."""
+"""Number of unread bytes at which the transport pauses."""
 
 
 class ByteStream:
-    """The bytes of one open port, with the host times at which they came.
+    """The bytes of one open port, with the host times of their arrival.
 
     Made by :func:`open_port`. ``label`` names sensor and port in every error.
     """
@@ -59,36 +59,36 @@ class ByteStream:
         self._failure: str | None = None
         self._waiter: asyncio.Future[None] | None = None
         self._paused = False
-        self._expected = 1  # bytes, as every wire begins
+        self._expected = 1  # bytes; the initial value of every transport
         self._wire: Transport
 
     def attach(self, wire: Transport) -> None:
-        """Name the transport that carries the bytes (called when the port has been opened)."""
+        """Set the transport (called when the port is open)."""
         self._wire = wire
 
-    def expect(self, n_frames: int, size: int = 1, *, begun: int = 0) -> None:
-        """Wake only when so many frames of ``size`` bytes are there, instead of at every byte.
+    def expect(self, n_frames: int, size: int = 1, *, n_pending: int = 0) -> None:
+        """Make :meth:`read` wait for ``n_frames`` frames of ``size`` bytes instead of one byte.
 
-        ``begun`` bytes of the first came already: without them each wake would be amid a frame,
-        long after the last whole one came. To be said again when that changes.
+        ``n_pending`` bytes of the first frame have already been read. Without this number, reads
+        would end within a frame, long after the arrival of the last complete one. Call again
+        whenever it changes.
 
-        The kernel does the waiting, so that the time at which the last byte came is no less exact.
-        A serial port counts to 255 bytes at the most, which are then fewer frames. A hang-up is
-        still seen at once.
+        The kernel waits, so arrival times stay exact. A serial port waits for at most 255 bytes,
+        which may be fewer frames. A hang-up ends the wait immediately.
         """
         most = max(1, self._wire.most_expected // size)
-        n_bytes = max(1, min(n_frames, most) * size - begun)
+        n_bytes = max(1, min(n_frames, most) * size - n_pending)
         if n_bytes != self._expected:
             self._expected = n_bytes
             self._wire.expect(n_bytes)
 
     async def read(self) -> tuple[bytes, HostTime]:
-        """Return all that has come, at least one byte, and when the last of it came.
+        """Return all received bytes, at least one, and the arrival of the last.
 
         Raises
         ------
         NotConnectedError
-            The port closed by itself; everything received before has been returned.
+            If the port closed by itself, after all received bytes have been returned.
         """
         while not self._size:
             if self._failure is not None:
@@ -112,7 +112,7 @@ class ByteStream:
         Raises
         ------
         NotConnectedError
-            The port is gone.
+            If the port is closed.
         """
         if self._failure is None:
             try:
@@ -123,13 +123,13 @@ class ByteStream:
             raise NotConnectedError(f"{self.label}: {self._failure}")
 
     def discard(self) -> int:
-        """Forget what has come and was not read; return how many bytes that was."""
+        """Discard unread bytes; return their number."""
         size, self._size = self._size, 0
         self._chunks.clear()
         return size
 
     def feed(self, received: bytes, at: HostTime | None = None) -> None:
-        """Take received bytes (called by the wire)."""
+        """Add received bytes (called by the transport)."""
         self._at = at or self._clock.now()
         self._chunks.append(received)
         self._size += len(received)
@@ -139,7 +139,7 @@ class ByteStream:
         self._wake()
 
     def lost(self, reason: str) -> None:
-        """Note that the port is gone (called by the wire)."""
+        """End the stream after a failure of the port (called by the transport)."""
         if self._failure is None:
             self._failure = f"the port closed ({reason}); check cable and power"
         self._wake()

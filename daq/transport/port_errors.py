@@ -1,4 +1,4 @@
-"""Why a port failed, in words, with what to do about it."""
+"""Messages for failures of ports: cause and remedy."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _REASONS = {
     errno.EPERM: "no permission; add yourself to the group that owns the port (dialout, usually)",
     errno.EBUSY: "busy: another program has it open",
     errno.EAGAIN: "busy: another program has it open",
-    errno.ECONNREFUSED: "nothing listens there; is the device on, and is the port number right?",
+    errno.ECONNREFUSED: "connection refused; check that the device is on, and the port number",
     errno.ECONNRESET: "the other end reset the connection",
     errno.EPIPE: "the other end closed the connection",
     errno.EHOSTUNREACH: "the host cannot be reached",
-    errno.ENETUNREACH: "the network cannot be reached",
+    errno.ENETUNREACH: "the network is unreachable",
     errno.EIO: "hang-up",
     errno.ENXIO: "hang-up",
     errno.ENOTTY: "not a serial port",
@@ -24,7 +24,7 @@ _REASONS = {
 
 
 def why(error: BaseException) -> str:
-    """Return why a port failed, and what to do."""
+    """Return cause and remedy of a port's failure."""
     if isinstance(error, socket.gaierror):
         return f"unknown host ({error.strerror})"
     number = getattr(error, "errno", None)

@@ -2,17 +2,17 @@
 
 Theory of operation
 -------------------
-A port is named as pyserial names it: ``/dev/ttyUSB0``, ``COM3``, ``socket://host:port``,
-``rfc2217://host:port``. Whatever the kind, the driver sees one :class:`ByteStream`, which hands
-over what has come together with the host time at which the last of it came. Times are taken where
-the bytes are, not where the driver gets round to them: in the event loop's own callback for ports
-with a file descriptor and for TCP, and in the reading thread for ports without one (``rfc2217://``,
-Windows).
+Names of ports are those of pyserial: ``/dev/ttyUSB0``, ``COM3``, ``socket://host:port``,
+``rfc2217://host:port``. For every kind of port the driver gets one :class:`ByteStream`, which
+returns received bytes together with the host time at which the last byte arrived. This time is
+taken when the bytes are read from the port, not when the driver requests them: in the event loop's
+callback for TCP and ports with a file descriptor, and in the reading thread for other ports
+(``rfc2217://``, Windows).
 
-A port that closes by itself reads as ``b""`` or fails with ``EIO``; either ends the stream with
-``NotConnectedError`` once everything received before has been handed over. A driver that does not
-keep up stops the reading (``HIGH_WATER``), and the loss then happens where it can be seen: in the
-device's counter.
+A port that closes by itself reads as ``b""`` or fails with ``EIO``. Either ends the stream with
+``NotConnectedError`` after all received bytes have been returned. If a driver reads too slowly, the
+stream stops reading the port (``HIGH_WATER``); samples are then lost in the device, where its
+counter shows the loss.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ async def open_port(
     ----------
     port
         Device path, ``COMn``, ``socket://host:port``, ``rfc2217://host:port`` or
-        ``hwgrep://pattern``. Serial ports are opened 8 data bits, exclusively; on FTDI adapters
-        the latency timer (16 ms as delivered) is set to its least.
+        ``hwgrep://pattern``. Serial ports are opened exclusively, with 8 data bits. The latency
+        timer of FTDI adapters (16 ms by default) is set to its minimum.
     label
-        Begins every error message; names sensor and port.
+        Start of every error message, with sensor and port.
     parity, stop_bits
         As in pyserial: ``"N"``, ``"E"``, ``"O"``; 1, 1.5, 2.
 
     Raises
     ------
     NotConnectedError
-        The port cannot be opened; the message says why and what to do.
+        If the port cannot be opened; the message has the cause and the remedy.
     """
     stream = ByteStream(label or f"port {port}", clock)
     try:

@@ -1,8 +1,8 @@
-"""The serial ports of this computer, and which adapter each of them is.
+"""The serial ports of this computer, and the identities of their adapters.
 
-The system numbers ports as it finds them: an adapter that was ``/dev/ttyUSB0`` can come back as
-``/dev/ttyUSB1``. Its identity stays: vendor, product, and its serial number, or where it has none
-the USB socket that it is plugged into.
+The system numbers ports in the order of their detection: an adapter at ``/dev/ttyUSB0`` can
+reappear as ``/dev/ttyUSB1``. Its identity is constant: vendor, product, and serial number, or the
+USB socket if it has no serial number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class SerialPort:
 
     path: str
     identity: str
-    """Of the adapter; empty where it has none, as ports on the mainboard."""
+    """Identity of the adapter; empty for ports without one, such as those on the mainboard."""
 
 
 def serial_ports() -> tuple[SerialPort, ...]:
@@ -39,9 +39,9 @@ def _identity(vendor: int | None, product: int | None, which: str | None) -> str
 
 
 def stable_path(port: str, folder: Path = BY_ID) -> str:
-    """Return the name of a port that stays the same, such as ``/dev/serial/by-id/…``.
+    """Return the constant name of a port, such as ``/dev/serial/by-id/…``.
 
-    The port itself if it is a network address, or if the system keeps no such name of it.
+    Return the port itself if it is a network address or has no such name.
     """
     if "://" in port or not folder.is_dir():
         return port

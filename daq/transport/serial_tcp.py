@@ -1,4 +1,4 @@
-"""Serial ports and TCP connections, each of which feeds a ``ByteStream``."""
+"""Transports for serial ports and TCP connections."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 READ_SIZE, READS = 65536, 64
 CONNECT_TIMEOUT = 5.0
 _CLOSE_TIMEOUT = 1.0
-_POLL = 0.1  # how long a reading thread may take to see that it should end, s
+_POLL = 0.1  # interval at which a reading thread tests whether to end, s
 
 
 class _TcpWire(asyncio.Protocol):
@@ -56,7 +56,7 @@ class _TcpWire(asyncio.Protocol):
 
     def expect(self, n_bytes: int) -> None:
         connection = self._transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):  # gone: the next read says so
+        with contextlib.suppress(OSError):  # port closed: the next read reports it
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, n_bytes)
 
     def pause(self) -> None:
@@ -70,13 +70,13 @@ class _TcpWire(asyncio.Protocol):
         try:
             async with asyncio.timeout(_CLOSE_TIMEOUT):
                 await asyncio.shield(self._closed)
-        except TimeoutError:  # the other end does not take what is still to be sent
+        except TimeoutError:  # the other end does not read the remaining bytes
             self._transport.abort()
             await self._closed
 
 
 async def open_tcp(host: str, number: int, stream: ByteStream) -> Transport:
-    """Connect; raises OSError."""
+    """Connect; raise OSError on failure."""
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(CONNECT_TIMEOUT):
@@ -88,7 +88,7 @@ async def open_tcp(host: str, number: int, stream: ByteStream) -> Transport:
 
 
 class _DescriptorWire:
-    """Reads when the event loop says so; no thread, no polling."""
+    """A port with a file descriptor, read by the event loop without thread or polling."""
 
     most_expected = 255
 
@@ -98,11 +98,11 @@ class _DescriptorWire:
         self._stream = stream
         self._loop = asyncio.get_running_loop()
         self._exclude_others(termios.TIOCEXCL)
-        self.expect(1)  # pyserial leaves 0, with which nothing there would read as a hang-up
+        self.expect(1)  # with pyserial's 0, an empty buffer would read as a hang-up
         self.resume()
 
     def _readable(self) -> None:
-        # a terminal gives what it holds in pieces; what is left would wait for as much again
+        # A terminal returns its bytes in pieces; a rest would wait for another ``expect``.
         pieces: list[bytes] = []
         ended = ""
         try:
@@ -137,7 +137,7 @@ class _DescriptorWire:
                     self._loop.remove_writer(self._descriptor)
 
     def expect(self, n_bytes: int) -> None:
-        with contextlib.suppress(termios.error):  # gone: the next read says so
+        with contextlib.suppress(termios.error):  # port closed: the next read reports it
             attributes = termios.tcgetattr(self._descriptor)
             attributes[6][termios.VMIN] = min(n_bytes, self.most_expected)
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
@@ -154,8 +154,8 @@ class _DescriptorWire:
         self._port.close()
 
     def _exclude_others(self, request: int) -> None:
-        """Let the kernel refuse others: the lock that pyserial takes is heeded by few programs."""
-        with contextlib.suppress(OSError):  # gone
+        """Make the kernel refuse other programs: few programs respect pyserial's lock."""
+        with contextlib.suppress(OSError):  # port closed
             fcntl.ioctl(self._descriptor, request)
 
 
@@ -165,7 +165,7 @@ def _settle(future: asyncio.Future[None]) -> None:
 
 
 class _ThreadWire:
-    """A thread reads; the event loop is told."""
+    """A port without file descriptor, read by a thread."""
 
     most_expected = READ_SIZE
 
@@ -194,7 +194,7 @@ class _ThreadWire:
                     self._loop.call_soon_threadsafe(self._stream.lost, why(error))
                 return
             received += piece
-            # one that only timed out says nothing of when the last byte came
+            # after a timeout the arrival of the last byte is not known
             if received and (len(piece) >= wanted or not piece):
                 self._loop.call_soon_threadsafe(self._stream.feed, received, self._clock.now())
                 received = b""
@@ -226,7 +226,7 @@ async def open_serial(
     parity: str,
     stop_bits: float,
 ) -> Transport:
-    """Open anything pyserial opens; raises OSError or ValueError."""
+    """Open a port by pyserial; raise OSError or ValueError on failure."""
 
     def opened() -> serial.SerialBase:
         return serial.serial_for_url(
@@ -238,18 +238,18 @@ async def open_serial(
             exclusive=None if "://" in port else True,
         )
 
-    # rfc2217 negotiates for seconds, a local port opens at once
+    # rfc2217 negotiates for seconds; a local port opens immediately
     device = await asyncio.to_thread(opened) if "://" in port else opened()
     if os.name == "posix" and isinstance(device, serial.Serial):
         _set_low_latency(device)
         return _DescriptorWire(device, stream)
-    # every kind of port has what serial.Serial has; the stubs' common base does not say so
+    # every kind of port has the members of serial.Serial, unlike the stubs' common base
     return _ThreadWire(cast("serial.Serial", device), stream, clock)
 
 
 def _set_low_latency(device: serial.Serial) -> None:
-    """Shorten the latency timer where there is one: only FTDI adapters show this file."""
+    """Minimise the latency timer, if there is one: only FTDI adapters have this file."""
     name = Path(os.path.realpath(device.name or "")).name
     if Path(f"/sys/class/tty/{name}/device/latency_timer").exists():
-        with contextlib.suppress(OSError, ValueError):  # not ours to change: the timer stays
+        with contextlib.suppress(OSError, ValueError):  # no permission: the timer is unchanged
             device.set_low_latency_mode(True)

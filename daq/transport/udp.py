@@ -1,7 +1,7 @@
-"""UDP ports: whole datagrams with the host times at which they came.
+"""UDP ports: datagrams with the host times of their arrival.
 
-The counterpart of :mod:`daq.transport.ports` for devices that send packets: ``udp://host:port`` is
-the address to listen at, or that of a server to ask, as the driver knows.
+This is the counterpart of :mod:`daq.transport.ports` for devices that send packets. Depending on
+the driver, ``udp://host:port`` is the address to listen on or that of a server.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from daq.host_clock import HostClock
     from daq.protocols.block import HostTime
 
-MOST_WAITING = 8192
-"""Datagrams received and not yet asked for; the oldest are dropped beyond."""
+MAX_UNREAD = 8192
+"""Maximum number of unread datagrams; beyond, the oldest are dropped."""
 
 _MOST_STRANGERS = 16
 
@@ -32,12 +32,12 @@ class DatagramStream(asyncio.DatagramProtocol):
     def __init__(self, label: str, clock: HostClock) -> None:
         self.label = label
         self._clock = clock
-        self._waiting: deque[tuple[bytes, HostTime]] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[tuple[bytes, HostTime]] = deque(maxlen=MAX_UNREAD)
         self._arrived = asyncio.Event()
         self._failure: Exception | None = None
         self._sender: str | None = None
         self.strangers: set[str] = set()
-        """Hosts other than the first whose datagrams were left out."""
+        """Hosts other than the first; their datagrams are ignored."""
         self._transport: asyncio.DatagramTransport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -45,7 +45,7 @@ class DatagramStream(asyncio.DatagramProtocol):
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Keep a datagram and when it came; two hosts would make one sensor of two devices."""
+        """Store a datagram and its arrival; ignore hosts other than the first."""
         self._sender = self._sender or addr[0]
         if addr[0] != self._sender:
             if len(self.strangers) < _MOST_STRANGERS:
@@ -55,30 +55,30 @@ class DatagramStream(asyncio.DatagramProtocol):
         self._arrived.set()
 
     def error_received(self, exc: Exception) -> None:
-        """Note that nothing listens at the other end."""
+        """Store the failure: the other end refuses datagrams."""
         self._failure = exc
         self._arrived.set()
 
     async def read(self) -> tuple[bytes, HostTime]:
-        """Return the next datagram and when it came.
+        """Return the next datagram and its arrival.
 
         Raises
         ------
         NotConnectedError
-            The other end refuses datagrams.
+            If the other end refuses datagrams.
         """
         while not self._waiting:
             if self._failure is not None:
                 raise NotConnectedError(
-                    f"{self.label}: nothing listens there ({self._failure});"
-                    " is the server on, and is the port number right?"
+                    f"{self.label}: datagrams refused ({self._failure});"
+                    " check that the server is on, and the port number"
                 )
             self._arrived.clear()
             await self._arrived.wait()
         return self._waiting.popleft()
 
     def discard(self) -> None:
-        """Forget what has come and was not read."""
+        """Discard unread datagrams."""
         self._waiting.clear()
 
     def send(self, payload: bytes) -> None:
@@ -96,16 +96,16 @@ async def open_datagrams(
     Parameters
     ----------
     address
-        ``udp://host:port``: where to listen (``0.0.0.0`` for any interface), or a server.
+        ``udp://host:port``: an address to listen on (``0.0.0.0`` for any interface), or a server.
     listen
-        Which of the two.
+        Whether to listen on the address instead of connecting to it.
     label
-        Begins every error message; names sensor and port.
+        Start of every error message, with sensor and port.
 
     Raises
     ------
     NotConnectedError
-        The address cannot be listened at or reached.
+        If listening or connecting fails.
     """
     try:
         where = host_and_port(address)

@@ -1,5 +1,5 @@
-"""Looks at a bench before a test: which devices answer, and what their latest samples show.
+"""Checks of a bench before a test: replies of devices, and their latest samples.
 
-Reads devices and writes nothing. What runs during a recording is in `daq.acquisition`, which does
-not import this package.
+Reads devices and writes nothing. `daq.acquisition` has the code that runs during a recording; it
+does not import this package.
 """

@@ -1,4 +1,4 @@
-"""Checks devices for ``huddle check``: their identity, and a second of their samples."""
+"""Checks of devices for ``huddle check``: identity, and one second of samples."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MIN_SAMPLES = 4
 TEXT_BAUD_RATES = (115200, 9600, 57600, 38400, 19200, 230400)
 TEXT_ROWS, LISTEN, LISTEN_ON = 12, 1.0, 2.5
-"""Rows of text to guess a format from; seconds to listen for one, and for the next one."""
+"""Rows of text to guess a format from; seconds to listen for the first row, and for later ones."""
 MODBUS_BAUD_RATES = (9600, 115200, 19200, 38400, 57600)
 MODBUS_DEVICES = (1, 2, 3, 4, 5, 0x50)
 
@@ -48,7 +48,7 @@ class ChannelCheck:
     unit: str
     mean: float
     rms: float
-    """About the mean."""
+    """Standard deviation about the mean."""
     minimum: float
     maximum: float
     is_stuck: bool
@@ -57,7 +57,7 @@ class ChannelCheck:
 
 @dataclass(frozen=True, slots=True)
 class SensorCheck:
-    """What a sensor reports about itself, and statistics of some of its samples.
+    """Information that a sensor reports, and statistics of some of its samples.
 
     Attributes
     ----------
@@ -72,11 +72,11 @@ class SensorCheck:
     channels
         In the order of the bench file.
     events : tuple of Event
-        Reported by the device or its protocol in the meantime.
+        Events of the device or its protocol during the check.
     jitter : float or None
-        Of polled sensors: standard deviation of the sample times about an even grid, in s.
+        Standard deviation of the sample times about an even grid, in s; polled sensors only.
     bandwidth : float or None
-        Of polled sensors: half the reciprocal of the longest sampling interval, in Hz.
+        Half the reciprocal of the longest sampling interval, in Hz; polled sensors only.
     """
 
     information: DeviceInformation
@@ -91,10 +91,10 @@ class SensorCheck:
 
     @property
     def signal_to_noise_db(self) -> float | None:
-        """SNR of a sine at the edge of the bandwidth if its samples are taken to be evenly spaced.
+        """SNR of a sine at the edge of the bandwidth, if its samples are assumed evenly spaced.
 
         Power of the sine over power of the error, −20 log10(2π f σ) in dB. Estimates use the
-        recorded sample times and do better.
+        recorded sample times and are more accurate.
         """
         if self.jitter is None or self.bandwidth is None or self.jitter <= 0:
             return None
@@ -111,7 +111,7 @@ async def probe(
     sensors
         All sensors of one port.
     duration
-        Length of the samples to read of each sensor, in seconds of its nominal rate.
+        Duration of the samples to read from each sensor, in s at its nominal rate.
 
     Raises
     ------
@@ -138,7 +138,7 @@ async def _probe(
         errors = list(_identity_errors(sensors, information))
         awaited = {name: n for name, n in wanted.items() if not information[name].trouble}
         async with contextlib.aclosing(
-            cast("AsyncGenerator[Block | Event]", session.read())  # others have nothing to close
+            cast("AsyncGenerator[Block | Event]", session.read())  # other iterators need no closing
         ) as stream:
             try:
                 async with asyncio.timeout(patience + 3 * longest):
@@ -174,7 +174,7 @@ async def _probe(
 def _identity_errors(
     sensors: Sequence[Sensor], information: Mapping[str, DeviceInformation]
 ) -> Iterator[DeviceError]:
-    """Yield an error for each device that does not answer, or is not the expected one."""
+    """Yield an error for each device that does not reply, or is not the expected one."""
     for sensor in sensors:
         found = information[sensor.name]
         if found.trouble:
@@ -211,7 +211,7 @@ async def probe_bench(
 
 @dataclass(frozen=True, slots=True)
 class DiscoveredDevice:
-    """A device on a port: the driver and settings it needs, and what it reports about itself."""
+    """A device on a port: required driver and settings, and the information it reports."""
 
     driver: str
     port: str
@@ -229,12 +229,12 @@ async def discover(
 ) -> list[DiscoveredDevice]:
     """Look for text, Epson accelerometers and Modbus devices on a port.
 
-    Text is listened for first, for it needs no question.
+    Text is tested first, because it needs no request.
 
     Parameters
     ----------
     baud_rates, device_ids
-        To try for Modbus devices. Any answer shows a device, also a refusal.
+        Values to try for Modbus devices. Any reply, even a refusal, proves a device.
 
     Raises
     ------
@@ -262,7 +262,7 @@ async def discover(
 
 
 async def _text_rows(port: str, clock: HostClock, baud_rate: int) -> list[bytes]:
-    """Return whole lines that come by themselves, the first one not among them."""
+    """Return complete lines that the device sends by itself, without the first line."""
     finder = MessageFinder(b"\n")
     rows: list[bytes] = []
     loop = asyncio.get_running_loop()
@@ -273,13 +273,13 @@ async def _text_rows(port: str, clock: HostClock, baud_rate: int) -> list[bytes]
                 async with asyncio.timeout_at(deadline):
                     received, _ = await stream.read()
                 rows += finder.receive(received)
-                if rows and rows[-1].isascii():  # a slow device: its next rows are worth the wait
+                if rows and rows[-1].isascii():  # a slow device: wait longer for its next rows
                     deadline = max(deadline, loop.time() + LISTEN_ON)
     return rows[1:]
 
 
 def search_description(port: str) -> str:
-    """Return in words what `discover` looks for by default."""
+    """Return a description of the devices that `discover` looks for by default."""
     devices = "Modbus device " + ", ".join(map(str, MODBUS_DEVICES))
     if port.startswith(TCP):
         return devices
@@ -310,9 +310,9 @@ async def _modbus_devices(
             try:
                 await bus.read(3, device_id, 0, 1)
             except RefusedError as refused:
-                if refused.code in {10, 11}:  # a gateway answers in place of an absent device
+                if refused.code in {10, 11}:  # a gateway replies for an absent device
                     continue
-                remark = "answers, and has no register 0"
+                remark = "replies, but has no register 0"
             except NoAnswerError:
                 continue
             except NotConnectedError:

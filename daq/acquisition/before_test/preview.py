@@ -1,6 +1,6 @@
-"""Reads the sensors of a bench before a test: their latest samples, and why a port fails.
+"""Preview of the sensors of a bench before a test: latest samples, and failures of ports.
 
-Nothing is recorded. A port that fails is tried again. The recorder opens the ports itself: end the
+Nothing is recorded. A port that fails is opened again. The recorder opens the ports itself: end the
 preview before a test starts.
 """
 
@@ -49,11 +49,11 @@ class SensorPreview:
     sensor : Sensor
         As in the bench file.
     information : DeviceInformation or None
-        As reported by the device; None before it has answered.
+        As reported by the device; None before its first reply.
     samples : float64, shape (n_samples, n_channels)
         The latest samples in the units of the channels.
     last_ns : int
-        Host monotonic time of the last one.
+        Host monotonic time of the last sample, in ns.
     measured_rate : float or None
         Samples per second by the host's clock; None while it is not known.
     rate_error : float
@@ -63,9 +63,9 @@ class SensorPreview:
     is_clipping : bool
         Whether a sample reached the end of the range.
     n_missing : int
-        Samples missing between those that are kept.
+        Samples missing between the kept ones.
     trouble : str
-        Why the sensor does not deliver, or is not the one that the bench file names.
+        Why the sensor does not deliver, or is not the one in the bench file; empty if it is.
     """
 
     sensor: Sensor
@@ -130,7 +130,7 @@ async def preview(
     ended: threading.Event,
     interval: float = INTERVAL,
 ) -> None:
-    """Read all sensors until `ended` is set, and show them again and again.
+    """Read all sensors until `ended` is set, and show them periodically.
 
     Parameters
     ----------

@@ -103,7 +103,9 @@ class EpsonSession:
         ask_after = None if configuration.is_triggered else ASK_AFTER
         n_frames = round(GATHER * configuration.sampling_rate)
         while True:
-            self._stream.expect(n_frames, configuration.burst.size, begun=self.decoder.n_pending)
+            self._stream.expect(
+                n_frames, configuration.burst.size, n_pending=self.decoder.n_pending
+            )
             try:
                 async with asyncio.timeout(ask_after):
                     received, at = await self._stream.read()

@@ -601,7 +601,7 @@ def test_a_recording_that_the_disk_refuses_goes_on_in_another_file(tmp_path: Pat
         assert second.closed
         assert second.continues == first.run_id
         texts = [event.text for event in second.events]
-        assert "continues r.h5, which could not be written any more" in texts
+        assert "continues r.h5, which could no longer be written" in texts
         for name in "abc":
             one, two = first.sensor(name), second.sensor(name)
             assert two.blocks["first_sample"][0] == 0

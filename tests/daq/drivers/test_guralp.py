@@ -147,7 +147,7 @@ def test_a_rate_that_gcf_has_no_code_for_is_named() -> None:
 
 async def test_nothing_listens() -> None:
     gone = device_at("udp://127.0.0.1:9", "D", "guralp")
-    with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: nothing listens"):
+    with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: datagrams refused"):
         await record(sensors(gone, TABLES[3])[0], 1)
 
 

@@ -310,7 +310,7 @@ async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
             BenchFileError,
             "AIN0 is already an input of sensor 'A'",
         ),
-        ({"settings": {"stream_port": 1}}, {}, NotConnectedError, "nothing listens there"),
+        ({"settings": {"stream_port": 1}}, {}, NotConnectedError, "connection refused"),
         ({"sampling_rate": 20_000.0}, {}, DeviceError, "the stream keeps ending: scan overlap"),
         (
             {"settings": {"trigger_index": 1 << 31}},

@@ -204,7 +204,7 @@ async def test_what_came_of_a_frame_already_is_not_waited_for_again() -> None:
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         await stream.write(b"?")
         await far.arrived(1)
-        stream.expect(2, 100, begun=30)
+        stream.expect(2, 100, n_pending=30)
         reading = asyncio.create_task(stream.read())
         far.send(bytes(169))
         done, _ = await asyncio.wait([reading], timeout=0.05)
@@ -282,7 +282,7 @@ async def test_a_busy_port_is_named() -> None:
     [
         ("/dev/ttyNotThere", "port does not exist; serial ports of this computer: "),
         ("/dev/null", "not a serial port|Inappropriate ioctl"),
-        ("socket://127.0.0.1:1", "nothing listens there"),
+        ("socket://127.0.0.1:1", "connection refused"),
         ("socket://127.0.0.1", "expected socket://host:port"),
         ("nonsense://x", "nonsense"),
     ],

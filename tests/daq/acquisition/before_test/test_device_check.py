@@ -140,7 +140,7 @@ async def test_what_is_on_a_port(running: tuple[RunningDevice, ...]) -> None:
     assert accelerometer.information.model == "A352AD10"
     (slave,) = await discover(running[1].port, CLOCK, baud_rates=[9600], device_ids=[7, 0x50])
     assert (slave.driver, slave.settings) == ("registers", {"device_id": 0x50, "baud_rate": 9600})
-    assert slave.remark == "answers, and has no register 0"
+    assert slave.remark == "replies, but has no register 0"
     with pytest.raises(NotConnectedError, match="port does not exist"):
         await discover("/dev/ttyNotThere", CLOCK)
 
