@@ -1,4 +1,4 @@
-"""Every sensor of a recording on one grid in physical units.
+"""Aligns all sensors of a recording on one grid, in physical units.
 
-Raw counts on disk are never touched. Knows no spectra.
+Does not change raw counts on disk, and computes no spectra for results.
 """

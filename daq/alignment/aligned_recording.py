@@ -2,14 +2,14 @@
 
 Theory of operation
 -------------------
-Within an *epoch* of its clock the samples of a sensor are counted without error; the clock gives
-the time of each (:mod:`daq.timing.clock_model`). The grid has one rate and begins when the last
-sensor has begun. Samples on the grid (sensors of one clock, recordings with exact times) are
-copied; others are interpolated (:mod:`daq.alignment.resampling`).
+Within an *epoch* of its clock the sample indices of a sensor are exact; the clock gives the time of
+each sample (:mod:`daq.timing.clock_model`). The grid has one rate and begins when the last sensor
+begins. Samples on the grid (sensors of one clock, recordings with exact times) are copied; others
+are interpolated (:mod:`daq.alignment.resampling`).
 
-A grid instant is valid if every sensor has all samples for it; gaps are never filled. Spans are
-filtered as a whole, counted from the start of the grid, so the result does not depend on how reads
-are divided. Memory is that of the requested span.
+A grid instant is valid if every sensor has all samples for it; gaps are never filled. Spans have
+fixed positions on the grid and are filtered as a whole, so the result does not depend on the limits
+of reads. Memory is proportional to the requested span.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
 
-_GROWTH = 0.02  # share by which a recording grows before its clocks are set anew
-_FIRST_GROWTH = 0.25  # the same of a short one, in which that would be
-_ENOUGH = 10.0  # seconds at most: the clock's filter takes one observation in as long
-_LATEST = 5.0  # seconds that a device with UTC may take to send what it has
+_GROWTH = 0.02  # fraction by which a recording grows before its clocks are set again
+_FIRST_GROWTH = 0.25  # the same for a short recording, up to
+_ENOUGH = 10.0  # this time in s: the clock's filter takes one observation per 10 s
+_LATEST = 5.0  # maximum delay in s of the blocks of a device with UTC
 
 
 class AlignedRecording:
-    """The sensors of a recording on one grid, as long as the recording is, or as it grows.
+    """The sensors of a recording, complete or growing, on one grid.
 
     Parameters
     ----------
     recording : ReadableRecording
-        Open; may still be growing.
+        Open; may be growing.
     sampling_rate : float, optional
-        Of the grid, in Hz; the lowest of the sensors' where not given.
+        Sampling rate of the grid in Hz; default: the lowest rate of the sensors.
     start_utc_ns, end_utc_ns : int, optional
-        Only what lies between.
-    at_face_value : bool
-        Take every clock to keep its nominal rate from the sample on that arrived first.
+        Limits of the grid, UTC in ns since 1970.
+    nominal_clocks : bool
+        Whether to assume that every clock has its nominal rate, from the first sample to arrive.
 
     Raises
     ------
@@ -100,12 +100,12 @@ class AlignedRecording:
 
     @property
     def clocks(self) -> tuple[ClockState, ...]:
-        """What is known about each sensor's clock, in the order of the sensors."""
+        """State of each sensor's clock, in the order of the sensors."""
         return tuple(source.clock.state for source in self._sources if source.clock)
 
     @property
     def is_reference(self) -> tuple[bool, ...]:
-        """Which sensors run by the clock that the others are measured against."""
+        """Whether each sensor has the reference clock."""
         if not self._sources:
             return ()
         name = self._sources[self._reference].clock_name
@@ -113,7 +113,7 @@ class AlignedRecording:
 
     @property
     def longest_stretches(self) -> dict[str, float]:
-        """Longest time in seconds without a gap, by name of the sensor."""
+        """Longest time without a gap in s, by name of the sensor."""
         return {
             source.record.name: max(run.n_samples for run in source.runs)
             / source.record.sampling_rate
@@ -122,7 +122,7 @@ class AlignedRecording:
 
     @property
     def n_available(self) -> int:
-        """Grid samples that can be read now."""
+        """Number of grid samples available now."""
         grid = self._grid
         if grid is None:
             return 0
@@ -135,16 +135,16 @@ class AlignedRecording:
 
     @property
     def is_exact(self) -> bool:
-        """Whether every sensor's samples fall on the grid, so that no clock had to be estimated."""
+        """Whether every sensor's samples are on the grid, so that no clock was estimated."""
         return self._untouched and not any(source.offset_in_doubt for source in self._sources)
 
     @property
     def usable(self) -> float:
-        """Frequency in Hz up to which samples on the grid are what sensors read."""
+        """Frequency in Hz up to which interpolation preserves the samples."""
         return (0.5 if self._untouched else USABLE) * self.sampling_rate
 
     def delays(self, at: FloatArray) -> FloatArray:
-        """Return how far each sensor's count of time lags the grid, by the clocks as known now.
+        """Return the delay of each sensor's sample index against the grid, by the current clocks.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class AlignedRecording:
         Returns
         -------
         float64, shape (n, n_sensors)
-            In seconds; only differences mean anything.
+            In s; only differences are meaningful.
         """
         seconds = self._start + at / self.sampling_rate
         columns = [
@@ -165,10 +165,10 @@ class AlignedRecording:
 
     @property
     def measurable(self) -> tuple[int, ...]:
-        """Sensors whose delay the samples could tell: the best reference, and one of each clock.
+        """Indices of sensors with measurable delays: the best reference, and one per other clock.
 
-        And those that share a clock, where it is in doubt how many samples apart they began.
-        Empty where no clock has to be estimated. Sensors are numbered in order.
+        Also the sensors that share a clock, if the number of samples between their starts is in
+        doubt. Empty if no clock must be estimated.
         """
         if self.is_exact:
             return ()
@@ -185,17 +185,17 @@ class AlignedRecording:
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FloatArray
     ) -> None:
-        """Take delays that have been measured from what was read.
+        """Add delays measured from the samples.
 
         Parameters
         ----------
         at : float64, shape (n,)
             Grid positions in samples, increasing from call to call.
         delays, std : float64, shape (n, n_measurable)
-            By how much each sensor that is `measurable` lags the one whose standard deviation is
-            zero, in seconds; an infinite one where that is not known.
+            Delay of each `measurable` sensor against the sensor with standard deviation zero, and
+            its standard deviation, in s; an infinite standard deviation means unknown.
         frame_delays : float64, shape (n_measurable,)
-            What is to be added to all delays since `forget`, in seconds.
+            Correction of all delays since `reset_delays`, in s.
         """
         if len(at) == 0:
             return
@@ -212,13 +212,13 @@ class AlignedRecording:
                 DelayMeasurement(index, at_reference, delays[:, column], std[:, column])
             )
 
-    def forget(self) -> None:
-        """Drop what was learnt; the clocks stay as they are until they are set again."""
+    def reset_delays(self) -> None:
+        """Drop all measured delays; the clocks do not change until they are set again."""
         for source in self._sources:
             source.learnt.clear()
 
     def set_clocks(self) -> None:
-        """Set every clock by all that is known now."""
+        """Set every clock from all current data."""
         sources = self._sources
         self._place_stated()
         if self._at_face_value:
@@ -261,15 +261,16 @@ class AlignedRecording:
                 )
             else:
                 clock = source.arrivals.solve(source.record.name, measured)
-                if clock.state.refined:  # against the reference, whose rate is not certain either
+                if clock.state.refined:  # relative to the reference, whose rate is also uncertain
                     clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
                 source.clock = clock
 
     def _place_stated(self) -> None:
-        """Move stated UTC to where it arrives, if the host's UTC, which others have, is wrong.
+        """Shift devices' UTC to arrival times, if the host's UTC, used by other sensors, is wrong.
 
-        It is where no device's blocks arrive when they can. A block of all channels is there when
-        the slowest channel's is: where these are out of step, up to twice as long after its end.
+        The host's UTC is wrong if no device's blocks arrive at possible times. A block of all
+        channels arrives with its slowest channel: if channels are not synchronised, up to twice its
+        duration after its end.
         """
         stated = [source.arrivals for source in self._sources if source.device_utc]
         if 0 < len(stated) < len(self._sources):
@@ -278,7 +279,7 @@ class AlignedRecording:
                 each.moved = min(other.latency for other in stated) if wrong else 0.0
 
     def refresh(self) -> None:
-        """Take what has been committed since, and set every clock by it."""
+        """Read newly committed blocks, and set every clock."""
         self._recording.refresh()
         if not self._sources:
             if any(record.n_samples == 0 for record in self._records):
@@ -310,17 +311,17 @@ class AlignedRecording:
         samples : float64, shape (stop - start, n_channels)
             In physical units. Arbitrary where not valid.
         valid : bool, shape (stop - start,)
-            False where any sensor has a gap.
+            False if any sensor has a gap.
 
         Raises
         ------
         CannotAlignError
-            If the samples are not available (yet).
+            If the samples are not available yet.
         """
         grid = self._grid
         if grid is None or not 0 <= start <= stop <= self.n_available:
             raise CannotAlignError(
-                f"{self._recording.path}: grid samples {start} to {stop} asked for,"
+                f"{self._recording.path}: grid samples {start} to {stop} requested;"
                 f" {self.n_available} available"
             )
         samples = np.zeros((stop - start, len(self.channels)))
@@ -334,12 +335,12 @@ class AlignedRecording:
 
     @property
     def _reference(self) -> int:
-        """The sensor others are measured against."""
+        """Return the index of the reference sensor."""
         return self._preferred if self._measured_against is None else self._measured_against
 
     @property
     def _preferred(self) -> int:
-        """The sensor others are best measured against: one with its own UTC, else the first."""
+        """Return the index of the best reference: a sensor with its own UTC, else the first."""
         for number, source in enumerate(self._sources):
             if source.device_utc:
                 return number
@@ -347,17 +348,17 @@ class AlignedRecording:
 
     @property
     def _untouched(self) -> bool:
-        """Whether all samples fall on the grid, as far as there is one."""
+        """Return whether all samples are on the grid."""
         grid = self._grid
         return grid is None or all(map(grid.has, self._sources))
 
     @property
     def _start(self) -> float:
-        """Seconds from the recording's creation to grid sample 0."""
+        """Return the time from the recording's creation to grid sample 0, in s."""
         return 0.0 if self._grid is None else self._grid.start
 
     def _laid(self) -> Grid:
-        """Lay the grid from where all sensors have begun, and note where it is to end."""
+        """Return the grid from the start of all sensors on, and set its end."""
         start_utc_ns, end_utc_ns = self._wanted
         start = max(source.known_clock.start for source in self._sources)
         grid = Grid(self.sampling_rate, start)
@@ -384,6 +385,6 @@ def _grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:
         listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
         raise CannotAlignError(
             f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
-            f" ask for {lowest:g} Hz or less"
+            f" expected at most {lowest:g} Hz"
         )
     return wanted

@@ -1,24 +1,24 @@
-"""Delays between sensors from the motion they share, segment by segment.
+"""Delays between sensors from their common motion, segment by segment.
 
 Theory of operation
 -------------------
-What sensor j reads is predicted from the reference sensor's channels by the averaged relative
-response ``P = S_j0 S_00^-1`` (any orientation, gain and response is in it; the convention is
-``S_pq = E[X_p conj(X_q)]``). Within one segment, sensor j lags that prediction by the one delay τ
-that maximises
+The averaged relative response ``P = S_j0 S_00^-1`` predicts sensor j from the reference sensor's
+channels, for any orientation, gain and response (the convention is ``S_pq = E[X_p conj(X_q)]``).
+The delay of sensor j against this prediction, within one segment, is the τ that maximises
 
-    J(τ) = Re Σ_f  (P X_0)^H  R^-1  X_j  exp(iωτ),      R = S_jj - P S_0j,
+    J(τ) = Re Σ_f  (P X_0)^H  R^-1  X_j  exp(iωτ),      R = S_jj - P S_0j.
 
-which is least squares weighted by what the prediction leaves over: frequencies without coherent
-signal do not count. The maximum is searched for on a grid and polished by Newton's method. Its
-variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, with κ for the correlation of neighbouring
-frequencies under the window, and s the share of that sum which P's own noise does not account for.
+This is least squares weighted by the residuals of the prediction: frequencies without coherent
+signal have no weight. The maximum is searched for on a grid and refined by Newton's method. Its
+variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, where κ accounts for the correlation of
+neighbouring frequencies by the window, and s is the share of the sum that is not noise of P.
 
-P is averaged over segments already freed of their delays. The first batch does so by iteration and
-thereby defines a frame; later batches are measured in that frame, which makes the delays of a whole
-recording comparable. The frame's own delay is the one that makes P most nearly real.
+P is averaged over segments after correction of their delays. The first batch of segments does this
+by iteration and thereby defines a frame; later batches are measured in that frame, so that the
+delays of a recording are comparable. The frame's own delay is the one for which P is closest to
+real.
 
-The reference is the first sensor, unless that one shares the motion with fewer of the others.
+The reference is the first sensor, unless another sensor shares the motion with more sensors.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ if TYPE_CHECKING:
 
 _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3
-_MIN_SEGMENTS = 6  # in the first batch, per channel of the reference: P is a mean of those
-_SHARED = 0.1  # samples to which most segments tell the delay of sensors that share a motion
-_REFERENCES = 3  # sensors tried as the reference: more would cost too much where none is coherent
+_MIN_SEGMENTS = 6  # of the first batch, per channel of the reference: P is their mean
+_SHARED = 0.1  # samples; precision of delays in most segments, for sensors with common motion
+_REFERENCES = 3  # maximum number of sensors tried as reference, to bound the cost
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
-_LONGEST = 32.0  # samples either way
-_CLEAR = 1.5  # times as high as the peak nearest zero: those of one line are about as high
-_OUTSTANDING = 2.0  # times as high as all within _LONGEST: noise alone is 1.5 at most
+_LONGEST = 32.0  # samples, in both directions
+_CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
+_OUTSTANDING = 2.0  # ratio to all peaks within _LONGEST: noise reaches at most 1.5
 _FREQUENCIES_AT_ONCE = 1024
-_RIDGE = 1e-10  # of the mean power: keeps a dead channel from stopping everything
+_RIDGE = 1e-10  # fraction of the mean power: keeps matrices regular with a dead channel
 
 
 @dataclass(slots=True, eq=False)
 class _Frame:
-    """Spectral sums of one sensor and the reference, freed of delays."""
+    """Spectral sums of one sensor and the reference, after correction of delays."""
 
     reference: ComplexArray
     crossed: ComplexArray
@@ -63,7 +63,7 @@ class _Frame:
 
     @classmethod
     def of(cls, x0: ComplexArray, xj: ComplexArray, reference: ComplexArray | None = None) -> Self:
-        """Sum spectra, shape (n_freqs, n_segments, n_channels); `reference` if it is known."""
+        """Sum spectra (n_freqs, n_segments, n_channels); `reference` is S_00 if known."""
         if reference is None:
             reference = _products(x0, x0)
         return cls(reference, _products(xj, x0), _products(xj, xj), x0.shape[1])
@@ -78,14 +78,15 @@ class _Frame:
 
 @dataclass(slots=True, eq=False)
 class DelayEstimator:
-    """Measures each sensor's delay against one of them.
+    """Measures the delays of sensors against one of them.
 
     Attributes
     ----------
     sampling_rate : float
+        In Hz.
     window : float64, shape (segment_length,)
     columns : tuple of slice
-        Which columns of the samples belong to each sensor, the preferred reference first.
+        Columns of the samples of each sensor, with the preferred reference first.
     """
 
     sampling_rate: float
@@ -96,7 +97,7 @@ class DelayEstimator:
 
     @property
     def fewest(self) -> int:
-        """Segments of one batch that can define a frame."""
+        """Minimum number of segments in the batch that defines the frame."""
         reference: slice = self.columns[0]
         return _MIN_SEGMENTS * int(reference.stop - reference.start)
 
@@ -107,7 +108,7 @@ class DelayEstimator:
 
     @property
     def omega(self) -> FloatArray:
-        """Angular frequencies that are looked at, from the first above zero."""
+        """Angular frequencies used, in rad/s, from the first above zero."""
         length = len(self.window)
         count = int(USABLE * length)
         return np.arange(1.0, count + 1.0) * (2 * np.pi * self.sampling_rate / length)
@@ -119,13 +120,13 @@ class DelayEstimator:
         ----------
         samples : float64, shape (n_samples, n_channels)
         starts : int64, shape (n_segments,)
-            Rows at which segments begin.
+            First row of each segment.
 
         Returns
         -------
         delays, std : float64, shape (n_segments, n_sensors)
-            In seconds; positive if the sensor lags the reference, whose own are all zero. NaN and
-            infinite where the coherent motion is too weak to tell.
+            In s; positive if the sensor lags the reference, whose delays are zero. NaN and infinity
+            if the coherent motion is too weak.
         """
         shape = (len(starts), len(self.columns))
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
@@ -139,7 +140,7 @@ class DelayEstimator:
                 for number, frame in self._frames.items()
             }
         else:
-            self._reference, found = self._begun(sensors)
+            self._reference, found = self._with_reference(sensors)
             x0 = sensors[self._reference]
         delays[:, self._reference] = std[:, self._reference] = 0.0
         for number, (tau, spread) in found.items():
@@ -156,10 +157,10 @@ class DelayEstimator:
             delays[:, number], std[:, number] = np.where(known, tau, np.nan), spread
         return delays, std
 
-    def _begun(
+    def _with_reference(
         self, sensors: list[ComplexArray]
     ) -> tuple[int, dict[int, tuple[FloatArray, FloatArray]]]:
-        """Return the reference, and delays and standard deviations of the others against it."""
+        """Return the reference, and the others' delays and standard deviations against it."""
         best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
         most = -1
         for reference, x0 in enumerate(sensors[:_REFERENCES]):
@@ -180,9 +181,9 @@ class DelayEstimator:
     def _first_delays(
         self, x0: ComplexArray, xj: ComplexArray, power: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Measure delays in the frame of these segments, which the delays define in turn.
+        """Measure delays and the frame of these segments, by iteration.
 
-        `power` is the sum of x0's own products.
+        `power` is the sum of the products of x0.
         """
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
         for _ in range(_FIRST_ITERATIONS):
@@ -193,27 +194,27 @@ class DelayEstimator:
         return tau, spread
 
     def frame_delays(self) -> FloatArray:
-        """Return the delay of each sensor's frame, that of a real relative response, in seconds."""
+        """Return the delay of each sensor's frame in s: without it, P is closest to real."""
         delays = np.zeros(len(self.columns))
         for number, frame in self._frames.items():
             response, left = _prediction(frame)
-            # A rotation with gains is real: the sum of squares turns with twice the delay.
+            # A rotation with gains is real: the phase of the sum of squares is twice the delay's.
             squares = np.einsum("fpq,fpq->f", response, response)
             size = np.einsum("fpq,fpq->f", response, response.conj()).real
             own = np.einsum("fpp->f", frame.own).real / frame.n_segments
-            # How much of the sensor is predicted, as a weight that noise cannot raise.
+            # Weight: the predicted share of the sensor, which noise does not increase.
             with np.errstate(divide="ignore", invalid="ignore"):
                 weight = np.maximum(1 - np.einsum("fpp->f", left).real / own, 0.0)
-                turned = np.nan_to_num(weight * squares / size)  # nothing, of no signal
+                turned = np.nan_to_num(weight * squares / size)  # zero without signal
             delay = self._constant(turned) / 2
-            # Squares are the same half a segment farther; responses alternate there.
+            # Squares do not distinguish delays half a segment apart; responses do, by their sign.
             other = delay - math.copysign(len(self.window) / 2 / self.sampling_rate, delay)
             here, there = (self._met(response, weight, tau) for tau in (delay, other))
             delays[number] = other if there > _OUTSTANDING * here else delay
         return delays
 
     def _met(self, response: ComplexArray, weight: FloatArray, tau: float) -> float:
-        """Return how much of a relative response is the same at all frequencies, freed of τ."""
+        """Return the share of a relative response, without τ, that is equal at all frequencies."""
         turned = _turn(self.omega, np.array([tau]))[:, :, None]
         return float(
             np.linalg.norm((np.nan_to_num(weight)[:, None, None] * response * turned).sum(0))
@@ -226,7 +227,7 @@ class DelayEstimator:
         frames -= frames.mean(axis=-1, keepdims=True)
         frames *= self.window
         spectra = np.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1].transpose(2, 0, 1)
-        # The numbers of one sensor lie side by side, so that products of them are fast.
+        # Contiguous values of one sensor make products fast.
         return [np.ascontiguousarray(spectra[:, :, columns]) for columns in self.columns]
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
@@ -235,7 +236,7 @@ class DelayEstimator:
     def _delays(
         self, frame: _Frame, x0: ComplexArray, xj: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Measure delays in a frame, shapes (n_segments,): where J is largest."""
+        """Measure delays in a frame, shapes (n_segments,): the maxima of J."""
         omega = self.omega
         response, left = _prediction(frame)
         weight = np.linalg.inv(left)
@@ -250,22 +251,22 @@ class DelayEstimator:
         total = energy.sum(axis=0)
         met = (crossed * _turn(omega, tau)).real.sum(axis=0)
         informative = omega**2 @ energy
-        # Of P's own noise, which predicts nothing: the mean of Wishart matrices has d0 dj / n.
+        # The share of P's noise, which predicts nothing: d0 dj / n, for Wishart matrices.
         spurious = x0.shape[2] * xj.shape[2] / frame.n_segments * float(omega @ omega)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
             std = np.sqrt(kappa / (2 * informative)) / share
-        # What P leaves over is scattered itself: the mean of an inverse Wishart matrix.
+        # R is an estimate too: correct by the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)
         std *= math.sqrt(freedom / max(freedom - xj.shape[2] - 1, 1))
         known = (2 * total / kappa > _SIGNIFICANT) & (met > 0.3 * total)
         return tau, np.where(known, std, np.inf)
 
     def _peak(self, crossed: ComplexArray) -> FloatArray:
-        """Return the τ at which Re Σ crossed exp(iωτ) is largest, for every column."""
+        """Return the τ that maximises Re Σ crossed exp(iωτ), for every column."""
         reach = min(self._n_grid // 2 - 1, int(_LONGEST / self.sampling_rate / self._step))
         even, odd = (np.zeros((crossed.shape[1], reach + 1)) for _ in range(2))
-        # Of so few τ a product with the transform's matrix costs less than the transform.
+        # For so few τ a product with the transform's matrix costs less than the transform.
         for first in range(0, len(crossed), _FREQUENCIES_AT_ONCE):
             some = crossed[first : first + _FREQUENCIES_AT_ONCE]
             cosine, sine = _fourier(self._n_grid, first + 1, reach + 1)
@@ -276,20 +277,20 @@ class DelayEstimator:
 
     @property
     def _n_grid(self) -> int:
-        """Grid points of τ in a segment: a fraction of a period of the highest frequency."""
+        """Number of grid points of τ, less than a period of the highest frequency apart."""
         return _fast_length(4 * len(self.window))
 
     @property
     def _step(self) -> float:
-        """Seconds between grid points of τ."""
+        """Interval between grid points of τ, in s."""
         return float(2 * np.pi / self.omega[0] / self._n_grid)
 
     def _constant(self, crossed: ComplexArray) -> float:
-        """Return the τ at which Re Σ crossed exp(iωτ) has the peak that it is likely to have.
+        """Return the τ of the most likely peak of Re Σ crossed exp(iωτ).
 
-        The one nearest zero, where arrival times have it: motion that is nearly one line has
-        others, as high. So another one within `_LONGEST` must be clearly higher, and one farther
-        off must be so high that noise cannot be the reason.
+        Arrival times make τ nearly zero, and nearly monochromatic motion has other peaks of equal
+        height. So the peak nearest zero is chosen, unless another one within `_LONGEST` is clearly
+        higher, or a more distant one is too high for noise.
         """
         step, middle = self._step, self._n_grid // 2
         height = np.fft.fftshift(np.fft.irfft(np.append(0, crossed), n=self._n_grid))
@@ -320,7 +321,7 @@ class DelayEstimator:
 
 @cache
 def _fast_length(n: int) -> int:
-    """Return the least length from `n` whose prime factors are 2, 3 and 5: fast to transform."""
+    """Return the smallest length from `n` on with prime factors 2, 3 and 5: fast to transform."""
     while n != math.gcd(n, 2**64 * 3**40 * 5**28):
         n += 1
     return n
@@ -350,7 +351,7 @@ def _products(a: ComplexArray, b: ComplexArray) -> ComplexArray:
 
 
 def _prediction(frame: _Frame) -> tuple[ComplexArray, ComplexArray]:
-    """Relative response P, shape (n_freqs, dj, d0), and what it leaves over, per segment."""
+    """Return P, shape (n_freqs, dj, d0), and the residual matrix R per segment."""
     reference = _ridged(frame.reference)
     response = np.linalg.solve(reference.transpose(0, 2, 1), frame.crossed.transpose(0, 2, 1))
     response = response.transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""The common grid of a recording: a sensor's samples on it, as they are or interpolated."""
+"""The common grid of a recording: copies or interpolates a sensor's samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 SNAP = 1e-3
-"""Samples: constant offsets this small between exact clocks are rounding of the times."""
+"""Constant offset between exact clocks, in samples, up to which it is rounding of the times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Grid:
     start: float
 
     def has(self, source: SensorSource) -> bool:
-        """Whether the sensor's samples fall on the grid."""
+        """Return whether the sensor's samples are on the grid."""
         if source.record.sampling_rate != self.sampling_rate:
             return False
         for epoch in source.known_clock.epochs:
@@ -51,16 +51,16 @@ class Grid:
         return True
 
     def reach(self, source: SensorSource) -> float:
-        """Return how far interpolation looks to both sides, in seconds."""
+        """Return the half width of the interpolation, in s."""
         return reach(self._ratio(source)) / source.record.sampling_rate
 
     def read(self, source: SensorSource, at: int, samples: FloatArray) -> BoolArray:
-        """Write a sensor's samples from grid sample `at` on; return which are valid.
+        """Write a sensor's samples from grid sample `at` on; return whether each is valid.
 
         Parameters
         ----------
         samples : float64, shape (n, n_channels)
-            Written to, in physical units; arbitrary where not valid.
+            Output, in physical units; arbitrary where not valid.
 
         Returns
         -------
@@ -68,7 +68,7 @@ class Grid:
         """
         if self.has(source):
             return self._pass_through(source, at, samples)
-        # Whole spans: then the same numbers come out however the reading is cut.
+        # Complete spans: the values then do not depend on the limits of reads.
         first = at // SPAN * SPAN
         last = -(-(at + len(samples)) // SPAN) * SPAN
         whole, present = self._interpolated(source, first, last)

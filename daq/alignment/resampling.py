@@ -1,19 +1,18 @@
-"""Band-limited interpolation: samples between the samples.
+"""Band-limited interpolation between samples.
 
-The value between samples is the sum of its neighbours times a windowed sinc (Kaiser window, 120 dB;
-80 neighbours): flat to 0.45 of the sampling rate, images and aliases down by more than 100 dB. To a
-lower rate the same kernel is stretched, so that it is the anti-alias filter as well.
+A value is the sum of its 80 neighbours times a windowed sinc (Kaiser window, 120 dB): flat to 0.45
+of the sampling rate, with images and aliases below -100 dB. For a lower output rate the kernel is
+stretched and thus also is the anti-alias filter.
 
-Two ways through the same kernel:
+The kernel is applied in two ways:
 
-- Where the output runs at nearly the rate of the input (free-running oscillators, parts per
-  million apart), the position within a span of `SPAN` outputs hardly moves. The span is filtered
-  by fast convolution at a few fixed fractional delays (Chebyshev nodes), and each output is
-  interpolated between them: three filters serve to 25 ppm at better than -110 dB.
-- Elsewhere every output gets its own row of the kernel.
+- If the output rate is nearly the input rate (free-running oscillators that differ by parts per
+  million), the fractional position hardly changes within a span of `SPAN` outputs. The span is
+  filtered by fast convolution at a few fixed fractional delays (Chebyshev nodes), and each output
+  is interpolated between them: three filters suffice to 25 ppm with an error below -110 dB.
+- Otherwise every output has its own row of the kernel.
 
-Positions that are whole numbers throughout are not filtered at all: those samples come out
-bit-exact.
+If all positions are integers, the samples are copied without filtering.
 """
 
 from __future__ import annotations
@@ -32,25 +31,25 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 USABLE = 0.45
-"""Share of the lower rate up to which samples keep what they are."""
+"""Fraction of the lower rate up to which interpolation preserves the samples."""
 HALF_WIDTH = 40
-"""Samples the kernel reaches to either side, at the lower of the two rates."""
+"""Half width of the kernel, in samples at the lower of the two rates."""
 SPAN = 896
-"""Outputs filtered together; a long output is best cut at multiples of it."""
+"""Number of outputs filtered together; divide long outputs at multiples of it."""
 
 _ATTENUATION_DB = 120.0
 _BETA = 0.1102 * (_ATTENUATION_DB - 8.7)  # Kaiser's formula, above 50 dB
-_PHASES = 4096  # table steps per sample: linear interpolation errs by (π/4096)²/8, -142 dB
+_PHASES = 4096  # table steps per sample: the error of linear interpolation is (π/4096)²/8, -142 dB
 _FFT_LENGTH = 1024
 _TOLERANCE = 3e-6  # of the interpolation between fixed delays, at the Nyquist frequency
 _MOST_DELAYS = 8
-_WHOLE = 1e-9  # samples; positions of long records carry rounding of about this size
+_WHOLE = 1e-9  # samples; rounding of positions in long recordings
 _SPANS_AT_ONCE = 8
 _OUTPUTS_AT_ONCE = 2048
 
 
 def reach(ratio: float = 1.0) -> int:
-    """Input samples needed before the first and after the last position.
+    """Return the number of input samples needed before the first and after the last position.
 
     Parameters
     ----------
@@ -61,14 +60,14 @@ def reach(ratio: float = 1.0) -> int:
 
 
 def all_there(present: BoolArray, positions: FloatArray, *, ratio: float = 1.0) -> BoolArray:
-    """Tell at which positions all samples that the kernel takes are there.
+    """Return whether all samples under the kernel are present, for each position.
 
     Parameters
     ----------
     present : bool, shape (n_samples,)
-        Which samples are there.
+        Whether each sample is present.
     positions : float64, shape (n_outputs,)
-        As `resample` takes them.
+        As for `resample`.
     ratio : float
         Input rate over output rate.
     """
@@ -81,7 +80,7 @@ def all_there(present: BoolArray, positions: FloatArray, *, ratio: float = 1.0) 
 
 
 def are_whole(positions: FloatArray) -> bool:
-    """Tell whether all positions fall on consecutive samples, to rounding."""
+    """Return whether all positions are consecutive integers, within rounding."""
     if len(positions) == 0:
         return True
     expected = np.round(positions[0]) + np.arange(len(positions))
@@ -94,12 +93,12 @@ def resample(samples: FloatArray, positions: FloatArray, *, ratio: float = 1.0) 
     Parameters
     ----------
     samples : float64, shape (n_samples, n_channels)
-        What lies before the first and after the last row counts as zero.
+        Zero before the first and after the last row.
     positions : float64, shape (n_outputs,)
-        Increasing row numbers; position 2.25 lies a quarter of the way from row 2 to row 3.
+        Increasing row numbers; position 2.25 is a quarter of the way from row 2 to row 3.
     ratio : float
-        Input rate over output rate; above 1 the kernel also removes what the output rate
-        cannot hold, from 0.45 (flat) to 0.55 (gone) of the output rate.
+        Input rate over output rate. Above 1 the kernel is also the anti-alias filter: flat to 0.45
+        of the output rate, zero from 0.55 on.
 
     Returns
     -------
@@ -135,22 +134,22 @@ def resample(samples: FloatArray, positions: FloatArray, *, ratio: float = 1.0) 
 
 
 def _runs(numbers: IntArray) -> list[IntArray]:
-    """Split increasing numbers where one is left out."""
+    """Split increasing numbers into runs of consecutive ones."""
     return np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
 
 
 def _by_spans(
     samples: FloatArray, positions: FloatArray, middle: FloatArray, nodes: FloatArray
 ) -> FloatArray:
-    """Convolve each span at its fixed delays, and interpolate between those.
+    """Convolve each span at its fixed delays, and interpolate between them.
 
-    `middle` is the row at which a span's first output stands, halfway through the span;
+    `middle` is the position of a span's first output for the delay at the middle of the span;
     `nodes`, shape (n_spans, n_delays), are the delays around it.
     """
     n_spans, n_channels = len(middle), samples.shape[1]
     base = np.floor(middle).astype(np.int64)
     offsets = np.arange(-HALF_WIDTH + 1, HALF_WIDTH + 1)
-    # Output k of a span lies between rows base + k and base + k + 1. (n_spans, n_delays, taps)
+    # Output k of a span is between rows base + k and base + k + 1. (n_spans, n_delays, taps)
     taps = _kernel(offsets - (((middle - base)[:, None] + nodes)[:, :, None]))
     responses = np.fft.rfft(taps[:, :, ::-1], n=_FFT_LENGTH, axis=-1)
     start = base + offsets[0]
@@ -170,7 +169,7 @@ def _by_spans(
 
 
 def _direct(samples: FloatArray, positions: FloatArray, ratio: float) -> FloatArray:
-    """Give every output its own row of the (stretched) kernel."""
+    """Apply a separate row of the (stretched) kernel for every output."""
     half = reach(ratio)
     offsets = np.arange(-half + 1, half + 1)
     out = np.empty((len(positions), samples.shape[1]))
@@ -188,10 +187,10 @@ def _direct(samples: FloatArray, positions: FloatArray, ratio: float) -> FloatAr
 
 
 def _delays_needed(spread: FloatArray) -> IntArray:
-    """Return how many fixed delays keep the error of interpolation within tolerance.
+    """Return the number of fixed delays that keep the error of interpolation within tolerance.
 
-    Interpolation at m Chebyshev nodes of exp(iπx) over ±spread errs by at most
-    ``(π spread)^m / (2^(m-1) m!)``. Above `_MOST_DELAYS` there is no such number.
+    Interpolation of exp(iπx) at m Chebyshev nodes over ±spread has an error of at most
+    ``(π spread)^m / (2^(m-1) m!)``. A number above `_MOST_DELAYS` means that none suffices.
     """
     needed = np.full(len(spread), _MOST_DELAYS + 1)
     for delays in range(_MOST_DELAYS, 0, -1):
@@ -201,7 +200,7 @@ def _delays_needed(spread: FloatArray) -> IntArray:
 
 
 def _lagrange(x: FloatArray, nodes: FloatArray, which: int) -> FloatArray:
-    """Weight of node `which` at `x`; shapes (n_spans, n) and (n_spans, n_delays)."""
+    """Return the weight of node `which` at `x` (n_spans, n); `nodes` is (n_spans, n_delays)."""
     weight = np.ones_like(x)
     for other in range(nodes.shape[1]):
         if other != which:
@@ -212,7 +211,7 @@ def _lagrange(x: FloatArray, nodes: FloatArray, which: int) -> FloatArray:
 
 @cache
 def _table() -> tuple[FloatArray, FloatArray]:
-    """Kernel and its steps at multiples of 1/_PHASES sample, from 0 to beyond its reach."""
+    """Return the kernel and its differences at multiples of 1/_PHASES sample, from 0 on."""
     u = np.arange(HALF_WIDTH * _PHASES + 1) / _PHASES
     window = np.i0(_BETA * np.sqrt(np.maximum(0.0, 1 - (u / HALF_WIDTH) ** 2))) / np.i0(_BETA)
     table = np.append(np.sinc(u) * window, 0.0)
@@ -221,7 +220,7 @@ def _table() -> tuple[FloatArray, FloatArray]:
 
 
 def _kernel(u: FloatArray) -> FloatArray:
-    """Windowed sinc at distance `u`, in samples of the lower rate."""
+    """Return the windowed sinc at distance `u`, in samples of the lower rate."""
     table, steps = _table()
     place = np.minimum(np.abs(u) * _PHASES, float(len(table) - 1))
     index = place.astype(np.int64)
@@ -229,7 +228,7 @@ def _kernel(u: FloatArray) -> FloatArray:
 
 
 def _padded(samples: FloatArray, first: int, last: int) -> FloatArray:
-    """Rows `first` to `last` (not included), zero where there are none."""
+    """Return rows `first` to `last` (not included), padded with zeros."""
     low, high = max(first, 0), min(last, len(samples))
     if low == first and high == last:
         return samples[first:last]

@@ -1,4 +1,4 @@
-"""One sensor of a recording as alignment sees it: where its samples are, when they were taken."""
+"""One sensor of a recording for alignment: the rows and times of its samples."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 
 _CHUNK_BLOCKS = 1 << 14  # blocks
-_PROOF = 256  # samples whose counts are equal, one by one, are the same samples
-_APART = 1.0  # seconds by which two wires may deliver them apart
+_PROOF = 256  # number of samples with equal counts that proves identical samples
+_APART = 1.0  # maximum difference in s of their arrivals over two connections
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Contiguous samples, in the file as well as in time."""
+    """Samples that are contiguous both in the file and in time."""
 
     first_sample: int
     first_row: int
@@ -44,13 +44,13 @@ class _Run:
         return self.first_row + self.n_samples
 
     def row_of(self, sample: int) -> int:
-        """Return the row of a sample, of the nearest end where it lies outside."""
+        """Return the row of a sample, or that of the nearest end if it is outside."""
         return self.first_row + min(max(sample - self.first_sample, 0), self.n_samples)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayMeasurement:
-    """Delays measured where a sensor's sample `index` met the reference's `at_reference`."""
+    """Measured delays at a sensor's sample `index` and the reference's sample `at_reference`."""
 
     index: FloatArray
     at_reference: FloatArray
@@ -60,7 +60,7 @@ class DelayMeasurement:
 
 @dataclass(slots=True)
 class SensorSource:
-    """One sensor of the recording: where its samples are, and when they were taken."""
+    """One sensor of the recording: the rows and times of its samples."""
 
     record: ReadableSensor
     columns: list[int]
@@ -74,9 +74,9 @@ class SensorSource:
     learnt: list[DelayMeasurement] = field(default_factory=list)
     frame_delay: float = 0.0
     _seconds: FloatArray = field(default_factory=lambda: np.empty(0))
-    """When the samples of a polled sensor were taken, as far as `by_instants` has read."""
+    """Times of a polled sensor's samples that `by_instants` has read, in s."""
     offset_in_doubt: bool = False
-    """Whether how many samples apart it and others of its clock began had to be estimated."""
+    """Whether the offset of its sample index to others of its clock is an estimate."""
 
     @property
     def end_sample(self) -> int:
@@ -85,7 +85,7 @@ class SensorSource:
         return run.first_sample + run.n_samples
 
     def refresh(self) -> None:
-        """Take the blocks that have been committed since."""
+        """Add newly committed blocks."""
         for first in range(self.n_blocks, len(self.record.blocks), _CHUNK_BLOCKS):
             self._take(self.record.blocks[first : first + _CHUNK_BLOCKS])
 
@@ -98,7 +98,7 @@ class SensorSource:
         length = blocks["n_samples"].astype(np.int64)
         expected = np.append(self.end_sample if self.runs else -1, (first + length)[:-1])
         starts = np.flatnonzero(first != expected)
-        if len(starts) == 0 or starts[0] > 0:  # the run before goes on
+        if len(starts) == 0 or starts[0] > 0:  # the last run continues
             until = int(starts[0]) if len(starts) else len(blocks)
             run = self.runs[-1]
             self.runs[-1] = _Run(
@@ -110,7 +110,7 @@ class SensorSource:
         self.n_blocks += len(blocks)
 
     def fill(self, samples: FloatArray, first: int) -> BoolArray:
-        """Write samples from `first` on in physical units; return which of them are there."""
+        """Write samples from `first` on in physical units; return whether each is present."""
         last = first + len(samples)
         present = np.zeros(len(samples), dtype=bool)
         begin = bisect.bisect_right(self.runs, first, key=lambda run: run.first_sample) - 1
@@ -118,7 +118,7 @@ class SensorSource:
         runs = self.runs[max(begin, 0) : end]
         if not runs:
             return present
-        # The rows of a stretch follow those of the one before: all are read at once.
+        # Rows of consecutive runs are contiguous, so one read returns all.
         row, last_row = runs[0].row_of(first), runs[-1].row_of(last)
         if row == last_row:
             return present
@@ -143,7 +143,7 @@ class SensorSource:
 
     @classmethod
     def of(cls, record: ReadableSensor, monotonic_ns: int, utc_ns: int) -> SensorSource:
-        """Return the source of a sensor, nothing taken yet, times from this origin."""
+        """Return an empty source of a sensor, with times relative to this origin."""
         columns = main_columns(record)
         return cls(
             record,
@@ -154,18 +154,18 @@ class SensorSource:
 
     @property
     def clock_name(self) -> str:
-        """Name of the clock that samples it: its own where the recording does not say."""
+        """Name of its clock; its own name if the recording has none."""
         return self.record.clock or self.record.name
 
     @property
     def known_clock(self) -> Clock:
-        """The clock, once a block has come."""
+        """The clock; raise CannotAlignError before the first block."""
         if self.clock is None:
             raise CannotAlignError(f"sensor {self.record.name!r}: no block recorded yet")
         return self.clock
 
     def by_instants(self) -> Clock:
-        """Return the clock of a polled sensor: every sample has its instant."""
+        """Return the clock of a polled sensor, from the instants of its samples."""
         known = len(self._seconds)
         instants_ns = self.record.instants_ns(known, self.runs[-1].last_row)
         elapsed_ns = instants_ns - self.arrivals.origin_monotonic_ns
@@ -179,7 +179,7 @@ class SensorSource:
         )
 
     def measured(self, reference: Clock) -> MeasuredDelays | None:
-        """Return when samples were taken, from the delays learnt against the reference."""
+        """Return the sample times that follow from measured delays against the reference."""
         if not self.learnt:
             return None
         index = np.concatenate([each.index for each in self.learnt])
@@ -190,7 +190,7 @@ class SensorSource:
         return MeasuredDelays(index, seconds, std)
 
     def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
-        """Return the one of others that is the same sensor, read over another wire."""
+        """Return the source in `others` that is the same sensor over another connection."""
         for other in others:
             apart = self.arrivals.start - other.arrivals.start
             guess = round(apart * self.record.sampling_rate)
@@ -200,9 +200,9 @@ class SensorSource:
         return None
 
     def _departs(self, other: SensorSource, lag: int) -> bool:
-        """Whether counts that were the other's at first are not at the end of the first epoch.
+        """Return whether counts that were equal at first differ at the end of the first epoch.
 
-        Coarse counts of one motion can be equal by chance, until clocks have drifted apart.
+        Coarse counts of one motion can be equal by chance, until the clocks drift apart.
         """
         mine, others = (next(each.arrivals.earliest())[1] for each in (self, other))
         first = min(mine, others - lag) - _PROOF
@@ -210,9 +210,9 @@ class SensorSource:
         return last is not None and other_last is not None and bool((last != other_last).any())
 
     def _lag(self, other: SensorSource, first: int, guess: int) -> int | None:
-        """Return the n for which its samples i, soon after `first`, are the other's i + n.
+        """Return the n for which samples i, soon after `first`, equal the other's samples i + n.
 
-        By their counts; None if they are not the same, or stand still, or repeat themselves.
+        Counts decide; None if they differ, are constant, or are periodic.
         """
         stated = self.device_utc or self.polled or other.device_utc or other.polled
         if stated or self.record.sampling_rate != other.record.sampling_rate:
@@ -230,7 +230,7 @@ class SensorSource:
         return guess - reach + int(same[0]) if len(same) == 1 else None
 
     def _counts(self, first: int, n_samples: int) -> NDArray[Any] | None:
-        """Return counts of contiguous samples from `first` on, if they are there."""
+        """Return counts of contiguous samples from `first` on; None if any is missing."""
         for run in self.runs:
             if run.first_sample <= first and first + n_samples <= run.first_sample + run.n_samples:
                 row = run.first_row + first - run.first_sample
@@ -238,18 +238,18 @@ class SensorSource:
         return None
 
     def share(self, first: SensorSource, measured: MeasuredDelays | None) -> None:
-        """Set the clock to that of another sensor, which the same oscillator samples.
+        """Set the clock to that of another sensor with the same oscillator.
 
-        Sensors whose blocks are received together count alike. Others have begun to count at
-        different samples: how many apart, the samples tell, or else the arrival times. If it is
-        the same sensor, its counts tell.
+        Sensors whose blocks arrive together have equal sample indices. The indices of others have
+        an offset, which follows from measured delays, or else from arrival times. For two
+        connections of the same sensor it follows from the counts.
         """
         name, known = self.record.name, first.known_clock
         self.offset_in_doubt = not self.arrivals.arrives_with(first.arrivals)
         if not self.offset_in_doubt:
             self.clock = known.shared_by(name, end_sample=self.end_sample)
             return
-        # Arrivals are compared with arrivals: the other's clock may be the timeline itself.
+        # Compare arrivals with arrivals: the other's clock may be the timeline itself.
         stated = first.device_utc or first.polled
         heard = known if stated else first.arrivals.solve(name)
         stretches, by_samples = [], measured is not None

@@ -1,4 +1,4 @@
-"""The HDF5 recording: writes it, reads it while it grows, locks, repairs and monitors it.
+"""The HDF5 recording: writing, reading while it grows, locking, repair, monitoring.
 
-Knows no driver and no estimate; the format is in docs/recording-format.md.
+Uses no drivers and no estimates; docs/recording-format.md describes the format.
 """

@@ -27,14 +27,14 @@ BLOCK_ROWS = 4096
 CHUNK_SECONDS = 10.0
 _NS_PER_S = 1_000_000_000
 _COMMIT_BYTES = 1 << 24
-"""Samples after which those written before are made safe, so that none are kept in memory."""
+"""Number of bytes after which samples are committed, to bound memory."""
 
 
 class ArrayWriter:
     """Writes a recording from arrays; a context manager.
 
-    The recording appears under its name when the context ends without an exception; otherwise
-    nothing is left behind. Samples may be added in pieces of any length, so memory stays bounded.
+    The recording gets its name when the context ends without an exception; otherwise the file is
+    removed. Samples may be added in pieces of any length, so memory is bounded.
     All times are in ns after `created`.
 
     Parameters
@@ -112,21 +112,21 @@ class ArrayWriter:
         ----------
         sensor : str
         counts : ndarray, shape (n_samples, n_channels)
-            Of the dtype of the sensor's layout. Sliced block by block, so a lazily read array is
-            never in memory as a whole.
+            With the dtype of the sensor's layout. Sliced block by block, so a lazily read array is
+            never completely in memory.
         first_sample : int
-            Sample index of the first one, counted from the sensor's first sample.
+            Index of the first sample, counted from the sensor's first sample.
         block_rows : int
-            Samples in a block; the last block has the remaining ones.
+            Number of samples per block; the last block has the remaining ones.
         received_ns : int, shape (n_blocks,), optional
-            When each block was received. By default, one sampling interval after its last sample at
-            the nominal rate.
+            Arrival of each block. Default: one sampling interval after its last sample at the
+            nominal rate.
         utc_ns : int, shape (n_blocks,), optional
-            Time of the first sample of each block, where the device sends UTC.
+            Time of the first sample of each block, if the device sends UTC.
         instants_ns : int64, shape (n_samples,), optional
-            Time of each sample, where it is known.
+            Time of each sample, if known.
         restart : bool, optional
-            Whether the sampling clock restarts here; by default, only at sample 0.
+            Whether the sampling clock restarts at the first sample; default: only at index 0.
         """
         rate, n_samples = self._rates[sensor], len(counts)
         flags = BlockFlag.NONE if utc_ns is None else BlockFlag.DEVICE_UTC

@@ -2,11 +2,10 @@
 
 Theory of operation
 -------------------
-The recorder listens on an ephemeral port of the local host, and writes port and a random token into
-the attributes of the file: whoever can read the recording can stop it, which is its owner alone
-unless its permissions are changed. A request is one line,
-``token command text``. The answer is one line of JSON, with the key ``"error"`` if the recorder
-refuses.
+The recorder listens on an ephemeral port of the local host, and writes the port and a random token
+into the attributes of the file. Users who can read the recording can therefore stop it; by default
+only its owner can. A request is one line, ``token command text``. The reply is one line of JSON,
+with the key ``"error"`` if the recorder refuses.
 """
 
 from __future__ import annotations
@@ -30,27 +29,27 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 MAX_CONNECTIONS = 16
-"""Connections at a time; further ones are closed at once."""
+"""Maximum number of connections; further ones are closed immediately."""
 _TOKEN_BYTES = 16
 _TOKEN = re.compile(rf"[0-9a-f]{{{2 * _TOKEN_BYTES}}}")
 _MAX_PORT = 65535
 _MAX_LINE = 4096
 _IDLE_TIMEOUT = 10.0
 _FINAL_REPLY_TIMEOUT = 1.0
-"""Seconds in which the last answers may be read when the recorder ends."""
+"""Time in s for clients to read the last replies when the recorder ends."""
 
 Answer = dict[str, Any]
 
 
 class Command(StrEnum):
-    """What a recorder can be asked."""
+    """Commands to a recorder; the reply to each is the status."""
 
     STOP = "stop"
     """Close the recording and end."""
     MARK = "mark"
     """Record a remark."""
     STATUS = "status"
-    """Answer with the status; every other command is answered so, too."""
+    """Only reply with the status."""
 
 
 class ControlRefusedError(HuddleError):
@@ -61,12 +60,12 @@ class ControlRefusedError(HuddleError):
 async def serve(
     answer: Callable[[Command, str], Awaitable[Answer]],
 ) -> AsyncIterator[tuple[int, str]]:
-    """Listen for commands while the context lasts.
+    """Listen for commands until the context ends.
 
     Parameters
     ----------
     answer : coroutine function of command and text
-        Carries out a command and returns the answer.
+        Executes a command and returns the reply.
 
     Yields
     ------
@@ -75,7 +74,7 @@ async def serve(
     """
     token = secrets.token_hex(_TOKEN_BYTES)
     conversations: set[asyncio.Task[None]] = set()
-    silent: set[asyncio.Task[None]] = set()  # those that have sent nothing yet
+    silent: set[asyncio.Task[None]] = set()  # connections without a request yet
 
     async def converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -96,7 +95,7 @@ async def serve(
                 writer.write(json.dumps(reply, ensure_ascii=False).encode() + b"\n")
                 await writer.drain()
         except (TimeoutError, ConnectionError, ValueError):
-            pass  # the client has gone, or its line is too long
+            pass  # the client closed the connection, or its line is too long
         except asyncio.CancelledError:
             writer.transport.abort()
         finally:
@@ -109,7 +108,7 @@ async def serve(
         yield int(server.sockets[0].getsockname()[1]), token
     finally:
         server.close()
-        # Requests are still answered, above all "stop"; clients that are silent are dropped.
+        # Complete pending replies, above all to "stop"; drop clients without a request.
         for task in silent:
             task.cancel()
         if conversations:
@@ -134,7 +133,7 @@ async def _reply(
 
 
 def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -> Answer:
-    """Send a command to the recorder of a recording and return its answer.
+    """Send a command to the recorder of a recording and return its reply.
 
     Parameters
     ----------
@@ -149,13 +148,13 @@ def ask(recording: str | Path | tuple[int, str], command: str, text: str = "") -
     NotConnectedError
         If no recorder is writing it.
     NoAnswerError
-        If the recorder does not answer.
+        If the recorder does not reply.
     ControlRefusedError
         If the recorder refuses.
     """
     control = recording if isinstance(recording, tuple) else _control_of(Path(recording))
     port, token = control
-    if not (0 < port <= _MAX_PORT and _TOKEN.fullmatch(token)):  # from a file of somebody else
+    if not (0 < port <= _MAX_PORT and _TOKEN.fullmatch(token)):  # the file is not trusted
         raise NotConnectedError(
             f"port {port}: the control address is not one of a recorder; nothing was sent to it"
         )

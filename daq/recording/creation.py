@@ -1,4 +1,4 @@
-"""What a new recording holds: its attributes, and the datasets that grow."""
+"""Creates the contents of a new recording: attributes, and datasets that grow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_attributes(
     control: tuple[int, str] | None,
     attributes: dict[str, str | float],
 ) -> None:
-    """Write what is known of the run when it starts."""
+    """Write the attributes that are known at the start of the run."""
     utc = datetime.fromtimestamp(created.utc_ns / 1e9, tz=UTC)
     try:
         software = f"huddle {version('huddle-bench')}"
@@ -57,14 +57,14 @@ def write_attributes(
 
 
 def make_datasets(file: h5py.File, sensors: Sequence[SensorLayout], chunk_seconds: float) -> None:
-    """Make the datasets of all sensors, events, and ``/committed``, all of them empty."""
+    """Create the empty datasets of all sensors, events, and ``/committed``."""
     groups = file.create_group("sensors")
     for sensor in sensors:
         group = groups.create_group(sensor.name)
         for key in ("model", "serial_number", "driver", "port", "clock", "sampling_rate"):
             group.attrs[key] = getattr(sensor, key)
         n_channels = len(sensor.channels)
-        # Reading a chunk takes at least 10 µs, so at low rates a chunk has two seconds.
+        # Reading a chunk takes at least 10 µs, so at low rates a chunk has 2 s.
         min_rows = min(_MIN_CHUNK_ROWS, round(2 * sensor.sampling_rate))
         n_rows = max(4, min_rows, round(sensor.sampling_rate * chunk_seconds))
         filters = {"shuffle": True, "compression": "gzip", "compression_opts": 1}

@@ -1,9 +1,9 @@
-"""Checksums of what has none in HDF5: attributes, gaps, events, and ``/committed``.
+"""Checksums of attributes, gaps, events, and ``/committed``, for which HDF5 has none.
 
-``/checksums`` has the rows of ``/committed``: a CRC-32 of the description of a sensor (its
-attributes), of its gaps, and of its row of ``/committed``; in the last row those of the file's
-attributes, of the events, and of the last row. It is written when the recording is closed; zeros
-mean that it was not. Older recordings have no such dataset.
+``/checksums`` has the same rows as ``/committed``. A sensor's row has the CRC-32 of its description
+(attributes), of its gaps, and of its row of ``/committed``; the last row has those of the file's
+attributes, of the events, and of the last row of ``/committed``. It is written when the recording
+is closed; zeros mean that it was not closed. Older recordings have no such dataset.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SAMPLES = ("channels", "sensitivity", "unit", "direction", "auxiliary", "respon
 
 
 def write_checksums(file: h5py.File) -> None:
-    """Write ``/checksums`` of a recording that is complete."""
+    """Write ``/checksums`` of a complete recording."""
     if CHECKSUMS in file:
         names = list(file["committed"].attrs["sensors"])
         tables = [file["sensors"][name]["gaps"][...].tobytes() for name in names]
@@ -46,7 +46,7 @@ def write_checksums(file: h5py.File) -> None:
 def damaged_tables(
     path: Path, file: h5py.File, gaps: dict[str, CommittedRows], events: CommittedRows
 ) -> Iterator[str]:
-    """Yield the names of tables that do not have their checksums.
+    """Yield the names of tables with wrong checksums.
 
     Parameters
     ----------
@@ -54,13 +54,13 @@ def damaged_tables(
     file : h5py.File
         The recording.
     gaps : dict
-        Of each sensor, by name.
+        Gaps by name of the sensor.
     events : CommittedRows
 
     Raises
     ------
     NotARecordingError
-        If a description or ``/committed`` is damaged: nothing else would mean anything.
+        If a description or ``/committed`` is damaged: the data then have no meaning.
     """
     if CHECKSUMS not in file:
         return
@@ -122,6 +122,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - any attribute
 
 
 def make_checksums(file: h5py.File, n_sensors: int) -> None:
-    """Make ``/checksums`` of a new recording."""
+    """Create ``/checksums`` of a new recording."""
     file.create_dataset(CHECKSUMS, data=np.zeros((n_sensors + 1, 3), "<u4"))
     file[CHECKSUMS].attrs["columns"] = ["description", "gaps or events", "committed"]

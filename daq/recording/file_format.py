@@ -73,9 +73,9 @@ class SensorLayout:
     sampling_rate : float
         In Hz; as reported by the device, otherwise nominal.
     dtype : numpy dtype
-        Of the raw counts.
+        Type of the raw counts.
     clock : str
-        Sensors with the same name here are sampled by one clock.
+        Name of the sampling clock; sensors with one clock share the name.
     """
 
     name: str
@@ -105,7 +105,7 @@ class SensorLayout:
 
 
 def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
-    """Return channels as attributes of the dataset ``samples``."""
+    """Return the attributes of the dataset ``samples`` that describe channels."""
     return {
         "channels": [channel.name for channel in channels],
         "sensitivity": np.array([channel.sensitivity for channel in channels]),
@@ -117,7 +117,7 @@ def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
 
 
 def channels_of(attributes: Any) -> tuple[Channel, ...]:  # noqa: ANN401  (h5py is untyped)
-    """Return the channels from the attributes that :func:`channel_attributes` made."""
+    """Return the channels described by :func:`channel_attributes`."""
     columns = zip(
         *(attributes[key] for key in ("channels", "sensitivity", "unit", "direction")),
         *(attributes[key] for key in ("auxiliary", "response")),

@@ -35,7 +35,7 @@ class ReadableSensor(Protocol):
 
     @property
     def clock(self) -> str:
-        """Sensors with the same name here are sampled by one clock."""
+        """Name of the sampling clock; sensors with one clock share the name."""
 
     @property
     def sampling_rate(self) -> float:
@@ -67,11 +67,11 @@ class ReadableSensor(Protocol):
     def intact_counts(
         self, first_row: int, last_row: int
     ) -> tuple[NDArray[Any], list[tuple[int, int]]]:
-        """Return raw counts, and which rows (first, last + 1) of them are damaged and zero."""
+        """Return raw counts, and the ranges (first, last + 1) of damaged rows, which are zero."""
 
     @property
     def n_damaged(self) -> int:
-        """Number of damaged blocks that have been read."""
+        """Number of damaged blocks read so far."""
 
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Return the host monotonic time of each sample of a polled sensor, in ns."""
@@ -106,10 +106,10 @@ class ReadableRecording(Protocol):
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """What happened while recording."""
+        """Events of the recording."""
 
     def refresh(self) -> bool:
-        """Read what has been committed since the last call; return whether there was anything."""
+        """Read newly committed rows; return whether there were any."""
 
     def close(self) -> None:
         """Close the file, if there is one."""

@@ -1,4 +1,4 @@
-"""Status of a recording and its sensors between estimates: cheap enough for every refresh."""
+"""Status of a recording and its sensors, at little cost per refresh."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ class SensorStatus:
     overdue_for : float
         Time since the last block of a sensor that is late or lost; 0 in other states.
     reason : str
-        The recorder's words on the state; empty where it gave none.
+        The recorder's reason for the state; empty if it gave none.
     is_clipping : bool
         Whether one of the latest blocks reached the end of the range.
     n_clipped : int
         Number of clipped blocks.
     stuck, was_stuck : tuple of str
-        Channels whose values do not change now, and those whose values did not for a while.
+        Channels with constant values now, and channels with constant values for some time earlier.
     """
 
     name: str
@@ -73,14 +73,14 @@ class RecordingStatus:
     Attributes
     ----------
     elapsed : float
-        Seconds from its start to the latest block or event; to now where no sensor sends.
+        Seconds from its start to the latest block or event; to now if no sensor sends.
     started_utc_ns : int
     closed : bool
     sensors : tuple of SensorStatus
     events : tuple of Event
-        All of them.
+        All events.
     ends_in : float or None
-        Seconds until the recording ends by itself; None where it does not.
+        Seconds until the planned end of the recording; None without a planned end.
     """
 
     elapsed: float
@@ -92,13 +92,13 @@ class RecordingStatus:
 
 
 class RecordingMonitor:
-    """Derives the status of a recording that somebody else refreshes.
+    """Derives the status of a recording that the caller refreshes.
 
     Parameters
     ----------
     recording : Recording
     now : callable
-        Seconds of a clock that never goes back.
+        Time in s of a monotonic clock.
     """
 
     def __init__(self, recording: Recording, *, now: Callable[[], float] = time.monotonic) -> None:
@@ -125,24 +125,24 @@ class RecordingMonitor:
             self._sensor(record, self._blocks[record.name], latest_ns)
             for record in recording.sensors
         )
-        gone_on = self._gone_on(latest_ns, sensors)
-        elapsed = (latest_ns - start_ns) * _NS + gone_on
+        since_latest = self._since_latest(latest_ns, sensors)
+        elapsed = (latest_ns - start_ns) * _NS + since_latest
         duration = None if recording.closed else recording.duration
         return RecordingStatus(
             elapsed=elapsed,
             started_utc_ns=recording.created_at.utc_ns,
             closed=recording.closed,
-            sensors=tuple(replace(s, overdue_for=s.overdue_for + gone_on) for s in sensors)
-            if gone_on
+            sensors=tuple(replace(s, overdue_for=s.overdue_for + since_latest) for s in sensors)
+            if since_latest
             else sensors,
             events=self._events,
             ends_in=None if duration is None else max(0.0, duration - elapsed),
         )
 
-    def _gone_on(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:
-        """Return seconds since the latest block or event where no sensor sends any more.
+    def _since_latest(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:
+        """Return the time since the latest block or event in s if no sensor sends, else 0.
 
-        Otherwise time is that of the blocks, whatever the speed of the clock that stamps them.
+        While sensors send, elapsed time follows from the blocks, whose clock may be faster.
         """
         if latest_ns != self._latest_ns:
             self._latest_ns, self._since = latest_ns, self._now()
@@ -152,13 +152,13 @@ class RecordingMonitor:
         return (self._now() - self._since) * (1.0 if bench is None else bench.speed)
 
     def status_with_stuck_channels(self) -> RecordingStatus:
-        """Return the current status; read the latest samples to find channels that are stuck."""
+        """Return the current status; read the latest samples to find stuck channels."""
         for blocks in self._blocks.values():
             blocks.find_stuck()
         return self.status()
 
     def is_any_sensor_quiet(self) -> bool:
-        """Return whether a sensor with samples has got none since the last call."""
+        """Return whether a sensor with samples received none since the last call."""
         n_samples = {record.name: record.n_samples for record in self._recording.sensors}
         before, self._n_samples = self._n_samples, n_samples
         return any(count and before.get(name) == count for name, count in n_samples.items())
@@ -166,15 +166,15 @@ class RecordingMonitor:
     def with_late_sensors(
         self, status: RecordingStatus, states: Mapping[str, str]
     ) -> RecordingStatus:
-        """Return a status in which sensors are late that the recorder calls late.
+        """Return a status that includes late sensors as reported by the recorder.
 
-        The recorder writes that a sensor was late only once it is lost.
+        The file has a late sensor's event only after the sensor is lost.
 
         Parameters
         ----------
         status : RecordingStatus
         states : mapping
-            State of each sensor, by name, as the recorder answers.
+            State of each sensor by name, from the recorder's reply.
         """
         latest_ns = round(status.elapsed / _NS) + self._recording.created_at.monotonic_ns
         sensors = [
@@ -220,7 +220,7 @@ class RecordingMonitor:
     def _state(
         self, record: SensorRecord, blocks: _BlockSummary, latest_ns: int
     ) -> tuple[SensorState, int, str]:
-        """Return state, monotonic time in ns since when the sensor is overdue, and the reason."""
+        """Return state, monotonic time in ns from which the sensor is overdue, and reason."""
         has_blocks = blocks.last_ns >= 0
         event, state = self._latest.get(record.name, (None, SensorState.WAITING))
         if event is not None and event.received.monotonic_ns > blocks.last_ns:
@@ -248,12 +248,12 @@ class _BlockSummary:
         """Host monotonic time at which the last block was received; -1 before the first."""
         self.n_clipped = 0
         self.clipped_ns = 0
-        """The same of the last clipped block."""
+        """Host monotonic time at which the last clipped block was received."""
         self.stuck: tuple[str, ...] = ()
         self.ever_stuck: dict[str, None] = {}
 
     def update(self) -> None:
-        """Read the blocks that were committed since the last call."""
+        """Read the blocks committed since the last call."""
         new = self._record.blocks[self._n_blocks :]
         if len(new) == 0:
             return

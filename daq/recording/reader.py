@@ -1,6 +1,6 @@
-"""Reads recordings: growing ones, those of a killed recorder, and closed ones, by the same code.
+"""Reads recordings: growing, left open by a killed recorder, or closed.
 
-A recording has the rows that ``/committed`` counts; rows beyond these were never acknowledged.
+A recording consists of the rows counted in ``/committed``; later rows were never acknowledged.
 """
 
 from __future__ import annotations
@@ -63,19 +63,19 @@ class Recording:
         self.location = text(attributes, "location")
         self.bench_text = text(attributes, "bench")
         self.duration = float(number(attributes, "duration")) if "duration" in attributes else None
-        """Planned length in seconds; None where it was to last until stopped."""
+        """Planned duration in s; None without a planned end."""
         self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
         """The ``run_id`` of the recording that this one continues; empty for most."""
         self._committed = dataset(file, "committed", np.dtype("<i8"))
         names = [str(name) for name in self._committed.attrs["sensors"]]
         if not names or len(set(names)) < len(names):
-            raise ValueError(f"sensors {names}; expected names that differ")
+            raise ValueError(f"sensors {names}; expected different names")
         groups = member(file, "sensors")
         self.sensors = tuple(SensorRecord(member(groups, name)) for name in names)
         """In the order of the bench."""
         self._events = CommittedRows(dataset(file, "events", file_format.EVENT_DTYPE))
         self.closed = False
-        """Whether the recording was closed properly, and so is complete."""
+        """Whether the recording was closed properly and is complete."""
         self.refresh()
         gaps = {sensor.name: sensor.gap_rows for sensor in self.sensors}
         self.damaged_tables = tuple(damaged_tables(path, file, gaps, self._events))
@@ -113,7 +113,7 @@ class Recording:
 
     @property
     def bench(self) -> Bench | None:
-        """The bench that was recorded; None for recordings from elsewhere."""
+        """The recorded bench; None for imported recordings."""
         if not self.bench_text:
             return None
         with contextlib.suppress(BenchFileError):
@@ -126,7 +126,7 @@ class Recording:
         return self.events_from(0)
 
     def events_from(self, first: int) -> tuple[Event, ...]:
-        """Return all events but the first ``first`` ones."""
+        """Return all events from index ``first`` on."""
         return tuple(
             Event(
                 sensor=row["sensor"].decode(),
@@ -138,7 +138,7 @@ class Recording:
         )
 
     def sensor(self, name: str) -> SensorRecord:
-        """Return the sensor of this name."""
+        """Return the sensor with this name."""
         for sensor in self.sensors:
             if sensor.name == name:
                 return sensor
@@ -156,7 +156,7 @@ class Recording:
     def result_attributes(self) -> dict[str, dict[str, Any]]:
         """Return the attributes of the stored results by method, without reading their arrays.
 
-        Their checksum is not verified: it covers the arrays too.
+        Their checksum is not verified, because it also covers the arrays.
         """
         with damage_named(self.path):
             if "results" not in self._file:
@@ -178,7 +178,7 @@ class Recording:
         return arrays, attributes
 
     def refresh(self) -> bool:
-        """Read what has been committed since the last call; return whether there was anything.
+        """Read newly committed rows; return whether there were any.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class Recording:
 
 
 def check_format(path: Path, file: h5py.File) -> None:
-    """Raise NotARecordingError for other HDF5 files, and for formats newer than this program."""
+    """Raise NotARecordingError for other HDF5 files, and for newer formats."""
     found = file.attrs.get("format")
     if found != file_format.FORMAT:
         what = "it has no attribute format" if found is None else f"its format is {found!r}"
@@ -235,9 +235,9 @@ def check_format(path: Path, file: h5py.File) -> None:
 def control_address(path: str | Path) -> tuple[int, str] | None:
     """Return port and token of the recorder that writes a recording; None if it is closed.
 
-    Safe beside a reader that follows the file in the same process, unlike a second ``Recording``:
-    HDF5 would share the metadata of the growing file, and the first reader would fail or read
-    zeros. This function reads the file without that cache, and only parts that never move.
+    Unlike a second ``Recording``, this is safe while a reader in the same process follows the file.
+    HDF5 would share cached metadata between both, and the first reader would fail or read zeros.
+    This function reads without that cache, and only parts of the file that never move.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 Theory of operation
 -------------------
-A recording is never changed in place. A copy beside it is changed, fsynced and renamed over the
-original, so that there is always one intact file under the name.
+A recording is never changed in place. A copy in the same folder is changed, fsynced and renamed to
+the original, so that the name always refers to an intact file.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class SensorVerification:
     bad_blocks : tuple of int
         Indices of committed blocks that have a wrong checksum or cannot be read.
     n_uncommitted : int
-        Rows that were written and never acknowledged; they are not part of the recording.
+        Rows written but never acknowledged; they are not part of the recording.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Verification:
 
     @property
     def intact(self) -> bool:
-        """Whether all committed blocks, gaps and events have their checksums."""
+        """Whether the checksums of all committed blocks, gaps and events are correct."""
         return not self.damaged_tables and not any(s.bad_blocks for s in self.sensors)
 
 
@@ -105,9 +105,9 @@ def verify(path: str | Path) -> Verification:
 
 
 def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
-    """Close a recording that a killed recorder, or a power cut, left open.
+    """Close a recording that a killed recorder or a power cut left open.
 
-    It is built again from its journal, where there is one, with everything that was acknowledged.
+    The recording is rebuilt from its journal, if there is one, with all acknowledged rows.
     Uncommitted rows are removed. A closed recording is not changed.
 
     Raises
@@ -151,12 +151,12 @@ def repair(path: str | Path, *, now: HostTime | None = None) -> Verification:
 
 
 def _is_left_open(path: Path, report: Verification | Recording) -> bool:
-    """Return whether a file was not closed, or not to the end."""
+    """Return whether a file was not closed, or not completely."""
     return not report.closed or Superblock.of(path).is_open
 
 
 def _remove_useless_journal(path: Path) -> None:
-    """Remove a journal that a power cut struck before anything was acknowledged."""
+    """Remove a journal that is incomplete because of a power cut before the first commit."""
     if read_journal(path) is None:
         journal_path(path).unlink(missing_ok=True)
 
@@ -168,12 +168,12 @@ def _own_journal(path: Path) -> JournalContents | None:
         return None
     with h5py.File(io.BytesIO(contents.created), "r") as created:
         run_id: str = created.attrs["run_id"]
-    with path.open("rb") as file:  # however damaged it is: its attributes were written once
+    with path.open("rb") as file:  # the attributes, written once, survive most damage
         return contents if run_id.encode() in file.read(len(contents.created)) else None
 
 
 def _whole(path: Path, journal: JournalContents) -> Verification | None:
-    """Return the report on a closed file that has all of its journal; None on any other."""
+    """Return the report on a closed file with all rows of its journal; else None."""
     try:
         report = verify(path)
         is_whole = report.intact and not _is_left_open(path, report)
@@ -191,14 +191,14 @@ def write_results(
 ) -> None:
     """Write the results of an estimate to ``/results``, replacing earlier ones.
 
-    All results are written in one pass; a crash leaves either all of them or none. A recording that
-    its recorder left open is closed first.
+    All results are written in one pass; a crash leaves either all or none. A recording left open by
+    its recorder is closed first.
 
     Parameters
     ----------
     path : path
     results : mapping
-        Arrays and attributes by name of the method, as `Recording.results` returns them.
+        Arrays and attributes by name of the method, as from `Recording.results`.
 
     Raises
     ------
@@ -274,7 +274,7 @@ def _add_last_events(file: h5py.File, report: Verification, now: HostTime) -> No
 
 @contextlib.contextmanager
 def _replaced(path: Path, *, copied: bool = True) -> Iterator[Path]:
-    """Yield a copy to be changed, or an empty file; it replaces the original if no error occurs."""
+    """Yield a copy, or an empty file; it replaces the original if no error occurs."""
     copy = path.with_name(f".{path.name}.{uuid.uuid4().hex}.copy")
     try:
         create_private(copy)

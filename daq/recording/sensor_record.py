@@ -1,4 +1,4 @@
-"""One sensor of a recording that is open for reading: its committed samples, blocks and gaps."""
+"""One sensor of an open recording: its committed samples, blocks and gaps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class CommittedRows:
-    """The committed rows of a table; each is read once."""
+    """The committed rows of a table; each row is read once."""
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._dataset = dataset
@@ -54,7 +54,7 @@ class CommittedRows:
 
 
 class SensorRecord:
-    """The committed data of one sensor; grows when its recording is refreshed."""
+    """The committed data of one sensor, extended when its recording is refreshed."""
 
     def __init__(self, group: h5py.Group) -> None:
         attributes = group.attrs
@@ -64,7 +64,7 @@ class SensorRecord:
         self.driver = text(attributes, "driver")
         self.port = text(attributes, "port")
         self.clock = text(attributes, "clock")
-        """Sensors with the same name here are sampled by one clock."""
+        """Name of the sampling clock; sensors with one clock share the name."""
         self.sampling_rate = float(number(attributes, "sampling_rate"))
         """In Hz, as reported by the device; otherwise nominal."""
         self._samples = dataset(group, "samples")
@@ -94,12 +94,12 @@ class SensorRecord:
 
     @property
     def polled(self) -> bool:
-        """Whether the time of every sample is recorded; False as long as there are no samples."""
+        """Whether the time of every sample is recorded; False before the first sample."""
         return bool(self.n_samples > 0 and self._instants.shape[0] >= self.n_samples)
 
     @property
     def n_written(self) -> int:
-        """Number of rows of samples in the file, including those never committed."""
+        """Number of rows of samples in the file, including uncommitted ones."""
         return int(self._samples.shape[0])
 
     @property
@@ -113,7 +113,7 @@ class SensorRecord:
         Parameters
         ----------
         first_row, last_row : int
-            Rows, without ``last_row``; up to ``n_samples`` if not given.
+            Rows, without ``last_row``; default: up to ``n_samples``.
 
         Returns
         -------
@@ -124,7 +124,7 @@ class SensorRecord:
         IndexError
             If these rows are not committed.
         RecordingError
-            If the file is damaged there.
+            If the file is damaged at these rows.
         """
         return self._read(self._sample_rows, first_row, last_row)
 
@@ -152,7 +152,7 @@ class SensorRecord:
         ends = blocks["first_row"] + blocks["n_samples"]
         try:
             counts = self.counts(low, int(ends[-1]))
-        except RecordingError:  # a chunk is damaged: which blocks are in others?
+        except RecordingError:  # a chunk is damaged: read the blocks of other chunks one by one
             counts = self._counts_block_by_block(blocks)
         bad = np.flatnonzero(~intact_blocks(blocks, counts))
         if len(bad):
@@ -167,7 +167,7 @@ class SensorRecord:
 
     @property
     def n_damaged(self) -> int:
-        """Number of damaged blocks that `intact_counts` has met."""
+        """Number of damaged blocks that `intact_counts` has found."""
         return len(self._damaged)
 
     @property
@@ -215,7 +215,7 @@ class SensorRecord:
             ) from error
 
     def extend(self, counts: NDArray[np.int64]) -> bool:
-        """Add what a row of ``/committed`` counts; return whether anything is new."""
+        """Add the rows counted in a row of ``/committed``; return whether there are new ones."""
         before = self.n_samples, self.gap_rows.n_rows
         self.blocks.extend(int(counts[file_format.BLOCKS]), int(counts[file_format.ROWS]))
         self.gap_rows.extend(int(counts[file_format.GAPS]))

@@ -1,4 +1,4 @@
-"""The state of a sensor: one vocabulary from the recorder to screens, JSON and reports."""
+"""The state of a sensor, with the same values in recorder, screens, JSON and reports."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ class SensorState(StrEnum):
     """State of one sensor of a recording."""
 
     WAITING = "waiting"
-    """Connected; no block has arrived since."""
+    """Connected, without a block since."""
     LIVE = "live"
     """Blocks arrive and are recorded."""
     LATE = "late"
-    """No block has arrived for two block periods."""
+    """No block for two block periods."""
     STALLED = "stalled"
-    """The port is open, but no block has arrived for so long that the sensor counts as lost."""
+    """The port is open, but without a block for so long that the sensor is lost."""
     DISCONNECTED = "disconnected"
     """The connection ended; the recorder tries to connect again until the run ends."""
     REFUSED = "refused"
-    """Another device answers than the bench file names, or than was recorded before."""
+    """The device is not the one in the bench file, or not the one recorded before."""
     SILENT = "silent"
-    """The file has received no samples for some seconds, and the recorder has given no reason."""
+    """The file has no new samples for some seconds, and the recorder has given no reason."""
     ENDED = "ended"
-    """The recording is closed, and the sensor was not lost when it was."""
+    """The recording is closed, and the sensor was not lost at its end."""
 
     @property
     def is_lost(self) -> bool:
-        """Whether the sensor delivers nothing any more."""
+        """Whether the sensor is lost."""
         return self in _LOST
 
     @property

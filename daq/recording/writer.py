@@ -2,18 +2,18 @@
 
 Theory of operation
 -------------------
-All groups, datasets and attributes are made under a temporary name of its own. Then the file is
+All groups, datasets and attributes are created under a unique temporary name. Then the file is
 switched to SWMR (single writer, multiple readers) and gets its name, which must be free: an
 incomplete recording never has the final name, and of two recorders with the same name one fails.
-From then on rows are only appended. Samples are written in whole compressed chunks: partial chunks
-would be rewritten elsewhere and inflate the file. So a sample is buffered for up to the length of
-one chunk.
+From then on rows are only appended. Samples are written in complete compressed chunks: HDF5 would
+rewrite partial chunks elsewhere, and the file would grow. So a sample is buffered for up to the
+duration of one chunk.
 
-``commit`` flushes and fsyncs the appended rows; appends what they are to the journal
-(:mod:`daq.recording.storage.journal`) and fsyncs that; writes their numbers to ``/committed``, for
-readers; and only then acknowledges. ``/committed`` has a fixed size and place. If a crash
-interrupts its writing, some numbers are old and some new; each counts rows that are safe. Readers
-cut all datasets of a sensor to the shortest.
+``commit`` flushes and fsyncs the appended rows; appends them to the journal
+(:mod:`daq.recording.storage.journal`) and fsyncs it; writes the numbers of rows to ``/committed``,
+for readers; and only then acknowledges. ``/committed`` has a fixed size and position. If a crash
+interrupts its writing, some numbers are old and some new; all count safe rows. Readers cut all
+datasets of a sensor to the shortest.
 
 ``close`` closes the file, fsyncs it, and then removes the journal.
 """
@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from daq.recording.file_format import SensorLayout
 
 BROKEN: list[RecordingWriter] = []
-"""Writers whose file HDF5 could not close. Their objects must not be freed: that fails, too, prints
-tracebacks, and may crash. The recorder ends without freeing anything."""
+"""Writers whose file HDF5 could not close. Freeing their objects also fails, prints tracebacks, and
+may crash. The recorder therefore ends without freeing them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class SensorCounts:
 
 @dataclass(frozen=True, slots=True)
 class Committed:
-    """An acknowledgment: what is safe on disk."""
+    """An acknowledgment: the numbers of rows that are safe on disk."""
 
     sensors: dict[str, SensorCounts]
     events: int
@@ -129,8 +129,8 @@ class RecordingWriter:
         chunk_seconds : float
             Length of a chunk. Longer chunks are read faster, but samples are buffered longer.
         hidden : bool
-            Keep the temporary name until `close`, for a recording that is not to be seen before it
-            is complete; `abandon` then removes it.
+            Keep the temporary name until `close`, to hide an incomplete recording; `abandon` then
+            removes the file.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class RecordingWriter:
         path = Path(path)
         if path.exists():
             raise taken(path)
-        renames = hidden or os.name != "nt"  # Windows renames no file that is open
+        renames = hidden or os.name != "nt"  # Windows cannot rename an open file
         with _as_recording_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(path)
@@ -148,7 +148,7 @@ class RecordingWriter:
             create_private(temporary)
             lock, file, writer = WriterLock(temporary), None, None
             try:
-                # A small cache: chunks are written whole and not read again.
+                # A small cache suffices: chunks are written completely and not read again.
                 file = h5py.File(
                     temporary,
                     "w",
@@ -211,23 +211,23 @@ class RecordingWriter:
         self._events.add(np.array([row], file_format.EVENT_DTYPE))
 
     def commit(self) -> Committed:
-        """Make all complete chunks safe on disk, and return what is safe.
+        """Make all complete chunks safe on disk, and return the numbers of safe rows.
 
         Raises
         ------
         RecordingError
-            If the file cannot be written (disk full, device removed); what earlier commits
-            acknowledged stays.
+            If the file cannot be written (disk full, device removed); rows acknowledged earlier
+            remain safe.
         """
         return self._commit(closed=False)
 
     def close(self) -> Committed:
-        """Write and commit everything, and close the file.
+        """Write and commit all buffered rows, and close the file.
 
         Raises
         ------
         RecordingError
-            If the file cannot be written; it is closed all the same.
+            If the file cannot be written; it is nevertheless closed.
         """
         try:
             with self._guarded():
@@ -248,7 +248,7 @@ class RecordingWriter:
             self.abandon()
 
     def discard(self) -> None:
-        """Close and remove the file: nothing was acknowledged that is only there."""
+        """Close and remove the file, which must not hold acknowledged rows."""
         self.abandon()
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
@@ -264,11 +264,11 @@ class RecordingWriter:
                 self._hidden.unlink(missing_ok=True)
 
     def _close_hdf5(self) -> None:
-        """Close the file; what HDF5 cannot free then is no matter for standard error."""
+        """Close the file; do not print errors of HDF5 while it frees objects."""
         before = sys.unraisablehook
         sys.unraisablehook = lambda _: None
         self._file.close()
-        sys.unraisablehook = before  # not after an error: its objects are freed later
+        sys.unraisablehook = before  # not after an error: objects are then freed later
 
     def _close_file(self) -> None:
         try:
@@ -322,7 +322,7 @@ class RecordingWriter:
         return {**rows, "": (self._events.written,)}
 
     def _check_place(self) -> None:
-        """Check that the file still has its name: nobody would find what is written to it."""
+        """Check that the file still has its name, so that users can find it."""
         place = self._hidden or self.path
         written = os.fstat(self._file.id.get_vfd_handle())
         try:

@@ -100,7 +100,7 @@ class Pass:
         self.left_out: Counter[Reason] = Counter()
         self.stillness = FlatlineDetector(self.welch.hop, self.n_channels, self.welch.sampling_rate)
         self.taken_at: list[FloatArray] = []
-        self.aligned.forget()
+        self.aligned.reset_delays()
         self._meter: DelayEstimator | None = None
 
     @property

@@ -1,4 +1,4 @@
-"""Rows of a recording in bulk: whole chunks written and read, blocks kept and checked.
+"""Bulk access to the rows of a recording: complete chunks, tables of blocks, checksums.
 
-Knows datasets and counts; opens and names no file.
+Uses datasets and counts; opens and names no file.
 """

@@ -1,7 +1,7 @@
 """The committed blocks of a sensor; a long recording has millions.
 
 Rows stay in the file and are read on demand: a reader that follows a recording needs each row once.
-Only the clipped stretches are kept in memory, since they are needed again and again.
+Only the clipped stretches are kept in memory, since they are needed repeatedly.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class BlockTable:
                 break
 
     def covering(self, first_row: int, last_row: int) -> NDArray[np.void]:
-        """Return the blocks that hold rows of samples, ``last_row`` not included."""
+        """Return the blocks with rows ``first_row`` to ``last_row`` (not included) of samples."""
         marks = self._marks
         begin = (bisect.bisect_right(marks, first_row) - 1) * _ROWS_PER_MARK
         end = bisect.bisect_left(marks, last_row) * _ROWS_PER_MARK
@@ -93,12 +93,12 @@ class BlockTable:
         return np.asarray(blocks[(ends > first_row) & (blocks["first_row"] < last_row)])
 
     def _check_contiguous(self, blocks: NDArray[np.void]) -> None:
-        """Check that each block begins in the file where the one before ends.
+        """Check that each block begins at the row where the previous one ends.
 
         Raises
         ------
         RecordingError
-            With the row of the table that does not.
+            With the first wrong row of the table.
         """
         ends = blocks["first_row"] + blocks["n_samples"]
         expected = np.append(self.n_samples, ends[:-1]) if len(blocks) else ends
@@ -111,7 +111,7 @@ class BlockTable:
             )
 
     def _mark(self, blocks: NDArray[np.void]) -> None:
-        """Note the first row of samples of every so many blocks."""
+        """Store the first row of samples of every ``_ROWS_PER_READ``-th block."""
         first = -self._n_rows % _ROWS_PER_MARK
         self._marks += blocks["first_row"][first::_ROWS_PER_MARK].tolist()
 

@@ -1,15 +1,15 @@
-"""Checks many small blocks against their CRC-32 at once.
+"""Checks the CRC-32 of many small blocks together.
 
 Theory of operation
 -------------------
-The stored checksum of a block runs over its counts and then over its row of the table. A call for
-each of them would cost twice the rest. So blocks of equal length are laid one after another and
-checksummed together; the result is compared with the one that their stored checksums imply.
-A CRC is linear: that of a message followed by n bytes is that of the message, n zero bytes further
-on, exclusive-or that of the n bytes. Going on by n zero bytes is a multiplication by a matrix over
-GF(2). Neighbours are joined in pairs, pairs of pairs, and so on.
+The stored checksum of a block covers its counts and then its row of the table. Separate calls for
+all blocks would cost twice as much as the rest of a read. So blocks of equal length are
+concatenated and checksummed together, and the result is compared with the value that their stored
+checksums imply. A CRC is linear: the CRC of a message followed by n bytes is the CRC of the message
+followed by n zero bytes, XOR the CRC of the n bytes. Appending n zero bytes is a multiplication by
+a matrix over GF(2). Neighbours are joined in pairs, then pairs of pairs, and so on.
 
-Only where the two differ is each block checked by itself.
+Single blocks are checked only if the two values differ.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from daq.recording.file_format import BLOCK_DTYPE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_POLYNOMIAL = 0xEDB88320  # of CRC-32, reflected
+_POLYNOMIAL = 0xEDB88320  # CRC-32, reflected
 _PLACES = np.arange(32, dtype=np.uint32)
 _BITS = np.uint32(1) << _PLACES
 _ROW_BYTES = BLOCK_DTYPE.itemsize - BLOCK_DTYPE["crc32"].itemsize
 
 
 def intact_blocks(blocks: NDArray[np.void], counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which blocks have their checksums.
+    """Return whether each block has its stored checksum.
 
     Parameters
     ----------
     blocks : BLOCK_DTYPE, shape (n_blocks,)
         Contiguous in the file.
     counts : ndarray, shape (n_rows, n_channels)
-        Counts of the first block's first row and of all that follow.
+        Counts from the first block's first row on.
 
     Returns
     -------
@@ -68,10 +68,10 @@ def intact_blocks(blocks: NDArray[np.void], counts: NDArray[Any]) -> NDArray[np.
 
 
 def _joined(crcs: NDArray[np.uint32], n_bytes: int) -> int:
-    """Return the CRC-32 of messages of ``n_bytes``, one after another, from that of each."""
+    """Return the CRC-32 of concatenated messages of ``n_bytes`` each, from their CRCs."""
     crcs = crcs.astype(np.uint32)
     while len(crcs) > 1:
-        if len(crcs) % 2:  # before the first message there is nothing, which has the CRC 0
+        if len(crcs) % 2:  # prepend an empty message, whose CRC is 0
             crcs = np.concatenate([np.zeros(1, np.uint32), crcs])
         first, second = crcs[::2], crcs[1::2]
         table = _advance(n_bytes)

@@ -1,8 +1,8 @@
-"""Reads many small chunks of a dataset at once, also from several threads.
+"""Reads many small chunks of a dataset together, also from several threads.
 
-HDF5 holds one lock for the whole process while it reads and decompresses. Here HDF5 only fetches
-the stored chunks. ISA-L decompresses them without a lock, in little more than half of zlib's time;
-where it is not installed, zlib does. Then numpy unshuffles the bytes of all chunks together.
+HDF5 holds one lock for the whole process while it reads and decompresses. So HDF5 only reads the
+stored chunks. ISA-L decompresses them without a lock, in little more than half of zlib's time; zlib
+is the fallback. Then numpy unshuffles the bytes of all chunks together.
 
 The Adler-32 in the zlib stream, over the decompressed bytes, shows whether a chunk is intact. The
 Fletcher-32 that HDF5 appends, over the compressed bytes, adds nothing and is not checked.
@@ -23,7 +23,7 @@ except ModuleNotFoundError:  # the extra "fast" is not installed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_KEPT_BYTES = 1 << 20  # of what was read last: a short recording is read several times
+_KEPT_BYTES = 1 << 20  # cache of the last read: short recordings are read several times
 _PIPELINE = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 
 
@@ -53,9 +53,9 @@ class ChunkedRows:
         Raises
         ------
         OSError, RuntimeError
-            If the file is damaged there.
+            If the file is damaged at these rows.
         """
-        # HDF5 caches the chunk of which only a part is read.
+        # For parts of a chunk HDF5 is used, which caches the chunk.
         if self._direct and last_row - first_row >= self._length:
             kept_from, kept = self._last
             if kept_from <= first_row and last_row <= kept_from + len(kept):
@@ -66,7 +66,7 @@ class ChunkedRows:
         return np.asarray(self._dataset[first_row:last_row])
 
     def _decompressed(self, first_row: int, last_row: int) -> NDArray[Any] | None:
-        """Return rows, or None where HDF5 must read them itself."""
+        """Return rows, or None if HDF5 must read them."""
         start = first_row // self._length * self._length
         fetch, corner, n_bytes = self._dataset.id.read_direct_chunk, self._corner, self._n_bytes
         try:

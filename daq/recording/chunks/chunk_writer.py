@@ -1,4 +1,4 @@
-"""Buffers the rows of one sensor: samples become whole chunks, small blocks are merged."""
+"""Buffers the rows of one sensor: writes complete chunks of samples, merges small blocks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TableBuffer:
         self._waiting: list[NDArray[np.void]] = []
         self.n_rows = 0
         self.written = b""
-        """What the last `write` wrote."""
+        """Rows written by the last `write`, as bytes."""
 
     def add(self, row: NDArray[np.void]) -> None:
         """Buffer a row until the next `write`."""
@@ -55,7 +55,7 @@ class TableBuffer:
 
 
 class ChunkBuffer:
-    """Appends rows to a dataset in whole chunks; the rows of an incomplete chunk are buffered."""
+    """Appends rows to a dataset in complete chunks; buffers the rows of an incomplete chunk."""
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self.dataset = dataset
@@ -65,10 +65,10 @@ class ChunkBuffer:
         self.n_written = 0
 
     def write_again(self) -> None:
-        """Write the chunks that are not safe yet once more, around HDF5's cache.
+        """Write the chunks that are not yet safe again, without HDF5's cache.
 
-        HDF5 forgets a chunk that it could not write, or keeps a wrong one. Here the chunks go
-        into the file as they are, past all filters, and are read back.
+        HDF5 loses a chunk that it could not write, or keeps a wrong one. This method writes chunks
+        directly, without filters, and reads them back.
 
         Raises
         ------
@@ -88,11 +88,11 @@ class ChunkBuffer:
                     raise OSError(f"{self.dataset.name}: a chunk was not stored as written")
 
     def are_safe(self) -> None:
-        """Forget what has been written: the file has been flushed."""
+        """Drop the written chunks: the file has been flushed."""
         self._unsafe.clear()
 
     def add(self, rows: NDArray[Any]) -> None:
-        """Add rows, and write the chunks that are complete."""
+        """Add rows, and write the complete chunks."""
         length = len(self._buffer)
         taken = min(len(rows), length - self._filled) if self._filled else 0
         if taken:
@@ -149,8 +149,8 @@ class _OpenBlock:
 class SensorRows:
     """Buffers samples, blocks and gaps of one sensor.
 
-    Small contiguous blocks are merged into one row of ``blocks`` of up to a tenth of a second: at
-    200 Hz a serial port delivers three or four samples at a time, which take less space than a row.
+    Small contiguous blocks are merged into one row of ``blocks`` of up to 0.1 s: at 200 Hz a serial
+    port delivers three or four samples per read, which take less space than a row.
     """
 
     def __init__(self, group: h5py.Group, sensor: SensorLayout) -> None:
@@ -172,7 +172,7 @@ class SensorRows:
         Raises
         ------
         RecordingError
-            If its shape or type is not that of the sensor.
+            If its shape or type differs from that of the sensor.
         """
         counts = self._converted(block)
         if self._polled is None:
@@ -189,7 +189,7 @@ class SensorRows:
             self.instants.add(block.instants_ns)
 
     def collect(self) -> None:
-        """Add the blocks whose samples are all written to the table of blocks."""
+        """Add the blocks with completely written samples to the table of blocks."""
         written = self.samples.n_written
         if self._polled:
             written = min(written, self.instants.n_written)
@@ -204,12 +204,12 @@ class SensorRows:
         del self._finished[:done]
 
     def write_again(self) -> None:
-        """Write the samples that are not safe yet once more."""
+        """Write the samples that are not yet safe again."""
         self.samples.write_again()
         self.instants.write_again()
 
     def are_safe(self) -> None:
-        """Forget the samples that have been written."""
+        """Drop the written samples: they are safe."""
         self.samples.are_safe()
         self.instants.are_safe()
 
@@ -221,13 +221,13 @@ class SensorRows:
 
     @property
     def committable_rows(self) -> int:
-        """Number of rows of samples in the blocks that are in their table."""
+        """Number of rows of samples in the blocks of the table."""
         if self._finished:
             return int(self._finished[0]["first_row"][0])
         return self._n_rows if self._current is None else self._current.first_row
 
     def _merge(self, block: Block) -> bool:
-        """Add a block to the current one and return True, or begin another one."""
+        """Merge a block into the current one; return False if it begins a new one."""
         current = self._current
         if (
             current is not None

@@ -1,1 +1,1 @@
-"""How a recording lies on the disk: superblock, locks, and how its file is opened."""
+"""The file of a recording: superblock, locks, journal, names, and safe opening."""

@@ -1,19 +1,19 @@
-"""The journal beside a growing recording, from which the recording can be built again.
+"""The journal of a growing recording, from which the recording can be rebuilt.
 
 Theory of operation
 -------------------
 HDF5 rewrites its metadata in place: object headers, chunk indexes, the last chunk of a table. A
 power cut can leave such a block half old and half new; its checksum is then wrong, and HDF5 refuses
-the whole file. The stored chunks of samples, however, are written once and never touched again.
+the whole file. The stored chunks of samples, however, are written only once.
 
-So what a commit acknowledges is also appended to ``<recording>.journal``: where each new chunk lies
-in the recording, the new rows of the tables, and how many rows are safe. The journal begins with
-the recording as it was created. From it, and from the chunks in the damaged file,
-:func:`rebuild` makes the recording again. A clean close removes the journal.
+So each commit also appends to ``<recording>.journal``: the position of each new chunk in the
+recording, the new rows of the tables, and the number of safe rows. The journal begins with the
+newly created recording. :func:`rebuild` writes the recording again from the journal and the chunks
+in the damaged file. A clean close removes the journal.
 
 A journal is a line, ``huddle-journal 1``, and frames: length and CRC-32 of a payload, and the
-payload, deflated. It is only appended to and fsynced after each frame; reading ends at the first
-frame that is not whole.
+deflated payload. Frames are only appended, each followed by an fsync; reading ends at the first
+incomplete frame.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ _MAGIC = b"huddle-journal 1\n"
 _FRAME = struct.Struct("<II")
 _MAX_FRAME = 1 << 30
 _WINDOW = 1 << 20
-"""Bytes before the end of a recording, as it was, in which HDF5 may still place a chunk."""
+"""Bytes before the previous end of a recording in which HDF5 may still place a chunk."""
 CHUNKED = ("samples", "instants")
 TABLES = ("blocks", "gaps")
 
 
 def journal_path(recording: Path) -> Path:
-    """Return where the journal of a recording is."""
+    """Return the path of a recording's journal."""
     return recording.with_name(f"{recording.name}.journal")
 
 
@@ -57,7 +57,7 @@ class Journal:
     Parameters
     ----------
     path : Path
-        Of the recording, which has been created and flushed.
+        Path of the recording, which has been created and flushed.
     file : h5py.File
         The recording.
     mode : int
@@ -69,7 +69,7 @@ class Journal:
         self._source = file.id.get_vfd_handle()
         self._searched = os.fstat(self._source).st_size
         self._n_chunks: dict[h5py.Dataset, int] = {}
-        # A journal that is there already belongs to a recording that is not there any more.
+        # An existing journal belongs to a recording that no longer exists.
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
         self._handle = os.open(self.path, flags, mode)
         try:
@@ -85,14 +85,14 @@ class Journal:
         tables: Mapping[str, Sequence[bytes]],
         counts: np.ndarray[Any, np.dtype[np.int64]],
     ) -> None:
-        """Append what is safe in the recording since the last commit, and fsync.
+        """Append the rows that became safe since the last commit, and fsync.
 
         Parameters
         ----------
         chunked : mapping
-            By sensor: its datasets `CHUNKED`.
+            Datasets `CHUNKED` of each sensor.
         tables : mapping
-            By sensor: its new rows of `TABLES`; by ``""``: the new rows of the events.
+            New rows of the `TABLES` of each sensor; the key ``""`` has the new rows of the events.
         counts : int64, shape (n_sensors + 1, 3)
             The new ``/committed``.
         """
@@ -107,7 +107,7 @@ class Journal:
         window = _Window(self._source, self._searched) if new else None
         for sensor, kind, (mask, content) in new:
             offset = window.find(content) if window is not None else -1
-            if offset < 0:  # nowhere near the end: kept here
+            if offset < 0:  # not found near the end: the journal holds the chunk itself
                 contents.append(content)
             entry = stored.setdefault(sensor, [[] for _ in CHUNKED])
             entry[kind].append([offset, len(content), mask])
@@ -137,12 +137,12 @@ class Journal:
         os.fsync(self._handle)
 
     def _write_at_end(self, end: int, frame: bytes) -> None:
-        os.ftruncate(self._handle, end)  # of what a failed write has left
+        os.ftruncate(self._handle, end)  # remove the rest of a failed write
         while frame:
             frame = frame[os.write(self._handle, frame) :]
 
     def close(self) -> None:
-        """Close the journal and leave it where it is; may be called again."""
+        """Close the journal without removing it; may be called again."""
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
@@ -154,7 +154,7 @@ class Journal:
 
 
 class _Window:
-    """The end of a recording, where new chunks lie."""
+    """The end of a recording, which has the new chunks."""
 
     def __init__(self, handle: int, searched: int) -> None:
         self.end = os.fstat(handle).st_size
@@ -163,7 +163,7 @@ class _Window:
         self._next = 0
 
     def find(self, content: bytes) -> int:
-        """Return where in the recording these bytes are, or -1."""
+        """Return the position of these bytes in the recording, or -1."""
         at = self._content.find(content, self._next)
         if at < 0:
             at = self._content.find(content)
@@ -175,18 +175,19 @@ class _Window:
 
 @dataclass(slots=True)
 class JournalContents:
-    """What a journal holds.
+    """Contents of a journal.
 
     Attributes
     ----------
     created : bytes
-        The recording as it was created, as a closed file.
+        The newly created recording, as a closed file.
     counts : int64, shape (n_sensors + 1, 3)
         The last ``/committed``.
     chunks : dict
-        By (sensor, dataset): offset, size, filter mask, and bytes where the offset is negative.
+        Offset, size, filter mask of each chunk, and its bytes if the offset is negative, by
+        (sensor, dataset).
     tables : dict
-        By (sensor, dataset), or ("", "events"): all rows.
+        All rows, by (sensor, dataset) or ("", "events").
     """
 
     created: bytes
@@ -198,7 +199,7 @@ class JournalContents:
 
 
 def read_journal(recording: Path) -> JournalContents | None:
-    """Return what the journal of a recording holds; None if there is none that is usable."""
+    """Return the contents of a recording's journal; None without a usable one."""
     found: JournalContents | None = None
     for payload in _frames(journal_path(recording)):
         if found is None:
@@ -242,12 +243,12 @@ def _add(found: JournalContents, payload: bytes) -> None:
 
 
 def rebuild(damaged: Path, contents: JournalContents, copy: Path) -> None:
-    """Write a recording anew from its journal and from the chunks in the damaged file.
+    """Write a recording again from its journal and the chunks in the damaged file.
 
     Parameters
     ----------
     damaged : Path
-        The recording as it is; not changed.
+        The damaged recording; not changed.
     contents : JournalContents
     copy : Path
         File to write.

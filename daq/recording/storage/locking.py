@@ -1,8 +1,8 @@
-"""Marks a recording as being written.
+"""Lock that marks a recording as being written.
 
 HDF5 releases its own lock when a writer switches to SWMR. So the writer holds a shared ``flock``:
-our readers take no lock, other readers a shared one, and programs that open the file for writing,
-plain h5py included, are refused. The lock ends with the process, however the process ends.
+huddle's readers take no lock, other readers a shared one, and programs that open the file for
+writing, including plain h5py, are refused. The system releases the lock when the process ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 IS_SEEN: bool = sys.platform != "win32"
-"""Whether `is_being_written` can tell: on Windows there is no lock beyond HDF5's own."""
+"""Whether `is_being_written` works: Windows has only HDF5's own lock."""
 
 
 class WriterLock:
@@ -38,8 +38,8 @@ class WriterLock:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether a living process is writing this recording."""
-    if sys.platform == "win32":  # no protection beyond HDF5's own
+    """Return whether a running process is writing this recording."""
+    if sys.platform == "win32":  # only HDF5's own lock
         return False
     handle = os.open(path, os.O_RDONLY)
     try:

@@ -1,4 +1,4 @@
-"""Names and permissions of recordings: taken exclusively, and made to survive a power cut."""
+"""Names and permissions of recordings: exclusive, and durable over power cuts."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from daq.protocols.block import HostTime
 
 PRIVATE = 0o600
-"""Permissions of a recording: whoever can read one can stop its recorder."""
+"""Permissions of a recording: users who can read it can stop its recorder."""
 CONTINUES = "continues"
-"""Attribute of a recording that continues another, which the disk refused: the other's run_id."""
+"""Attribute of a recording that continues another after a disk error: the run_id of the other."""
 _STALE_SECONDS = 60.0
-"""Age from which a temporary file that nobody writes is taken for a leftover."""
+"""Age in s from which a temporary file without a writer is a leftover."""
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
 
 
@@ -38,18 +38,18 @@ def create_private(path: Path) -> None:
     Raises
     ------
     FileExistsError
-        If there is one.
+        If the file exists.
     """
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, PRIVATE))
 
 
 def publish(temporary: Path, path: Path) -> None:
-    """Give a file its name, which must be free.
+    """Rename a file to its final name, which must be free.
 
     Raises
     ------
     RecordingError
-        If a file has that name.
+        If a file with this name exists.
     """
     try:
         _take_name(temporary, path)
@@ -70,17 +70,17 @@ def _take_name(temporary: Path, path: Path) -> None:
 
 
 def taken(path: Path) -> RecordingError:
-    """Return the error that a recording has this name already."""
+    """Return the error for a name that is not free."""
     return RecordingError(f"{path}: exists already; expected a new file")
 
 
 def continuation_names(path: Path) -> Iterator[Path]:
-    """Yield the names that continuations of a recording may have, in their order."""
+    """Yield the possible names of continuations of a recording, in order."""
     return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove what killed writers of this recording have left under temporary names."""
+    """Remove temporary files left by killed writers of this recording."""
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*new"):
         with contextlib.suppress(OSError):
             age = time.time() - leftover.stat().st_mtime
@@ -89,8 +89,8 @@ def remove_leftovers(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Make the contents of a closed file survive a power loss."""
-    handle = os.open(path, os.O_RDWR)  # Windows syncs only what may be written
+    """Make the contents of a closed file durable over a power loss."""
+    handle = os.open(path, os.O_RDWR)  # Windows syncs only files open for writing
     try:
         os.fsync(handle)
     finally:
@@ -98,7 +98,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_directory(path: Path) -> None:
-    """Make the names in a directory survive a power loss (not possible on Windows)."""
+    """Make the names in a directory durable over a power loss (not possible on Windows)."""
     if sys.platform == "win32":
         return
     handle = os.open(path, os.O_RDONLY)

@@ -1,11 +1,11 @@
-"""Opens the HDF5 file of a recording, in bounded time whatever the file holds.
+"""Opens the HDF5 file of a recording, in bounded time for any content.
 
 Theory of operation
 -------------------
-Only a file that is being written is opened as a SWMR reader. HDF5 then reads a metadata block whose
-checksum is wrong again, up to 100 times, and doubles the pause before each attempt: in a damaged
-file that takes longer than an hour. So the number of attempts is limited for such files. A file at
-rest is opened plainly, where one attempt is made.
+Only a file that is being written is opened as a SWMR reader. HDF5 then repeats the read of a
+metadata block with a wrong checksum up to 100 times, and doubles the pause before each attempt: in
+a damaged file this takes longer than an hour. So the number of attempts is limited for such files.
+A file at rest is opened without SWMR, and read with one attempt.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 READ_ATTEMPTS = 30
-"""Attempts to read a metadata block that its writer may be rewriting: one second in all."""
+"""Attempts to read a metadata block that its writer may be rewriting: one second in total."""
 _DRIVER = "huddle-growing"
 
 
@@ -37,7 +37,7 @@ def open_file(path: Path) -> h5py.File:
     Raises
     ------
     NotARecordingError
-        If it is no HDF5 file, truncated, or damaged where HDF5 begins to read.
+        If it is no HDF5 file, truncated, or damaged at its root.
     RecordingError
         If it cannot be read.
     """
@@ -55,25 +55,25 @@ def open_file(path: Path) -> h5py.File:
         if not superblock.is_open:
             with contextlib.suppress(OSError):  # open in this process as a SWMR reader: see below
                 return h5py.File(path, "r", locking=False)
-        # Through Python: HDF5 would share cached metadata with other readers of the file in this
-        # process, and beside one that has not been refreshed, return zeros in place of samples.
+        # As a Python file object: HDF5 would share cached metadata with other readers in this
+        # process, and return zeros instead of samples if one of them has not been refreshed.
         return h5py.File(source_of(path, superblock), "r")
     except (OSError, RuntimeError) as error:
         raise NotARecordingError(f"{path}: cannot be opened as HDF5: {error}") from error
 
 
 def refresh(dataset: h5py.Dataset) -> None:
-    """Read again what a writer may have changed of a dataset.
+    """Read the metadata of a dataset again, because a writer may have changed it.
 
-    At rest nothing changes, and nothing is read again: where two readers of the process have the
-    file open, HDF5 would lose the chunks of the dataset, and return zeros in place of rows.
+    Files at rest are not read again: if two readers in the process have the file open, HDF5 would
+    lose the chunks of the dataset, and return zeros instead of rows.
     """
     if dataset.file.swmr_mode:
         dataset.refresh()
 
 
 def source_of(path: Path, superblock: Superblock) -> ClearedFile | Path:
-    """Return what HDF5 opens as a file at rest, even if a program is writing it."""
+    """Return a source that HDF5 opens as a file at rest, even if a program is writing it."""
     return ClearedFile(path, superblock) if superblock.version == 3 else path
 
 
@@ -83,7 +83,7 @@ def _register_driver() -> None:
 
 
 def _set_driver(access: Any, **_: object) -> None:  # noqa: ANN401 - h5py is untyped
-    """Make a file access list limit the attempts; h5py has no name for that."""
+    """Limit the attempts in a file access list; h5py has no function for this."""
     access.set_fapl_sec2()
     limit = _attempts_setter()
     if limit is not None:
@@ -92,10 +92,10 @@ def _set_driver(access: Any, **_: object) -> None:  # noqa: ANN401 - h5py is unt
 
 @cache
 def _attempts_setter() -> Callable[[int, int], int] | None:
-    """Return ``H5Pset_metadata_read_attempts`` of the library that h5py has loaded."""
+    """Return ``H5Pset_metadata_read_attempts`` of the HDF5 library loaded by h5py."""
     try:
         function = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-    except (AttributeError, OSError):  # Windows looks for no function in a library's dependencies
+    except (AttributeError, OSError):  # Windows does not search a library's dependencies
         return None
     function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_uint), ctypes.c_int
     return function

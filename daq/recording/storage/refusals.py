@@ -1,7 +1,7 @@
-"""Refuses what a recording never holds: links, external storage, objects, impossible lengths.
+"""Refuses files with contents that recordings never have.
 
-A file from elsewhere must not make its reader follow a link, open another file, load a filter, or
-allocate more than the file can fill.
+These are links, external storage, objects, and impossible lengths. A file must not make its reader
+follow a link, open another file, load a filter, or allocate more memory than the file can fill.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MAX_CHUNK = 1 << 28
-"""Bytes of a chunk."""
+"""Maximum size of a chunk in bytes."""
 _MAX_INFLATION = 1100
-"""No deflated byte becomes more bytes: 1032, and some for what surrounds them."""
+"""Maximum ratio of inflated to deflated size: 1032, and a margin for headers."""
 _FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}
 _DAMAGE = (AttributeError, IndexError, KeyError, MemoryError, OSError, RuntimeError, TypeError)
 
 
 @contextlib.contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Convert whatever h5py raises on a damaged file to NotARecordingError."""
+    """Convert errors of h5py on a damaged file to NotARecordingError."""
     try:
         yield
     except RecordingError:
@@ -40,7 +40,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 
 def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyped
-    """Return a group or dataset that lies in the file itself."""
+    """Return a group or dataset stored in the file itself."""
     where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
     if "/" in name or name in {"", ".", ".."}:
         raise NotARecordingError(f"{where}: not a name")
@@ -53,13 +53,13 @@ def member(group: h5py.Group, name: str) -> Any:  # noqa: ANN401 - h5py is untyp
 
 
 def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) -> h5py.Dataset:
-    """Return a dataset of numbers that lie in the file itself.
+    """Return a dataset of numbers stored in the file itself.
 
     Raises
     ------
     NotARecordingError
-        If it is a link, stored elsewhere, filtered otherwise than a recording is, of another type
-        than expected, or longer than the file could hold.
+        If it is a link, is stored elsewhere, has other filters or another type than expected, or is
+        longer than the file can hold.
     """
     found = member(group, name)
     where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
@@ -84,12 +84,12 @@ def dataset(group: h5py.Group, name: str, dtype: np.dtype[Any] | None = None) ->
 
 
 def check_length(found: h5py.Dataset) -> None:
-    """Refuse a dataset that is longer than its file could hold.
+    """Check the length of a dataset.
 
     Raises
     ------
     NotARecordingError
-        If it is.
+        If it is longer than its file can hold.
     """
     n_bytes = float(np.prod(found.shape, dtype=float)) * found.dtype.itemsize
     held = _n_bytes(found.file)
@@ -106,16 +106,16 @@ def check_length(found: h5py.Dataset) -> None:
 def _n_bytes(file: h5py.File) -> int:
     if file.driver == "fileobj":
         return int(file.id.get_filesize())
-    return os.fstat(file.id.get_vfd_handle()).st_size  # of a growing file, the present one
+    return os.fstat(file.id.get_vfd_handle()).st_size  # the current size of a growing file
 
 
 def check_counts(counts: np.ndarray[Any, np.dtype[Any]], n_sensors: int) -> None:
-    """Refuse numbers of ``/committed`` that cannot be.
+    """Check type, shape and range of ``/committed``.
 
     Raises
     ------
     ValueError
-        Saying what was expected.
+        If one of them is wrong.
     """
     if counts.shape != (n_sensors + 1, 3) or counts.dtype != np.int64:
         raise ValueError(
@@ -127,7 +127,7 @@ def check_counts(counts: np.ndarray[Any, np.dtype[Any]], n_sensors: int) -> None
 
 
 def text(attributes: h5py.AttributeManager, name: str) -> str:
-    """Return an attribute that is a text."""
+    """Return an attribute; raise TypeError if it is no text."""
     found = attributes[name]
     if not isinstance(found, str):
         raise TypeError(f"attribute {name} is {type(found).__name__}; expected a text")
@@ -135,7 +135,7 @@ def text(attributes: h5py.AttributeManager, name: str) -> str:
 
 
 def number(attributes: h5py.AttributeManager, name: str) -> float:
-    """Return an attribute that is one finite number."""
+    """Return an attribute; raise TypeError if it is no finite number."""
     found = attributes[name]
     if not isinstance(found, (float, int, np.floating, np.integer)) or not np.isfinite(found):
         raise TypeError(f"attribute {name} is {found!r}; expected a number")

@@ -1,4 +1,4 @@
-"""Repeats writes that the disk refused: one that is full or disturbed for a moment ends no run."""
+"""Repeats writes that the disk refused, so that a transient error does not end a run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 PAUSES = (0.05, 0.2, 0.75)
-"""Seconds before each repetition; samples wait in the buffers of the recorder meanwhile."""
+"""Seconds before each repetition; meanwhile the recorder buffers samples."""
 
 
 def repeated(
@@ -20,14 +20,14 @@ def repeated(
     before: Callable[[], None] = lambda: None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Do a write that may be done twice; repeat it if the disk refuses, after `before`.
+    """Run `write`, which must be repeatable; if the disk refuses, run `before` and repeat.
 
-    Not for ``fsync``: after one that failed, a second one succeeds although the data are lost.
+    Not for ``fsync``: after a failed one, a second one succeeds although the data are lost.
 
     Raises
     ------
     OSError, RuntimeError
-        As `write` does, if the last repetition fails, too.
+        As `write`, if the last repetition also fails.
     """
     try:
         write()
@@ -49,5 +49,5 @@ def repeated(
 
 
 def report(error: BaseException) -> None:
-    """Log a write that failed."""
+    """Log a failed write."""
     _LOGGER.warning("a write to the recording failed and is repeated: %s", error)

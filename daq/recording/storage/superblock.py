@@ -1,4 +1,4 @@
-"""The superblock of a recording: where the file ends, and whether a program is writing it.
+"""The superblock of a recording: end of the file, and flags of a writer.
 
 A killed SWMR writer leaves flags in the superblock that forbid a plain open, and an end-of-file
 address that may be too small or, on a full disk, too large. If only the flags are cleared, HDF5
@@ -29,7 +29,7 @@ _MASK = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class Superblock:
-    """The first bytes of a file, and its length."""
+    """The first bytes of a file and its length."""
 
     head: bytes
     n_bytes: int
@@ -47,7 +47,7 @@ class Superblock:
         """
         try:
             status = path.stat()
-            is_file = stat.S_ISREG(status.st_mode)  # a pipe would be waited for
+            is_file = stat.S_ISREG(status.st_mode)  # reading a pipe would block
             head = _first_bytes(path) if is_file else b""
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -65,16 +65,16 @@ class Superblock:
 
     @property
     def end(self) -> int:
-        """Length of the file in bytes, as the superblock has it; 0 in other versions."""
+        """Length of the file in bytes, according to the superblock; 0 in other versions."""
         return int(_FIELDS.unpack_from(self.head)[_END]) if self.version == 3 else 0
 
     @property
     def is_open(self) -> bool:
-        """Whether the program that wrote the file has not closed it."""
+        """Whether the writer of the file has not closed it."""
         return self.version == 3 and _FIELDS.unpack_from(self.head)[_FLAGS] != 0
 
     def cleared(self) -> bytes:
-        """Return the first bytes of the same file, closed, as long as it is."""
+        """Return the first bytes for a closed file of the actual length."""
         fields = list(_FIELDS.unpack_from(self.head))
         if fields[_VERSION] != 3:
             raise NotARecordingError(f"superblock version {fields[_VERSION]}; expected 3")
@@ -83,7 +83,7 @@ class Superblock:
         return head + struct.pack("<I", lookup3(head))
 
     def cleared_file(self) -> bytes:
-        """Return the whole file, closed, where `head` is all of it."""
+        """Return the file as a closed one, if `head` is the complete file."""
         cleared = self.cleared()
         return cleared + self.head[len(cleared) :]
 
@@ -94,7 +94,7 @@ def _first_bytes(path: Path) -> bytes:
 
 
 class ClearedFile(io.RawIOBase):
-    """A file to read, with its superblock cleared."""
+    """A readable file whose superblock appears closed."""
 
     def __init__(self, path: Path, superblock: Superblock) -> None:
         self._path = path
@@ -102,7 +102,7 @@ class ClearedFile(io.RawIOBase):
         self._head = superblock.cleared()
 
     def __repr__(self) -> str:
-        """Return the path, which is what h5py names in messages."""
+        """Return the path, which h5py uses in messages."""
         return str(self._path)
 
     def readable(self) -> bool:
@@ -114,15 +114,15 @@ class ClearedFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to a place of the file."""
+        """Set the position in the file."""
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
-        """Return where the next byte comes from."""
+        """Return the position in the file."""
         return self._file.tell()
 
     def readinto(self, buffer: memoryview, /) -> int:  # type: ignore[override]  # HDF5 gives this
-        """Fill a buffer as far as the file goes."""
+        """Read bytes into a buffer; return their number."""
         start = self._file.tell()
         n_bytes = self._file.readinto(buffer)
         if start < _SIZE and n_bytes:
@@ -148,7 +148,7 @@ def lookup3(key: bytes) -> int:
     for triple in whole:
         a, b, c = (a + triple[0]) & _MASK, (b + triple[1]) & _MASK, (c + triple[2]) & _MASK
         for rotation in (4, 6, 8, 16, 19, 4):
-            # The roles of a, b and c move on from round to round.
+            # The roles of a, b and c rotate from round to round.
             a = ((a - c) & _MASK) ^ _rotated(c, rotation)
             a, b, c = b, (c + b) & _MASK, a
     a, b, c = (a + last[0]) & _MASK, (b + last[1]) & _MASK, (c + last[2]) & _MASK

@@ -1,4 +1,4 @@
-"""The thread in which a recorder writes."""
+"""The writing thread of a recorder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class WritingThread:
         self._executor.shutdown()
 
     async def run(self, function: Callable[[], _Result]) -> _Result:
-        """Run a function in the thread, to its end even if this task is cancelled meanwhile."""
+        """Run a function in the thread; wait for its end even if this task is cancelled."""
         future = asyncio.get_running_loop().run_in_executor(self._executor, function)
         try:
             return await asyncio.shield(future)

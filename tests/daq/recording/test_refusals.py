@@ -112,7 +112,7 @@ def sensor_named_twice(file: h5py.File) -> None:
         (negative_count, "expected none below 0"),
         (more_than_there_is, "were committed"),
         (sensor_named_as_a_path, "not a name"),
-        (sensor_named_twice, "expected names that differ"),
+        (sensor_named_twice, "expected different names"),
     ],
 )
 def test_what_a_recording_never_holds_is_refused(
