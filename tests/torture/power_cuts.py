@@ -7,6 +7,9 @@ prefix    everything
 writes    a random part of the writes, each whole
 pages     a random part of the 4 KiB pages of each write
 sectors   a random part of the 512-byte sectors of each write
+
+Of the names that were given, changed and removed after the last fsync of their folder it has none
+(synced), all (prefix), or the first ones, so many by lot.
 """
 
 from __future__ import annotations
@@ -83,10 +86,11 @@ def recorded(library: Path, folder: Path, commits: int) -> list[Operation]:
     done = run_program(library, watched, commits, SHIM_LOG=str(log))
     if done.returncode:
         raise RuntimeError(done.stdout + done.stderr)
-    return list(_operations(log.read_bytes()))
+    return list(operations_of(log.read_bytes()))
 
 
-def _operations(log: bytes) -> Iterator[Operation]:
+def operations_of(log: bytes) -> Iterator[Operation]:
+    """Yield the entries of the log of ``shim.c``."""
     at = 0
     while at < len(log):
         kind, n_path, n_other, offset, n = _HEAD.unpack_from(log, at)
@@ -146,32 +150,70 @@ def _pieces(operation: Operation, size: int) -> Iterator[tuple[int, bytes]]:
         at = after
 
 
+@dataclass(slots=True)
+class _Disk:
+    """The files of a folder, by the names that programs see and by those that survive."""
+
+    seen: dict[str, _File] = field(default_factory=dict)
+    safe: dict[str, _File] = field(default_factory=dict)
+    waiting: list[tuple[str, _File | None]] = field(default_factory=list)
+
+    def apply(self, operation: Operation) -> None:
+        """Do what a program did."""
+        path, kind = operation.path, operation.kind
+        if kind in "RL":
+            self._name(operation.other, self.seen[path])
+        if kind in "RU":
+            self._name(path, None)
+        elif kind == "F" and path in self.seen:
+            self.seen[path].sync()
+        elif kind == "F":  # a folder
+            self._keep_names(len(self.waiting))
+        elif kind in "OTSW":
+            if path not in self.seen:
+                self._name(path, _File())
+            if kind != "O":
+                self.seen[path].waiting.append(operation)
+
+    def cut(self, model: str, rng: np.random.Generator) -> dict[str, bytearray]:
+        """Return what there is after a power cut, by name."""
+        n = len(self.waiting)
+        few = {"synced": 0, "prefix": n}
+        self._keep_names(few[model] if model in few else int(rng.integers(n + 1)))
+        for file in {id(file): file for file in self.safe.values()}.values():
+            file.cut(model, rng)
+        return {path: file.content for path, file in self.safe.items()}
+
+    def _name(self, path: str, file: _File | None) -> None:
+        _set(self.seen, path, file)
+        self.waiting.append((path, file))
+
+    def _keep_names(self, n: int) -> None:
+        for path, file in self.waiting[:n]:
+            _set(self.safe, path, file)
+        self.waiting.clear()
+
+
+def _set(names: dict[str, _File], path: str, file: _File | None) -> None:
+    if file is None:
+        names.pop(path, None)
+    else:
+        names[path] = file
+
+
 def replay(
     operations: Sequence[Operation], n: int, model: str, rng: np.random.Generator, folder: Path
 ) -> bytes:
     """Write the files as the disk has them after ``n`` operations; return what was acknowledged."""
-    files: dict[str, _File] = {}
+    disk = _Disk()
     acknowledged = b""
     for operation in operations[:n]:
-        path, kind = operation.path, operation.kind
-        if path.endswith("/acknowledged"):
+        if operation.path.endswith("/acknowledged"):
             acknowledged += operation.content
-        elif kind == "R":
-            files[operation.other] = files.pop(path)
-        elif kind == "L":
-            files[operation.other] = files[path]
-        elif kind == "U":
-            files.pop(path, None)
-        elif kind == "F":
-            if path in files:  # a folder is fsynced, too
-                files[path].sync()
-        elif kind == "O":
-            files.setdefault(path, _File())
         else:
-            files.setdefault(path, _File()).waiting.append(operation)
-    for path, file in files.items():
-        file.cut(model, rng)
-        (folder / Path(path).name).write_bytes(file.content)
+            disk.apply(operation)
+    for path, content in disk.cut(model, rng).items():
+        (folder / Path(path).name).write_bytes(content)
     return acknowledged
 
 

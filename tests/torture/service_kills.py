@@ -12,7 +12,6 @@ descriptors of the service went. The clock begins an hour before clocks change i
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -36,9 +35,7 @@ from daq.bench.tables.unattended import Schedule, ScheduledRun, Storage
 from daq.drivers.bench_file import load, parse
 from daq.errors import HuddleError
 from daq.python_process import python_command
-from daq.recording.reader import Recording
-from daq.recording.repair import verify
-from daq.recording.storage.journal import journal_path
+from tests.torture.service_checks import fault_of_recording, faults_of_results
 from tests.torture.service_program import FastClock
 from tui.service.records.run_state import RunState
 from tui.service.records.store import RunStore
@@ -198,36 +195,13 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
     parts = [(part, run) for run in runs if run.removed is None for part in run.parts]
     kept = {part for part, _ in parts}
     for part in sorted({part for part, run in parts if run.is_over}):
-        path = bench.recording_directory / part
-        try:
-            report = verify(path)
-        except HuddleError as error:
-            found.append(str(error))
-            continue
-        if not (report.intact and report.closed) or journal_path(path).exists():
-            found.append(f"{part}: not intact and closed")
+        found += filter(None, [fault_of_recording(bench.recording_directory / part)])
     for run in runs:
         if run.state is RunState.DONE and run.removed is None:
             last = bench.recording_directory / run.parts[-1]
-            found += _unfinished_results(last)
+            found += faults_of_results(last, report=True)
     there = {path.name for path in bench.recording_directory.glob("*.h5")}
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
-
-
-def _unfinished_results(recording: Path) -> list[str]:
-    """Return which results of a run that is done are not there or cut in the middle."""
-    found = []
-    with Recording.open(recording) as opened:
-        if not opened.result_attributes():
-            found.append(f"{recording.name}: no results")
-    try:
-        json.loads(recording.with_suffix(".json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        found.append(f"{recording.name}: JSON: {error}")
-    report = recording.with_suffix(".html")
-    if not (report.exists() and report.read_bytes().rstrip().endswith(b"</html>")):
-        found.append(f"{recording.name}: no whole report")
-    return found
 
 
 def slope(usage: list[tuple[float, ...]], column: int) -> str:
