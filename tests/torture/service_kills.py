@@ -181,7 +181,9 @@ def _is_left(run: Run, until: datetime) -> bool:
     return run.due < until and not run.is_over
 
 
-def faults(bench_path: Path, until: datetime) -> list[str]:
+def faults(
+    bench_path: Path, entry: ScheduledRun, until: datetime, *, has_reports: bool = True
+) -> list[str]:
     """Return what is wrong with the runs and recordings of a service."""
     bench = load(bench_path)
     store = RunStore(bench.recording_directory)
@@ -190,7 +192,7 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
     known = {run.due.timestamp() for run in runs}
     # What is due before a service has planned anything, nobody knows of.
     begin = min((run.due for run in runs), default=BEGIN) - timedelta(seconds=1)
-    due = takewhile(lambda at: at < until, due_times(ENTRY, begin))
+    due = takewhile(lambda at: at < until, due_times(entry, begin))
     found += [f"{at:%d %H:%M %Z}: no row" for at in due if at.timestamp() not in known]
     parts = [(part, run) for run in runs if run.removed is None for part in run.parts]
     kept = {part for part, _ in parts}
@@ -199,7 +201,7 @@ def faults(bench_path: Path, until: datetime) -> list[str]:
     for run in runs:
         if run.state is RunState.DONE and run.removed is None:
             last = bench.recording_directory / run.parts[-1]
-            found += faults_of_results(last, report=True)
+            found += faults_of_results(last, report=has_reports)
     there = {path.name for path in bench.recording_directory.glob("*.h5")}
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
 
@@ -265,7 +267,7 @@ def main() -> int:
             until = soak.clock.now() - timedelta(minutes=2)
             soak.finish(until)
         runs = RunStore(load(folder / "bench.toml").recording_directory).runs()
-        wrong = faults(folder / "bench.toml", until)
+        wrong = faults(folder / "bench.toml", ENTRY, until)
         print(f"{time.monotonic() - begin:.0f} s, kills {dict(soak.kills)}, {n_steps} clock steps")
         print("runs", dict(Counter(str(run.state) for run in runs)))
         print("of several parts", sum(len(run.parts) > 1 for run in runs))

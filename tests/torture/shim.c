@@ -1,5 +1,6 @@
 // Preloaded library: logs every change of a file under $SHIM_DIR with its content, in order, into
-// $SHIM_LOG, and makes calls fail: SHIM_FAIL=call:errno:first[:last] counts the calls named so.
+// $SHIM_LOG, and makes calls fail: SHIM_FAIL=call:errno:first[:last] counts the calls named so. While
+// the file $SHIM_TROUBLE holds an error number, everything that this error can strike fails with it.
 //
 // A log entry: kind (1 byte), lengths of two paths (2 x uint16), offset (int64), size (uint32), the
 // paths, the content. Kinds: O created, T truncated to nothing, W written, S set to a size, F
@@ -24,11 +25,12 @@
 
 static char *paths[MAX_FD];
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
-static const char *watched, *failing;
+static const char *watched, *failing, *trouble;
 static int log_fd = -1, fail_errno, fail_first, fail_last, n_calls;
 
 __attribute__((constructor)) static void start(void) {
     watched = getenv("SHIM_DIR");
+    trouble = getenv("SHIM_TROUBLE");
     const char *log = getenv("SHIM_LOG"), *fail = getenv("SHIM_FAIL");
     if (log) {
         int fd = REAL(open)(log, O_WRONLY | O_CREAT | O_APPEND, 0644);
@@ -45,7 +47,20 @@ __attribute__((constructor)) static void start(void) {
 
 static const char *path_of(int fd) { return fd >= 0 && fd < MAX_FD ? paths[fd] : NULL; }
 
+static int troubled(int opens, int changes) {
+    char text[8] = "";
+    int fd = trouble ? REAL(open)(trouble, O_RDONLY | O_CLOEXEC) : -1, error = 0;
+    if (fd >= 0) {
+        if (REAL(read)(fd, text, 7) > 0) error = atoi(text);
+        REAL(close)(fd);
+    }
+    if (!error || (error == EMFILE ? !opens : !changes)) return 0;
+    errno = error;
+    return 1;
+}
+
 static int fails(const char *call) {
+    if (troubled(0, 1)) return 1;
     if (!failing || strcmp(call, failing)) return 0;
     int n = __sync_add_and_fetch(&n_calls, 1);
     if (n < fail_first || n > fail_last) return 0;
@@ -89,6 +104,7 @@ static void opened(int fd, const char *path, int flags) {
 #define OPEN(name)                                                                                 \
     int name(const char *path, int flags, ...) {                                                   \
         MODE(mode)                                                                                 \
+        if (is_watched(path) && troubled(1, (flags & O_ACCMODE) != O_RDONLY)) return -1;           \
         int fd = REAL(name)(path, flags, mode);                                                    \
         opened(fd, path, flags);                                                                   \
         return fd;                                                                                 \
@@ -98,6 +114,7 @@ OPEN(open64)
 #define OPENAT(name)                                                                               \
     int name(int dir, const char *path, int flags, ...) {                                          \
         MODE(mode)                                                                                 \
+        if (is_watched(path) && troubled(1, (flags & O_ACCMODE) != O_RDONLY)) return -1;           \
         int fd = REAL(name)(dir, path, flags, mode);                                               \
         opened(fd, path, flags);                                                                   \
         return fd;                                                                                 \
@@ -141,11 +158,14 @@ ssize_t write(int fd, const void *data, size_t n) {
 }
 
 // Copies are refused: the caller then reads and writes.
-ssize_t sendfile(int out, int in, off_t *at, size_t n) {
-    if (!path_of(out)) return REAL(sendfile)(out, in, at, n);
-    errno = EINVAL;
-    return -1;
-}
+#define SENDFILE(name)                                                                             \
+    ssize_t name(int out, int in, off_t *at, size_t n) {                                           \
+        if (!path_of(out)) return REAL(name)(out, in, at, n);                                      \
+        errno = EINVAL;                                                                            \
+        return -1;                                                                                 \
+    }
+SENDFILE(sendfile)
+SENDFILE(sendfile64)
 
 #define FTRUNCATE(name)                                                                            \
     int name(int fd, off_t size) {                                                                 \
@@ -187,12 +207,14 @@ static void renamed(char kind, const char *from, const char *to) {
 }
 
 int rename(const char *from, const char *to) {
+    if (is_watched(to) && troubled(0, 1)) return -1;
     int result = REAL(rename)(from, to);
     if (!result && is_watched(to)) renamed('R', from, to);
     return result;
 }
 
 int link(const char *from, const char *to) {
+    if (is_watched(to) && troubled(0, 1)) return -1;
     int result = REAL(link)(from, to);
     if (!result && is_watched(to)) renamed('L', from, to);
     return result;
@@ -205,6 +227,7 @@ int linkat(int from_dir, const char *from, int to_dir, const char *to, int flags
 }
 
 int unlink(const char *path) {
+    if (is_watched(path) && troubled(0, 1) && errno != ENOSPC) return -1;
     int result = REAL(unlink)(path);
     if (!result && is_watched(path)) renamed('U', path, NULL);
     return result;

@@ -292,6 +292,9 @@ class Service:
         )
         try:
             outcome = await self._steps.finish(request)
+        except asyncio.CancelledError:  # by a stop: the estimate has not failed
+            self._save(replace(run, attempts=run.attempts - 1))
+            raise
         except (HuddleError, OSError) as error:
             _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
             await self._clock.sleep(RETRY * 2**run.attempts, self.stop)

@@ -16,6 +16,7 @@ from tui.service.processes.finish import Outcome
 from tui.service.processes.steps import FinishFailedError
 from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
 from tui.service.records.store import RunStore, StoreError
+from tui.service.service import MAX_ATTEMPTS
 from tui.service.window import STALL, STOPPED
 from tui.service.window import START as START_LIMIT
 
@@ -64,6 +65,15 @@ async def test_a_stop_in_the_last_second_of_a_window_ends_the_service(tmp_path: 
         await place.serve(HOUR + 569)  # 13:09:59
     (run,) = place.store.unfinished("lab")
     assert (run.state, run.reason) == (RunState.ESTIMATING, "")
+
+
+async def test_stops_do_not_use_up_the_attempts_of_an_estimate(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    await place.serve(HOUR + 580)  # 13:10:10
+    for _ in range(MAX_ATTEMPTS + 1):
+        await place.serve(10)
+    (run,) = place.store.unfinished("lab")
+    assert (run.state, run.attempts) == (RunState.ESTIMATING, 0)
 
 
 async def test_a_killed_service_finds_its_recorder_again(tmp_path: Path) -> None:
