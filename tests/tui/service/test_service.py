@@ -138,10 +138,11 @@ async def test_a_killed_recorder_is_followed_by_another(tmp_path: Path) -> None:
 async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.steps.refuses = True
-    place.steps.endings = [(3.0, "a: no answer")] * 20
+    reason = "a: no answer; b: no answer"
+    place.steps.endings = [(3.0, reason)] * 20
     await place.serve(1.2 * HOUR)
     run = place.store.runs()[0]
-    assert (run.state, run.reason, run.parts) == (RunState.FAILED, "a: no answer", ())
+    assert (run.state, run.reason, run.parts) == (RunState.FAILED, reason, ())
     assert run.ended is not None
     assert START_LIMIT < run.ended - run.due < 2 * START_LIMIT
 

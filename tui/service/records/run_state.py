@@ -166,9 +166,9 @@ class Run:
         return replace(self, state=state, **changes)
 
     def because(self, reason: str) -> Run:
-        """Return the run with a further reason; each is said once."""
-        known = self.reason.split("; ") if self.reason else []
-        return self if reason in known else replace(self, reason="; ".join([*known, reason]))
+        """Return the run with further reasons, separated by semicolons; each is said once."""
+        said = [*(self.reason.split("; ") if self.reason else []), *reason.split("; ")]
+        return replace(self, reason="; ".join(dict.fromkeys(said)))
 
     def document(self) -> dict[str, Any]:
         """Return the run as JSON (docs/service.md)."""
