@@ -176,7 +176,7 @@ def _whole(operations: Sequence[Operation], folder: Path) -> None:
     """Write each recording as it was before it was removed."""
     rng = np.random.default_rng(0)
     ends = [n for n, each in enumerate(operations) if each.kind == "U" and each.path.endswith("h5")]
-    for n in [len(operations), *reversed(ends)]:
+    for n in [*ends, len(operations)]:
         replay(operations, n, "prefix", rng, folder)
 
 
