@@ -5,7 +5,7 @@ Theory of operation
 One task per port (:class:`daq.acquisition.connection.Connection`) puts items into one bounded
 queue. The recorder takes them from the queue in batches and writes them in a separate thread
 (:class:`daq.acquisition.block_writer.BlockWriter`), so that neither compression nor ``fsync``
-delays a port. It commits about twice a second, sooner if a complete chunk of samples is waiting,
+delays a port. It commits about once a second, sooner if a complete chunk of samples is waiting,
 and acknowledges only committed samples. If writing lags, the queue fills, the ports' tasks wait,
 and the operating system's buffers hold the data.
 """
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 QUEUE_LENGTH = 4096
-COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 0.5, 0.25
+COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 1.0, 0.25
 """Seconds between commits: usually, and if a complete chunk of samples is waiting."""
 CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
 """Seconds that all connections may take to end."""
-_BATCH_INTERVAL = 0.1
+_BATCH_INTERVAL = 0.15
 MIN_CONTINUATION = 60.0
 """Seconds that a continuation file must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0

@@ -104,16 +104,17 @@ class SampleCounter:
         runs: list[Run] = []
         n_repeated = row = 0
         while row < counters.size:
-            ahead = (counters[row:] - self._count) % self.modulus
-            index, restarted = self._index(int(ahead[0]), latest - (counters.size - 1 - row))
+            step = (int(counters[row]) - self._count) % self.modulus
+            index, restarted = self._index(step, latest - (counters.size - 1 - row))
             if index is None:
+                ahead = (counters[row:] - self._count) % self.modulus
                 forward = np.flatnonzero((ahead >= 1) & (ahead < self.modulus // 2))
                 skipped = int(forward[0]) if forward.size else ahead.size
                 n_repeated += skipped
                 row += skipped
                 continue
-            together = np.flatnonzero(np.diff(counters[row:]) % self.modulus != 1)
-            stop = row + int(together[0]) + 1 if together.size else counters.size
+            jumps = (counters[row + 1 :] - counters[row:-1]) % self.modulus != 1
+            stop = row + int(jumps.argmax()) + 1 if jumps.any() else counters.size
             if restarted:
                 self._base = int(counters[row]) - index
             missing = index - self._next

@@ -101,11 +101,9 @@ class EpsonSession:
         at: HostTime | None = None
         # A device waiting for a trigger also replies, so a reply does not prove a restart.
         ask_after = None if configuration.is_triggered else ASK_AFTER
-        n_frames = round(GATHER * configuration.sampling_rate)
+        n_frames, size = round(GATHER * configuration.sampling_rate), configuration.burst.size
         while True:
-            self._stream.expect(
-                n_frames, configuration.burst.size, n_pending=self.decoder.n_pending
-            )
+            self._stream.expect(n_frames, size, n_pending=self.decoder.n_pending)
             try:
                 async with asyncio.timeout(ask_after):
                     received, at = await self._stream.read()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
-from daq.protocols.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, word_sums
+from daq.protocols.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, are_sums_right
 from daq.protocols.framing import PIECE, BoolArray, OctetArray, find_frames
 from daq.protocols.plural import several
 from daq.protocols.sample_counter import Run, SampleCounter
@@ -72,6 +72,7 @@ class BurstDecoder:
         self._dtype = burst.dtype
         self._size = burst.size
         self._fields = tuple(fields)
+        self._has_checksum, self._has_flag = "checksum" in burst, "flag" in burst
         self._axes = [column for column, field in enumerate(fields) if field != "temperature"]
         self._full_scale = full_scale_counts
         self._counter = SampleCounter(COUNT_MODULUS, sampling_rate)
@@ -137,12 +138,7 @@ class BurstDecoder:
 
     def _valid(self, windows: OctetArray) -> BoolArray:
         good: BoolArray = (windows[:, 0] == BURST_HEADER) & (windows[:, -1] == DELIMITER)
-        if "checksum" in self._burst:
-            rows = np.flatnonzero(good)
-            octets = windows if rows.size == good.size else windows[rows]
-            given = octets[:, -3].astype(np.uint16) << 8 | octets[:, -2]
-            good[rows] = word_sums(octets[:, 1:-3]) == given
-        return good
+        return good & are_sums_right(windows[:, 1:-1]) if self._has_checksum else good
 
     def _note_skipped(self, octets: OctetArray, runs: list[tuple[int, int]], skipped: int) -> None:
         # A frame where one is due, with header and delimiter but a wrong checksum, was corrupted.
@@ -157,8 +153,7 @@ class BurstDecoder:
 
     def _blocks(self, frames: NDArray[np.void], at: HostTime) -> list[Block | Event]:
         if "count" in self._burst:
-            counters = frames["count"].astype(np.int64)
-            runs, repeated = self._counter.place(counters, at)
+            runs, repeated = self._counter.place(frames["count"], at)
             self._counts["repeated"] += repeated
         else:  # without COUNT, the skipped bytes are the only estimate of the missing frames
             lost = self._lost_frames
@@ -186,16 +181,16 @@ class BurstDecoder:
             if run.restarted or "count" not in self._burst:
                 flags |= BlockFlag.MISSING_ESTIMATED
         # np.abs would overflow at the most negative count
-        axes = counts[:, self._axes]
+        axes = counts if len(self._axes) == len(self._fields) else counts[:, self._axes]
         if axes.size and (axes.max() >= self._full_scale or axes.min() <= -self._full_scale):
             flags |= BlockFlag.CLIPPED
         self._started = True
         return Block(self._sensor, run.first_sample, counts, at, run.counter, flags, reason)
 
     def _error_flag(self, frames: NDArray[np.void], at: HostTime) -> list[Event]:
-        if "flag" not in self._burst:
+        if not self._has_flag:
             return []
-        error = bool((frames["flag"] & FLAG_ERROR).any())
+        error = bool(np.bitwise_or.reduce(frames["flag"]) & FLAG_ERROR)
         changed, self._error = error != self._error, error
         if not changed:
             return []
@@ -203,7 +198,9 @@ class BurstDecoder:
         return [Event(self._sensor, EventKind.STATUS, text, at)]
 
     def _report(self, at: HostTime) -> list[Event]:
-        events = []
+        events: list[Event] = []
+        if not any(self._counts.values()):
+            return events
         for name, (kind, noun, what) in _REPORTS.items():
             n = self._counts[name]
             if n and at.monotonic_ns - self._reported[name] >= REPORT_INTERVAL_NS:

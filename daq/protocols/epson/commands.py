@@ -246,8 +246,15 @@ def encode_bursts(burst: BurstFormat, **values: NDArray[np.integer[Any]] | int) 
 def word_sums(octets: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Return sums of big-endian 16-bit words modulo 65536: octets (n, 2 k) → (n,)."""
     words = np.ascontiguousarray(octets).view(">u2")
-    sums: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
-    return sums.astype(np.uint16)
+    sums: NDArray[np.uint16] = words.sum(axis=1, dtype=np.uint16)
+    return sums
+
+
+def are_sums_right(octets: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which rows, octets (n, 2 k), end in the sum of the words before."""
+    words = np.ascontiguousarray(octets).view(">u2")
+    right: NDArray[np.bool_] = words[:, :-1].sum(axis=1, dtype=np.uint16) == words[:, -1]
+    return right
 
 
 def text(values: tuple[int, ...]) -> str:
