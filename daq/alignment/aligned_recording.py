@@ -21,7 +21,7 @@ import numpy as np
 
 from daq.alignment.grid import SNAP, Grid
 from daq.alignment.resampling import USABLE
-from daq.alignment.sensor_reader import DelayMeasurement, SensorSource, main_columns
+from daq.alignment.sensor_reader import SensorSource, main_columns
 from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 
@@ -208,8 +208,8 @@ class AlignedRecording:
             source = self._sources[number]
             index = source.known_clock.position(seconds)
             source.frame_delay = float(frame_delays[column])
-            source.learnt.append(
-                DelayMeasurement(index, at_reference, delays[:, column], std[:, column])
+            source.learnt.add(
+                np.column_stack([index, at_reference, delays[:, column], std[:, column]])
             )
 
     def reset_delays(self) -> None:

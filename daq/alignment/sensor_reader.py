@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.alignment.growing_rows import GrowingRows
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.timing.arrival_times import ArrivalTimes, MeasuredDelays
@@ -48,16 +49,6 @@ class _Run:
         return self.first_row + min(max(sample - self.first_sample, 0), self.n_samples)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DelayMeasurement:
-    """Measured delays at a sensor's sample `index` and the reference's sample `at_reference`."""
-
-    index: FloatArray
-    at_reference: FloatArray
-    delay: FloatArray
-    std: FloatArray
-
-
 @dataclass(slots=True)
 class SensorSource:
     """One sensor of the recording: the rows and times of its samples."""
@@ -71,7 +62,8 @@ class SensorSource:
     device_utc: bool = False
     polled: bool = False
     clock: Clock | None = None
-    learnt: list[DelayMeasurement] = field(default_factory=list)
+    learnt: GrowingRows[np.float64] = field(default_factory=lambda: GrowingRows(np.float64, 4))
+    """Measured delays: sample of this sensor, that of the reference, delay (s), its std (s)."""
     frame_delay: float = 0.0
     _seconds: FloatArray = field(default_factory=lambda: np.empty(0))
     """Times of a polled sensor's samples that `by_instants` has read, in s."""
@@ -182,11 +174,8 @@ class SensorSource:
         """Return the sample times that follow from measured delays against the reference."""
         if not self.learnt:
             return None
-        index = np.concatenate([each.index for each in self.learnt])
-        at_reference = np.concatenate([each.at_reference for each in self.learnt])
-        delay = np.concatenate([each.delay for each in self.learnt])
+        index, at_reference, delay, std = self.learnt.values.T
         seconds = reference.at(at_reference) - delay - self.frame_delay
-        std = np.concatenate([each.std for each in self.learnt])
         return MeasuredDelays(index, seconds, std)
 
     def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from daq.estimation.noise_estimates import responses
 from estimator.diagnostics.stability import SegmentCourse
-from estimator.spectra.segment_spectra import MOST_SEGMENTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +24,7 @@ def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:
     while len(kept) > 1:
         for single in kept:
             single.thin(every)
-        if sum(map(len, kept)) <= max(MOST_SEGMENTS, len(kept)):
+        if sum(map(len, kept)) <= max(kept[0].most, len(kept)):
             return
         every *= 2
 
@@ -53,7 +52,7 @@ def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> Seg
     bins = first.single.bins
     response = responses(first.welch.frequencies[bins], channels, unit)
     return SegmentCourse(
-        spectra=np.concatenate(spectra) / response,
+        spectra=np.concatenate(spectra) / response.astype(np.complex64),
         bins=bins,
         times=np.concatenate(times),
         runs=np.concatenate(runs),

@@ -175,12 +175,12 @@ def stability(
     at = maximum.take(bins)
     vectors = at.eigenvectors
     free = vectors[:, :, at.n_factors :]
-    x = course.spectra[:, there].astype(np.complex128)
     fitted = np.einsum("fpm,fm,fpm->fp", vectors, at.eigenvalues, vectors.conj()).real
-    x *= np.sqrt(fitted / np.mean(np.abs(x) ** 2, axis=0))
-    residual = np.matmul(np.matmul(x.swapaxes(0, 1), free.conj()), free.swapaxes(1, 2))
-    residual = residual.swapaxes(0, 1)
-    del x  # tens of megabytes
+    residual = np.empty((n_segments, len(bins), fitted.shape[1]), np.complex128)
+    for number, column in enumerate(there):  # all at once would take four times the memory
+        x = course.spectra[:, column].astype(np.complex128)
+        x *= np.sqrt(fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
+        residual[:, number] = x @ free[number].conj() @ free[number].T
     groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
     out = _disturbed(residual, groups)
     lags = np.abs(bins[:, None] - bins)
@@ -209,8 +209,9 @@ def stability(
 
 def _disturbed(residual: ComplexArray, groups: list[IntArray]) -> BoolArray:
     """Return which segments have residuals that stand out; none where too many do."""
-    squares = np.abs(residual) ** 2
-    power = np.stack([squares[:, group].sum(axis=(1, 2)) for group in groups], axis=1)
+    power = np.stack(
+        [(np.abs(residual[:, group]) ** 2).sum(axis=(1, 2)) for group in groups], axis=1
+    )
     median = np.median(power, axis=0)
     scatter = 1.4826 * np.median(np.abs(power - median), axis=0)
     out = ((power - median) > DISTURBED * scatter).any(axis=1)

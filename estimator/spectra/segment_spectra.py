@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, IntArray
 
 KEPT_FREQUENCIES = 48
-MOST_SEGMENTS = 8192
-"""Beyond these every second one is kept, then every fourth, and so on."""
+MOST_SEGMENTS, MOST_VALUES = 4096, 1 << 21
+"""Beyond these every second segment is kept, then every fourth, and so on."""
 
 
 def kept_bins(n_freqs: int) -> IntArray:
@@ -47,11 +47,14 @@ class SegmentSpectra:
     ----------
     every : int
         Every how many-th segment is kept.
+    most : int
+        Segments that are kept at most.
     """
 
     def __init__(self, bins: IntArray, n_channels: int) -> None:
         self.bins = bins
         self.every = 1
+        self.most = max(1, min(MOST_SEGMENTS, MOST_VALUES // max(1, len(bins) * n_channels)))
         self._n_channels = n_channels
         self._n_seen = 0
         self._parts: list[NDArray[np.complex64]] = []
@@ -69,7 +72,7 @@ class SegmentSpectra:
         some = spectra[number % self.every == 0].astype(np.complex64)
         self._parts.append(some)
         self._n_kept += len(some)
-        while self._n_kept > MOST_SEGMENTS:
+        while self._n_kept > self.most:
             self.thin(2 * self.every)
 
     def __len__(self) -> int:

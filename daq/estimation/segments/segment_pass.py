@@ -12,6 +12,7 @@ import numpy as np
 
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.delay_estimation import DelayEstimator
+from daq.alignment.growing_rows import GrowingRows
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
 from estimator.spectra.multiresolution import MultiResolution
@@ -89,7 +90,7 @@ class Pass:
         # The other processors read ahead.
         single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
         self.single = None if wanted.octaves or wanted.reject else single
-        self._kept_at: list[NDArray[np.int64]] = []
+        self._kept_at = GrowingRows(np.int64)
         self._all = CrossSpectra(self.welch, self.n_channels, threads=1, segments=self.single)
         self._selected: CrossSpectra | None = None
         self._bridge: GapBridge | None = None
@@ -99,7 +100,7 @@ class Pass:
         self._fed = 0  # grid samples that the octaves have had
         self.left_out: Counter[Reason] = Counter()
         self.stillness = FlatlineDetector(self.welch.hop, self.n_channels, self.welch.sampling_rate)
-        self.taken_at: list[FloatArray] = []
+        self._taken_at = GrowingRows(np.float64, len(self.aligned.dims))
         self.aligned.reset_delays()
         self._meter: DelayEstimator | None = None
 
@@ -159,7 +160,7 @@ class Pass:
     @property
     def kept_at(self) -> NDArray[np.int64]:
         """Grid samples at which the segments of `single` begin."""
-        at = np.concatenate(self._kept_at) if self._kept_at else np.empty(0, np.int64)
+        at = self._kept_at.values
         return at if self.single is None else at[:: self.single.every]
 
     @property
@@ -218,7 +219,7 @@ class Pass:
             else:
                 self._take(samples, starts, first * hop + reach)
             self._n_taken += len(starts)
-            self.taken_at.append(self._positions(np.arange(first, first + count)))
+            self._taken_at.add(self._positions(np.arange(first, first + count)))
             self._measure(samples, starts, first * hop + reach + starts)
             if self._bridge is not None and not whole.all():
                 touched = np.flatnonzero(~whole) * hop
@@ -256,7 +257,7 @@ class Pass:
         """
         if self._undisturbed is None:
             self._all.add(samples, starts)
-            self._kept_at.append(first + starts)
+            self._kept_at.add(first + starts)
         else:
             self._undisturbed.add(samples, starts)
             self._selected = None
@@ -305,9 +306,9 @@ class Pass:
 
         In seconds, shape (n_segments, n_sensors); what all sensors have in common is left out.
         """
-        if not self.taken_at:
-            return np.empty((0, len(self.aligned.dims)))
-        before = np.concatenate(self.taken_at)
+        before = self._taken_at.values
+        if not len(before):
+            return before
         moved = self._positions(np.arange(len(before))) - before
         return np.asarray(moved - moved.mean(axis=1, keepdims=True))
 
@@ -322,7 +323,7 @@ class Pass:
         By more than `tolerance` in seconds rms, that is; or whether delays could be measured now
         and could not yet when segments came one by one.
         """
-        if not self.taken_at or self.aligned.is_exact:
+        if not len(self._taken_at) or self.aligned.is_exact:
             return False
         if self._meter is not None and not self._meter.has_frame:
             return self.n_seen >= self._meter.fewest
@@ -335,8 +336,7 @@ class Pass:
 
     def drift(self) -> FloatArray:
         """Return middles of segments in seconds, and every sensor's delay there."""
-        n_sensors = len(self.aligned.dims)
-        taken = np.concatenate(self.taken_at) if self.taken_at else np.empty((0, n_sensors))
+        taken = self._taken_at.values
         middle = self._middles(np.arange(len(taken)))
         return np.column_stack([middle / self.welch.sampling_rate, taken])
 

@@ -10,7 +10,12 @@ from estimator.diagnostics.kinds import AdviceKind
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges
 from estimator.diagnostics.stability import PARTS, SegmentCourse
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
-from estimator.spectra.segment_spectra import MOST_SEGMENTS, SegmentSpectra, kept_bins
+from estimator.spectra.segment_spectra import (
+    MOST_SEGMENTS,
+    MOST_VALUES,
+    SegmentSpectra,
+    kept_bins,
+)
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from tests.estimator.csm_models import rotation
@@ -102,3 +107,4 @@ def test_kept_segments_are_bounded_in_number() -> None:
         kept.add(part[:, None, None])
     assert kept.every == 4
     assert np.array_equal(kept.values()[:, 0, 0].real, np.arange(0, n, 4))
+    assert 64 <= SegmentSpectra(bins, 192).most <= MOST_VALUES / (192 * len(bins))
