@@ -99,9 +99,9 @@ class Restarted:
         self._wanted = 0
         self._answer = asyncio.Event()
 
-    def expect(self, n_frames: int, size: int = 1, *, begun: int = 0) -> None:
+    def expect(self, n_frames: int, size: int = 1, *, n_pending: int = 0) -> None:
         """Note how many bytes are waited for; the kernel keeps fewer to itself."""
-        self._wanted = n_frames * size - begun
+        self._wanted = n_frames * size - n_pending
 
     async def write(self, payload: bytes) -> None:
         """Hear a question."""
