@@ -28,7 +28,7 @@ STANDARD_OUTPUT = "-"
 WIDTH_OF_FILES = 110
 """Columns of tables that go into a file or a pipe."""
 _for_json = False
-_SHOWN = {
+SHOWN_CONTROLS = {
     code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
 }
 
@@ -44,7 +44,7 @@ class PlainConsole(Console):
             if segment.control or segment.text == "\n" or segment.text.isprintable():
                 yield segment
             else:
-                yield Segment(segment.text.translate(_SHOWN), segment.style)
+                yield Segment(segment.text.translate(SHOWN_CONTROLS), segment.style)
 
 
 def console() -> Console:

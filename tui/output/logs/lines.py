@@ -195,14 +195,14 @@ def report_failure(lines: Sequence[str], *, exit_code: int) -> None:
 
     The record has the fields ``exit_code`` and ``errors``, by which a parent knows it.
     """
-    from tui.output.console import notices
+    from tui.output.console import SHOWN_CONTROLS, notices
 
     if notices().quiet:
         fields = {"exit_code": exit_code, "errors": list(lines)}
         COMMAND.error("%s", "; ".join(lines), extra=fields)
         return
     for line in lines:
-        sys.stderr.write(f"huddle: {line}\n")
+        sys.stderr.write(f"huddle: {line}\n".translate(SHOWN_CONTROLS))
     sys.stderr.flush()
 
 

@@ -161,6 +161,14 @@ def test_why_a_child_failed_is_returned_and_not_logged_twice(
     assert json.loads(other)["message"] == "the recorder wrote: Fatal Python error: Aborted"
 
 
+def test_why_a_command_failed_does_not_act_on_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configure()
+    logs.report_failure(["C\x1b[31m: not\x9b\ta name\nhint"], exit_code=3)
+    assert capsys.readouterr().err == "huddle: C\\x1b[31m: not\\x9b\ta name\nhint\n"
+
+
 @pytest.mark.parametrize("line", ["", "[]", "{}", "1", '{"time": 1, "level": "info"}', "\x00"])
 def test_other_lines_are_no_records(line: str) -> None:
     assert logs.record_of(line) is None
