@@ -17,6 +17,7 @@ from daq.estimation.follow import follow
 from daq.results.decision.limits import judge
 from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
+from tui.application.harmless_lines import HarmlessLines
 from tui.application.messages import (
     DeletionRequested,
     ErrorReported,
@@ -113,10 +114,11 @@ class FollowingApp(App[None]):
         self._ended.set()
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Return what colours go through; without colours, plots as well."""
+        """Return what lines go through: without colours, plots as well."""
+        filters = super().get_line_filters()
         return [
-            PlainMonochrome() if isinstance(each, Monochrome) else each
-            for each in super().get_line_filters()
+            HarmlessLines(),
+            *(PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters),
         ]
 
     # ---------------------------------------------------------------------- views

@@ -184,7 +184,9 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
         replace(each, name=name, port=f"/dev/{name}")
         for each, name in zip(now.sensors, sensors, strict=True)
     )
-    event = replace(now.events[1], sensor=sensors[1], text=f"{sensors[2]} [/dropped]")
+    event = replace(
+        now.events[1], sensor=sensors[1], text=f"\x1b]0;{sensors[2]} [/drop\x9bped]\x07"
+    )
     now = replace(now, sensors=status, events=(now.events[0], event))
     async with app.run_test(size=(200, 60)) as pilot:
         await app.workers.wait_for_complete()
