@@ -282,10 +282,10 @@ def _write_rows(
 def _encodable(samples: NDArray[Any], name: str) -> tuple[NDArray[Any], str]:
     """Return samples in a type of miniSEED, and its encoding."""
     if samples.dtype.kind == "f":
-        single = samples.dtype.itemsize <= 4
-        return np.ascontiguousarray(samples, np.float32 if single else np.float64), (
-            "FLOAT32" if single else "FLOAT64"
-        )
+        # A copy, for its order of bytes is native: ObsPy takes one that is stated for the other.
+        if samples.dtype.itemsize <= 4:
+            return samples.astype(np.float32), "FLOAT32"
+        return samples.astype(np.float64), "FLOAT64"
     found = samples.astype(np.int32)
     if not np.array_equal(found, samples):
         if float(np.abs(samples.astype(np.float64)).max()) >= 2**53:

@@ -130,6 +130,19 @@ def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_
     assert run(recording, "--format", "sac").exit_code == ExitCode.USAGE
 
 
+@pytest.mark.parametrize("dtype", ["f4", "f8", "i8"])
+def test_miniseed_of_any_type_of_sample_is_read_as_it_was(tmp_path: Path, dtype: str) -> None:
+    """HDF5 states the order of bytes of floats, which ObsPy took for the other one."""
+    obspy = load_obspy()
+    samples = (1e10 * np.random.default_rng(4).normal(size=(6000, 2))).astype(dtype)
+    np.savez(tmp_path / "a.npz", sampling_rate=100.0, A=samples)
+    import_files([tmp_path / "a.npz"], tmp_path / "a.h5")
+    with Recording.open(tmp_path / "a.h5") as opened:
+        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
+    stream = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1).sort()
+    np.testing.assert_array_equal(np.column_stack([trace.data for trace in stream]), samples)
+
+
 @pytest.mark.parametrize("states_utc", [True, False])
 def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_utc: bool) -> None:
     obspy = load_obspy()
