@@ -86,9 +86,9 @@ def open_bench(
     settings = chosen(Settings.of(bench), **wanted)
     check_fit(settings, bench.sensors)
     settings = with_comparison(settings, wanted)
-    controls = BenchControls(path, bench, settings, on_event=on_event)
+    masks = _models(models, settings, bench.sensors)
+    controls = BenchControls(path, bench, settings, on_event=on_event, models=masks)
     try:
-        masks = _models(models, settings, bench.sensors)
         _run(HuddleApp(controls, models=masks, driver=_driver(baud)), again=path)
     finally:
         controls.release()
@@ -162,9 +162,9 @@ def open_recording(
     """Open the application on a recording, growing or closed."""
     settings, bench = settings_for(path, start=start, end=end, **wanted)
     settings = with_comparison(settings, wanted)
-    controls = RecordingControls(path, settings, bench, on_event=on_event)
     with Recording.open(path) as recording:
         masks = _models(models, settings, recording.sensors)
+    controls = RecordingControls(path, settings, bench, on_event=on_event, models=masks)
     _run(HuddleApp(controls, path=path, models=masks, driver=_driver(baud)), again=path)
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.acquisition.before_test.preview import SensorPreview
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -60,6 +61,8 @@ class BenchControls:
     """Folder of reports; None: beside their recordings."""
     on_event: str = ""
     """Command for the end of a test, and for trouble."""
+    models: tuple[Mask, ...] = ()
+    """Noise models in reports."""
     started: list[RecorderProcess] = field(default_factory=list)
     ports: threading.Lock = field(default_factory=threading.Lock)
     """Held by who reads the sensors."""
@@ -121,7 +124,7 @@ class BenchControls:
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report."""
-        return _report(path, snapshot, settings, folder=self.reports)
+        return _report(path, snapshot, settings, folder=self.reports, models=self.models)
 
     def save(
         self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
@@ -144,6 +147,7 @@ class RecordingControls:
     bench: Bench | None = None
     can_start: bool = False
     on_event: str = ""
+    models: tuple[Mask, ...] = ()
 
     @property
     def name(self) -> str:
@@ -191,7 +195,7 @@ class RecordingControls:
 
     def report(self, path: Path, snapshot: Snapshot, settings: Settings) -> Path:
         """Write the report beside the recording."""
-        return _report(path, snapshot, settings)
+        return _report(path, snapshot, settings, models=self.models)
 
     def save(
         self, path: Path, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
@@ -288,13 +292,18 @@ def save_result(
 
 
 def _report(
-    path: Path, snapshot: Snapshot, settings: Settings, *, folder: Path | None = None
+    path: Path,
+    snapshot: Snapshot,
+    settings: Settings,
+    *,
+    folder: Path | None = None,
+    models: tuple[Mask, ...] = (),
 ) -> Path:
     require("matplotlib", "jinja2")
     from tui.report.writing import write  # noqa: PLC0415 - loads matplotlib
 
     out = (folder or path.parent) / f"{path.stem}.html"
-    write(snapshot, out, recordings=[path], settings=settings)
+    write(snapshot, out, recordings=[path], settings=settings, models=models)
     return out
 
 

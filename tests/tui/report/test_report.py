@@ -20,6 +20,7 @@ from pypdf import PdfReader
 from pypdf.generic import Destination
 from typer.testing import CliRunner
 
+from daq.bench.masks.mask_file import masks_named
 from daq.drivers.bench_file import load
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -89,12 +90,17 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     return Reported(recording, snapshot, settings, out.read_text(encoding="utf-8"), report)
 
 
-def test_the_demo_s_reports_outlive_its_folder(reported: Reported, tmp_path: Path) -> None:
+def test_the_demo_s_reports_outlive_its_folder_and_have_its_noise_models(
+    reported: Reported, tmp_path: Path
+) -> None:
     settings, path = reported.settings, ROOT / "tui" / "resources" / "demo.toml"
-    controls = BenchControls(path, load(path), settings, reports=tmp_path)
+    models = masks_named("nhnm")
+    controls = BenchControls(path, load(path), settings, reports=tmp_path, models=models)
     out = controls.report(reported.recording, reported.snapshot, settings)
     assert out == tmp_path / "night.html"
-    assert out.read_text(encoding="utf-8") == reported.page
+    page = out.read_text(encoding="utf-8")
+    assert "NHNM" in page
+    assert "NHNM" not in reported.page
 
 
 def words_of(part: Part) -> list[str]:
