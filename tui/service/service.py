@@ -41,6 +41,9 @@ MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
 RETRY = 2.0
 """Seconds until an estimate without an outcome is tried again, doubled each time."""
+DISK_RETRY = 8
+"""By what the seconds grow each time where a disk refused something: to two hours."""
+REFUSED = "the disk refused a file for a while"
 _LEVELS = {RunState.FAILED: logging.ERROR, RunState.MISSED: logging.WARNING}
 BUSY = "the run before was still recording"
 OFF = "the computer was off, asleep or without the service"
@@ -300,6 +303,10 @@ class Service:
             await self._clock.sleep(RETRY * 2**run.attempts, self.stop)
             return run.because(str(error))
         run = replace(run, parts=outcome.parts or run.parts)
+        if outcome.refused and run.attempts < MAX_ATTEMPTS:
+            _LOGGER.error("run %s: %s", run.name, "; ".join([*outcome.notes, outcome.error]))
+            await self._clock.sleep(RETRY * DISK_RETRY**run.attempts, self.stop)
+            return run.because(REFUSED)
         for note in outcome.notes:
             run = run.because(note)
         if outcome.error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from typing import TYPE_CHECKING
 
@@ -51,12 +52,23 @@ def recorded(folder: Path) -> list[str]:
     return ["r.h5", "r-2.h5", "r-3.h5"]
 
 
+def no_descriptors(path: Path) -> None:
+    raise OSError(errno.EMFILE, "Too many open files", str(path))
+
+
 @pytest.mark.virtual_time
-async def test_files_that_continue_a_recording_belong_to_its_run(tmp_path: Path) -> None:
+async def test_files_that_continue_a_recording_belong_to_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     place = Place(tmp_path)
     folder = place.bench.recording_directory
     names = recorded(folder)
-    outcome = finish(Request([str(folder / "r.h5")], {"segment": "2s"}))
+    request = Request([str(folder / "r.h5")], {"segment": "2s"})
+    with monkeypatch.context() as patch:
+        patch.setattr("daq.recording.repair.create_private", no_descriptors)
+        assert finish(request).refused
+    outcome = finish(request)
+    assert not outcome.refused
     assert (outcome.error, list(outcome.parts)) == ("", names)
     assert outcome.notes == ("r-3.h5: shorter than one segment, and left out",)
     result = json.loads((folder / "r-2.json").read_text(encoding="utf-8"))

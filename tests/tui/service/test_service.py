@@ -16,7 +16,7 @@ from tui.service.processes.finish import Outcome
 from tui.service.processes.steps import FinishFailedError
 from tui.service.records.run_state import NEXT, Run, RunState, WrongStateError
 from tui.service.records.store import RunStore, StoreError
-from tui.service.service import MAX_ATTEMPTS
+from tui.service.service import MAX_ATTEMPTS, REFUSED
 from tui.service.window import STALL, STOPPED
 from tui.service.window import START as START_LIMIT
 
@@ -156,6 +156,17 @@ async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(tmp_path
     assert (run.state, run.reason) == (RunState.DONE, "a: no answer")
     assert len(run.parts) == 1
     assert [seconds for _, seconds in place.steps.started] == [600, 592, 579]
+
+
+async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    refused = Outcome(error="cannot be rewritten", refused=True)
+    kept = Outcome(notes=("the result is not in the recording",), refused=True)
+    place.steps.outcomes = [refused, kept, Outcome()]
+    await place.serve(1.5 * HOUR)
+    run = place.store.runs()[0]
+    assert (run.state, run.reason) == (RunState.DONE, REFUSED)
+    assert len(place.steps.finished) == 3
 
 
 async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ be killed at any moment and started again: it changes nothing that it has change
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 from dataclasses import asdict, dataclass, fields, replace
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 
+_OF_DISK = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE),
+}
 _NOISE = tuple(field.name for field in fields(BandNoise))
 
 
@@ -74,7 +78,8 @@ class Request:
 class Outcome:
     """What came of it: an error, or a verdict (empty without limits), and what is to be known.
 
-    ``parts`` are the file names of the request, with those in which its recorders went on.
+    ``parts`` are the file names of the request, with those in which its recorders went on. If
+    ``refused`` is set, the disk did not take or give something, which can be tried again.
     """
 
     verdict: str = ""
@@ -82,6 +87,7 @@ class Outcome:
     noise: tuple[BandNoise, ...] = ()
     error: str = ""
     parts: tuple[str, ...] = ()
+    refused: bool = False
 
     @classmethod
     def of(cls, text: str) -> Outcome:
@@ -117,12 +123,12 @@ def finish(request: Request) -> Outcome:
     try:
         outcome = _finished(replace(request, parts=[str(part) for part in parts]))
     except (HuddleError, EstimatorError, OSError) as error:
-        outcome = Outcome(error=str(error) or type(error).__name__)
+        outcome = Outcome(error=str(error) or type(error).__name__, refused=_is_of_disk(error))
     return replace(outcome, parts=tuple(part.name for part in parts))
 
 
 def _finished(request: Request) -> Outcome:
-    paths, notes = _repaired([Path(part) for part in request.parts])
+    paths, notes, refused = _repaired([Path(part) for part in request.parts])
     table = EstimateTable.model_validate(request.options)
     names = table_keys()
     wanted = {names[key]: getattr(table, key) for key in table.model_fields_set}
@@ -137,32 +143,60 @@ def _finished(request: Request) -> Outcome:
         store_results(last, snapshot)
     except HuddleError as error:
         notes.append(f"the result is not in the recording: {error}")
+        refused |= _is_of_disk(error)
     found = judge(bench, snapshot, settings)
     result = document(snapshot, settings, sources=sources(paths), verdict=found)
     try:
         write_json(str(last.with_suffix(".json")), result)
     except OSError as error:
         notes.append(f"the result is not in the JSON file: {error}")
+        refused |= _is_of_disk(error)
     if request.report is not None:
-        notes += _reported(snapshot, last, paths, settings, request.report)
+        try:
+            _report(snapshot, last, paths, settings, request.report)
+        except (HuddleError, OSError) as error:
+            notes.append(f"no report: {error}")
+            refused |= _is_of_disk(error)
     noise = _noise(snapshot, settings, request.bands, about, notes)
-    return Outcome("" if found is None else str(found.verdict), tuple(notes), noise)
+    verdict = "" if found is None else str(found.verdict)
+    return Outcome(verdict, tuple(notes), noise, refused=refused)
 
 
-def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Close what was left open; return the recordings that can be read, and what was found."""
-    good, notes, errors = [], [], []
+def _is_of_disk(error: BaseException | None) -> bool:
+    """Return whether an error comes from a disk, or the lack of descriptors: both can pass."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _OF_DISK:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str], bool]:
+    """Close what was left open.
+
+    Returns
+    -------
+    paths : list of Path
+        Recordings that can be read.
+    notes : list of str
+        What was found.
+    refused : bool
+        Whether the disk refused one.
+    """
+    good: list[Path] = []
+    notes: list[str] = []
+    errors: list[HuddleError] = []
     for part in parts:
         try:
             if not repair(part).intact:
                 notes.append(f"{part.name}: damaged blocks are left out")
         except HuddleError as error:
-            errors.append(str(error))
+            errors.append(error)
         else:
             good.append(part)
     if not good:
-        raise NothingRecordedError("; ".join(errors) or "no recording")
-    return good, notes + errors
+        raise NothingRecordedError("; ".join(map(str, errors))) from errors[0]
+    return good, notes + [str(error) for error in errors], any(map(_is_of_disk, errors))
 
 
 class NothingRecordedError(HuddleError):
@@ -184,16 +218,12 @@ def _long_enough(paths: list[Path], segment: float, notes: list[str]) -> list[Pa
     return found or paths
 
 
-def _reported(
+def _report(
     snapshot: Snapshot, last: Path, paths: list[Path], settings: Settings, kind: str
-) -> list[str]:
+) -> None:
     from tui.report.writing import write  # noqa: PLC0415 - matplotlib only where there is a report
 
-    try:
-        write(snapshot, last.with_suffix(f".{kind}"), recordings=paths, settings=settings)
-    except (HuddleError, OSError) as error:
-        return [f"no report: {error}"]
-    return []
+    write(snapshot, last.with_suffix(f".{kind}"), recordings=paths, settings=settings)
 
 
 def _noise(
