@@ -337,7 +337,7 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     assert max(plans["three-channel"]["bias"]) > 1
     assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
     shown = huddle("plan", str(bench), "--cov", "0.05")
-    assert "three sensors cannot tell its gradients from noise" in " ".join(shown.split())
+    assert "3 sensors cannot tell gradients of the motion from noise" in " ".join(shown.split())
     assert "efficiency" in shown
     assert "motion too weak" not in shown
     assert "motion too weak" in huddle("plan", str(bench), "--snr", "1e-5")
