@@ -148,16 +148,20 @@ def _pair(
     S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
     S_kk = part[:, rest[:, None], rest]
     by = np.linalg.solve(S_kk, S_rk.conj().swapaxes(1, 2))  # S_kk^-1 S_kr
-    power = S_rk @ by
+    power, cross = S_rk @ by, S_jk @ by
+    # less what the others tell by chance: Nagar's correction of two-stage least squares
+    chance = len(rest) / (n_effective - len(rest)) if n_effective > 2 * len(rest) else 0.0
+    power -= chance * (part[:, own[1][:, None], own[1]] - power)
+    cross -= chance * (part[:, own[0][:, None], own[1]] - cross)
     power = (power + power.conj().swapaxes(1, 2)) / 2
-    response = np.linalg.solve(power.swapaxes(1, 2), (S_jk @ by).swapaxes(1, 2)).swapaxes(1, 2)
+    response = np.linalg.solve(power.swapaxes(1, 2), cross.swapaxes(1, 2)).swapaxes(1, 2)
     d = len(own[0])
     rows = np.zeros((len(f), d, csm.shape[1]), dtype=np.complex128)
     rows[:, np.arange(d), own[0]] = 1.0
     rows[:, :, own[1]] = -response
     sigma = rows @ part @ rows.conj().swapaxes(1, 2)
     level = np.einsum("fcc->f", sigma).real / d
-    usable = (level > 0) & np.isfinite(response).all(axis=(1, 2))
+    usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
     if usable.sum() < 4:
         raise InsufficientDataError(
             f"sensors {reference} and {sensor}: {usable.sum()} frequencies from {band[0]:g} to "
@@ -237,10 +241,8 @@ def calibrate_sensor(
     inverse = np.linalg.inv(information)
     middle = np.einsum("fcg,fab->cagb", pair.noise, pair.weight)
     covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
-    covariance = covariance * inflation / 2
+    covariance = covariance.reshape(d * d, d * d) * inflation / 2
     delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
-    covariance = covariance.reshape(d * d, d * d)
-
     to_first = np.eye(d)
     to_first[:, 0] -= 1.0
     return SensorCalibration(

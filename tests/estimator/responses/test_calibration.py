@@ -91,6 +91,16 @@ def test_errors_cover_the_truth() -> None:
     assert np.mean(excess) == pytest.approx(1.0, abs=0.1)
 
 
+def test_weak_motion_does_not_lower_gains() -> None:
+    """What instruments tell by chance would, by two thirds of their error at an SNR of 10."""
+    scores = [
+        (found.gain.value - [1.02, 0.97, 1.0]) / found.gain.error
+        for found in (calibrated(averaged(seed, noise=0.35)) for seed in range(30))
+    ]
+    # 30 draws of three gains that share half of their scatter: 0.14
+    assert np.mean(scores) == pytest.approx(0.0, abs=0.35)
+
+
 def test_a_response_that_varies_over_the_band_is_seen() -> None:
     spectra = averaged(3, noise=0.02)
     csm = spectra.csm()
