@@ -10,7 +10,12 @@ import scipy.fft
 from scipy import signal
 
 from benchmarks.row import Row, fastest, least_work
+from estimator.diagnostics.shared_noise import shared_noise
+from estimator.likelihood.dimension import bands
+from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.methods import self_noise
+from estimator.spectra.equaliser import design
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 RATE, LENGTH, HOURS = 200, 2000, 3
@@ -37,7 +42,7 @@ print(peak_memory())
 
 def run() -> list[Row]:
     """Measure every row of the design's table that is the estimator's alone."""
-    return [*_speed(), *_memory(), *_live()]
+    return [*_speed(), *_beside(), *_memory(), *_live()]
 
 
 def _records(n_sensors: int, n_samples: int, snr: float = 1e4) -> np.ndarray:
@@ -101,6 +106,48 @@ def _speed() -> list[Row]:
     )
     title = "maximum likelihood, 1001 frequencies × 9 channels"
     return [*rows, Row(title, likelihood / three, "× three-sensor", at_most=10)]
+
+
+def _beside() -> list[Row]:
+    """Measure equalisation and score tests against one three-sensor estimate: processor time."""
+    samples = _records(3, HOURS * 3600 * RATE)
+    settings = WelchSettings(RATE, LENGTH)
+    starts = np.arange(0, len(samples) - LENGTH + 1, settings.hop)
+    grid = settings.frequencies
+    wanted = np.ones((len(grid), 9), dtype=np.complex128)
+    wanted[:, 3:6] = ((1 + 1j * grid / 30) / (1 + 1j * grid / 60))[:, None]  # of one sensor
+    filters = design(wanted, RATE, longest=LENGTH // 4)
+    result: dict[str, CrossSpectra] = {}
+
+    def estimate() -> None:
+        result["spectra"] = spectra = CrossSpectra(settings, 9)
+        spectra.add(samples, starts)
+        self_noise("three-sensor", spectra.csm(), dims=TRIAXIAL, n_effective=spectra.n_effective)
+
+    def equalise() -> None:
+        step = 120 * RATE
+        for first in range(0, len(samples) - step, step):
+            filters.apply(samples[first : first + step + 2 * filters.reach])
+
+    one = least_work(estimate)
+    csm, n = result["spectra"].csm()[1:-1], result["spectra"].n_effective
+    maximum = maximise(csm, 3)
+    number = bands(grid[1:-1])
+    separate = [number == each for each in np.unique(number)]
+
+    def score() -> None:
+        shared_noise(maximum, separate, dims=TRIAXIAL, n_effective=n, neighbours=HANN_HALF)
+
+    filtering, scoring = least_work(equalise), least_work(score)
+    return [
+        Row(
+            "equalisation of one sensor and score tests, 3 h × 9 × 200 Hz",
+            (filtering + scoring) / one,
+            "× three-sensor estimate",
+            at_most=1.0,
+            note=f"equalisation {filtering / one:.2f}, score tests {scoring / one:.2f}",
+        )
+    ]
 
 
 def _memory() -> list[Row]:
