@@ -12,8 +12,8 @@ import numpy as np
 from daq.alignment.growing_rows import GrowingRows
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
-from daq.timing.arrival_times import ArrivalTimes, MeasuredDelays
-from daq.timing.clock_model import OffsetSource, from_instants
+from daq.timing.arrival_times import ArrivalTimes
+from daq.timing.clock_model import MeasuredDelays, OffsetSource, from_instants
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

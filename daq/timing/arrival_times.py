@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.protocols.block import BlockFlag
-from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch
+from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.timing.usb_polling import BEATS_PER_WINDOW, Polls, shows
@@ -64,25 +64,6 @@ _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredDelays:
-    """When samples were taken, as measured from the motion, up to one constant.
-
-    Attributes
-    ----------
-    index : float64, shape (n,)
-        (Fractional) sample indices, increasing.
-    seconds : float64, shape (n,)
-        When they were taken.
-    std : float64, shape (n,)
-        Standard deviation of `seconds`.
-    """
-
-    index: FloatArray
-    seconds: FloatArray
-    std: FloatArray
 
 
 @dataclass(slots=True)

@@ -29,6 +29,25 @@ _NEVER = 1 << 62  # a sample index beyond all others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MeasuredDelays:
+    """When samples were taken, as measured from the motion, up to one constant.
+
+    Attributes
+    ----------
+    index : float64, shape (n,)
+        (Fractional) sample indices, increasing.
+    seconds : float64, shape (n,)
+        When they were taken.
+    std : float64, shape (n,)
+        Standard deviation of `seconds`.
+    """
+
+    index: FloatArray
+    seconds: FloatArray
+    std: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Epoch:
     """A stretch of samples counted without error: sample index to time, piecewise straight.
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
+from estimator.likelihood.newton import MAX_STEP, Point, left_over, newton
 from estimator.self_noise.coherency import TOLERANCE
 
 if TYPE_CHECKING:
@@ -32,12 +33,8 @@ DECREMENT = 1e-7
 of a single average, and the step still taken, if short, squares that."""
 BOUNDARY = 1e-6
 """psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
-_MAX_STEP = 2.0  # in ln psi, the first trust region
 _LAST_STEP = 0.01  # in ln psi: longer ones, of a likelihood that is nearly flat, may lead downhill
 _MIN_RADIUS = 1e-9
-_MIN_CURVATURE = 1e-9
-_CONVEX = 1e-6  # least pivot of a Hessian that is solved as it is
-_FAR = 0.1  # part of the discrepancy that a step by the Hessian's expectation has to promise
 _FALLING = np.log(0.1 / BOUNDARY)
 """A channel that falls further from less than this above its boundary is tried there at once: on
 its way the likelihood grows ever less, and ln psi by one a step."""
@@ -101,30 +98,6 @@ class Maximum:
             singular=self.singular[index],
             penalty=self.penalty,
         )
-
-
-@dataclass(slots=True)
-class _Point:
-    """The likelihood at one psi per frequency."""
-
-    x: FloatArray
-    discrepancy: FloatArray
-    eigenvalues: FloatArray
-    eigenvectors: ComplexArray
-
-    def take(self, index: IntArray | BoolArray) -> _Point:
-        return _Point(
-            self.x[index],
-            self.discrepancy[index],
-            self.eigenvalues[index],
-            self.eigenvectors[index],
-        )
-
-    def put(self, index: IntArray | BoolArray, other: _Point) -> None:
-        self.x[index] = other.x
-        self.discrepancy[index] = other.discrepancy
-        self.eigenvalues[index] = other.eigenvalues
-        self.eigenvectors[index] = other.eigenvectors
 
 
 def max_factors(n_channels: int | IntArray) -> IntArray:
@@ -251,9 +224,9 @@ def _search(
     n = len(precision)
     penalty = found.penalty
     best = _scaled(_evaluate(precision, x0, q), q)
-    gradient, step, decrement, at_boundary = _newton(best, lowest, q, penalty)
+    gradient, step, decrement, at_boundary = newton(best, lowest, q, penalty)
     falling = _falling(best.x, step, lowest)
-    radius = np.full(n, _MAX_STEP)
+    radius = np.full(n, MAX_STEP)
     iterations = np.ones(n, np.int64)
     converged = decrement < DECREMENT
     going = np.flatnonzero(~converged)
@@ -281,7 +254,7 @@ def _search(
         moved = going[accept]
         point = trial.take(accept)
         best.put(moved, point)
-        gradient[moved], step[moved], decrement[moved], at_boundary[moved] = _newton(
+        gradient[moved], step[moved], decrement[moved], at_boundary[moved] = newton(
             point, lowest[moved], q, penalty
         )
         falling[moved] = _falling(point.x, step[moved], lowest[moved])
@@ -305,7 +278,7 @@ def _falling(x: FloatArray, step: FloatArray, lowest: FloatArray) -> BoolArray:
     return np.asarray((x > lowest) & (x < lowest + _FALLING) & (step < -0.5))
 
 
-def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
+def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> Point:
     """Whiten by psi and diagonalise, on the inverse matrix.
 
     There the residual eigenvalues are the large ones, and keep their digits however strong the
@@ -314,98 +287,19 @@ def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> _Point:
     scale = np.exp(0.5 * x)
     inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])
     w = 1 / np.maximum(inverse, 1e-18 * inverse[:, -1:])
-    return _Point(x.copy(), _discrepancy(w, q), w, u)
+    return Point(x.copy(), _discrepancy(w, q), w, u)
 
 
-def _scaled(at: _Point, q: int) -> _Point:
+def _scaled(at: Point, q: int) -> Point:
     """Go to the best multiple of all psi, where the residual eigenvalues have a mean of one."""
     mean = at.eigenvalues[:, q:].mean(axis=1, keepdims=True)
     w = at.eigenvalues / mean
-    return _Point(at.x + np.log(mean), _discrepancy(w, q), w, at.eigenvectors)
+    return Point(at.x + np.log(mean), _discrepancy(w, q), w, at.eigenvectors)
 
 
 def _discrepancy(w: FloatArray, q: int) -> FloatArray:
-    return np.asarray(np.where(_residual(w, q), w - np.log(w) - 1, 0.0).sum(axis=1))
+    return np.asarray(np.where(left_over(w, q), w - np.log(w) - 1, 0.0).sum(axis=1))
 
 
 def _quadratic(x: FloatArray, penalty: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.einsum("fi,ij,fj->f", x, penalty, x))
-
-
-def _residual(w: FloatArray, q: int) -> BoolArray:
-    """Eigenvalues no factor takes up: all but the first q, and those below one (A would vanish)."""
-    return (np.arange(w.shape[1]) >= q) | (w <= 1)
-
-
-def _newton(
-    at: _Point, lowest: FloatArray, q: int, penalty: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Gradient, Newton step, its decrement (twice the gain expected), channels at the boundary."""
-    w, u = at.eigenvalues, at.eigenvectors
-    residual = _residual(w, q)
-    conj = u.conj().swapaxes(1, 2)
-    projector = (u * residual[:, None, :]) @ conj
-    weighted = (u * np.where(residual, w, 0.0)[:, None, :]) @ conj
-    gradient = np.einsum("fii->fi", projector - weighted).real + at.x @ penalty
-    hessian = weighted.real * projector.real + weighted.imag * projector.imag + penalty
-    if q:
-        hessian += _turning(w, u, residual, q)
-    at_boundary = (at.x <= lowest) & (gradient > 0)
-    free = ~at_boundary
-    among = free[:, :, None] & free[:, None, :]
-    hessian *= among
-    i = np.arange(w.shape[1])
-    hessian[:, i, i] += at_boundary
-    downhill = np.where(free, gradient, 0.0)
-    step = np.zeros_like(downhill)
-    convex = _least_pivot(hessian) > _CONVEX
-    step[convex] = _solved(hessian[convex], downhill[convex])
-    bent = np.flatnonzero(~convex)
-    if len(bent):
-        expected = (projector.real[bent] ** 2 + projector.imag[bent] ** 2 + penalty) * among[bent]
-        expected[:, i, i] += at_boundary[bent] + _MIN_CURVATURE
-        step[bent] = _solved(expected, downhill[bent])
-        gain = -(step[bent] * downhill[bent]).sum(axis=1)
-        size = np.abs(step[bent]).max(axis=1)
-        bent = bent[(gain < _FAR * at.discrepancy[bent]) | (size > _MAX_STEP)]
-        step[bent] = _turned(hessian[bent], downhill[bent])
-    return gradient, step, -(step * downhill).sum(axis=1), at_boundary
-
-
-def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    return np.asarray(-np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
-
-
-def _least_pivot(matrices: FloatArray) -> FloatArray:
-    """Least pivot of Gaussian elimination, shape (n,): positive if all eigenvalues are.
-
-    All matrices at once, none beyond a pivot under `_CONVEX`: a tenth of the time of eigenvalues.
-    """
-    left = np.moveaxis(matrices, 0, 2).copy()  # the matrices' own axis last: contiguous
-    least = left[0, 0].copy()
-    for k in range(1, len(left)):
-        pivot = np.where(least > _CONVEX, left[k - 1, k - 1], np.inf)
-        left[k:, k:] -= left[k:, k - 1, None] * (left[k - 1, k:] / pivot)
-        least = np.minimum(least, left[k, k])
-    return np.asarray(least, np.float64)
-
-
-def _turned(hessian: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Newton step with negative curvature turned round."""
-    curvature, axes = np.linalg.eigh(hessian)
-    floor = _MIN_CURVATURE * np.maximum(curvature[:, -1:], 1.0)
-    curvature = np.maximum(np.abs(curvature), floor)
-    along = np.einsum("fik,fi->fk", axes, downhill)
-    return np.asarray(-np.einsum("fik,fk->fi", axes, along / curvature))
-
-
-def _turning(w: FloatArray, u: ComplexArray, residual: BoolArray, q: int) -> FloatArray:
-    """Second derivatives by ln psi that come of the factors' turning, shape (n_freqs, p, p)."""
-    n, p = w.shape
-    factor, rest = w[:, None, :q], w[:, q:, None]
-    distance = np.maximum(factor - rest, 1e-6 * factor)
-    weight = np.where(residual[:, None, :q], 0.0, (1 - rest) * (factor + rest) / distance)
-    pairs = (u[:, :, q:, None].conj() * u[:, :, None, :q]).reshape(n, p, q * (p - q))
-    weighted = pairs * weight.reshape(n, 1, q * (p - q))
-    # the real part of a product of complex numbers is one of twice as many real numbers
-    return np.asarray(weighted.view(np.float64) @ pairs.view(np.float64).swapaxes(1, 2))

@@ -15,7 +15,7 @@ from rich.text import Text
 from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
-from tui.studies.clocks import clocks
+from tui.studies.clocks import clock_coverage, clocks
 from tui.studies.estimates import ESTIMATES
 from tui.studies.gradients import gradients
 from tui.studies.laboratory import LABORATORY, Laboratory
@@ -32,7 +32,12 @@ if TYPE_CHECKING:
     from tui.studies.study import ProgressCallback, Series, Study
 
 CLOCKS, VERDICTS = "clocks", "verdicts"
-RESPONSES = {"calibration": calibration, "edges": edges, "gradients": gradients}
+RESPONSES = {
+    "calibration": calibration,
+    "edges": edges,
+    "gradients": gradients,
+    "clock-coverage": clock_coverage,
+}
 STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, *RESPONSES)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")

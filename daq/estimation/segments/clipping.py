@@ -13,7 +13,7 @@ import numpy as np
 from daq.protocols.block import BlockFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -66,6 +66,25 @@ def clipped_columns(
                 if column is not None:
                     shares[column] = max(share, shares.get(column, 0.0))
     return shares
+
+
+def in_clipped_blocks(
+    records: Sequence[ReadableSensor], times: Callable[[], NDArray[np.float64]]
+) -> NDArray[np.bool_] | None:
+    """Return which samples lie in blocks that say they are clipped; None if no block does.
+
+    `times` returns, for each sample and sensor, the seconds since the recording's creation.
+    """
+    found: NDArray[np.bool_] | None = None
+    for number, record in enumerate(records):
+        clipped = record.blocks.clipped
+        if len(clipped) == 0:
+            continue
+        position = times()[:, number] * record.sampling_rate
+        found = np.zeros(len(position), dtype=np.bool_) if found is None else found
+        before = np.searchsorted(clipped[:, 0], position, side="right") - 1
+        found |= (before >= 0) & (position < clipped[before, 1])
+    return found
 
 
 def _rows(record: ReadableSensor) -> NDArray[np.int64]:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.delay_estimation import DelayEstimator
 from daq.alignment.growing_rows import GrowingRows
+from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
+from daq.estimation.segments.read_ahead import read_ahead
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
@@ -22,7 +23,7 @@ from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from datetime import datetime
 
     from numpy.typing import NDArray
@@ -34,11 +35,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_Piece = TypeVar("_Piece")
-_Read = TypeVar("_Read")
-
 _VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
-_READERS = 2  # pieces being read while one is worked on
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _MOST_PASSES = 4
@@ -202,7 +199,7 @@ class Pass:
                 clipped = None if clipped is None else ~_surrounded(~clipped, reach)
             return _Samples(samples, usable, clipped, raw, flat)
 
-        for (first, count), part in zip(pieces, _ahead(read, pieces), strict=True):
+        for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             samples, usable, clipped = part.samples, part.usable, part.clipped
             self.stillness.add(part.raw, part.raw_usable)
             starts = np.arange(count) * hop
@@ -282,19 +279,10 @@ class Pass:
         """Return which grid samples lie in blocks that are clipped; None if none do."""
         if self._settings.reject is False:
             return None
-        found = None
-        for number, record in enumerate(self._sensors):
-            clipped = record.blocks.clipped
-            if len(clipped) == 0:
-                continue
-            found = np.zeros(n_samples, dtype=np.bool_) if found is None else found
-            at = np.arange(start, start + n_samples, dtype=np.float64)
-            origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
-            seconds = origin * 1e-9 + at / self.welch.sampling_rate
-            position = (seconds - self.aligned.delays(at)[:, number]) * record.sampling_rate
-            before = np.searchsorted(clipped[:, 0], position, side="right") - 1
-            found |= (before >= 0) & (position < clipped[before, 1])
-        return found
+        at = np.arange(start, start + n_samples, dtype=np.float64)
+        origin = self.aligned.start_utc_ns - self.recording.created_at.utc_ns
+        seconds = origin * 1e-9 + at / self.welch.sampling_rate
+        return in_clipped_blocks(self._sensors, lambda: seconds[:, None] - self.aligned.delays(at))
 
     @property
     def awaited(self) -> int:
@@ -407,22 +395,5 @@ def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) ->
     return np.asarray(missing[starts + length] == missing[starts])
 
 
-def _ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
-    """Read pieces in order, the next ones while the one before is worked on."""
-    if len(pieces) < 2:
-        yield from map(read, pieces)
-        return
-    with ThreadPoolExecutor(_READERS) as pool:
-        coming: deque[Future[_Read]] = deque()
-        for piece in pieces:
-            coming.append(pool.submit(read, piece))
-            if len(coming) > _READERS:
-                yield coming.popleft().result()
-        while coming:
-            yield coming.popleft().result()
-
-
-def _utc_ns(instant: datetime | None) -> int | None:
-    if instant is None:
-        return None
-    return math.floor(instant.timestamp()) * 10**9 + instant.microsecond * 1000
+def _utc_ns(at: datetime | None) -> int | None:
+    return None if at is None else math.floor(at.timestamp()) * 10**9 + at.microsecond * 1000

@@ -9,7 +9,8 @@ import pytest
 
 from daq.protocols.block import BlockFlag
 from daq.recording.file_format import BLOCK_DTYPE
-from daq.timing.arrival_times import ArrivalTimes, MeasuredDelays
+from daq.timing.arrival_times import ArrivalTimes
+from daq.timing.clock_model import MeasuredDelays
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import supporting_line
 from daq.timing.usb_polling import Polls
