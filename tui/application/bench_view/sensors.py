@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.table import Table
+from rich.style import Style
 from rich.text import Text
 
 from daq.acquisition.before_test.findings import Problem
 from daq.acquisition.before_test.preflight import check_before_test, is_complete
 from tui.application.bench_view.traces import trace
+from tui.application.columns import columns, width_of
 from tui.output.formatting import listed, signed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from rich.console import RenderableType
 
     from daq.acquisition.before_test.findings import Finding
     from daq.acquisition.before_test.preview import SensorPreview
@@ -51,17 +50,17 @@ ADVICE: Mapping[Problem, str] = {
 """What is wrong, and what to do."""
 
 
-def sensors_of_bench(state: State) -> RenderableType:
+def sensors_of_bench(state: State, *, chosen: str = "") -> Text:
     """Return a row per sensor of the bench file."""
     if state.bench is None:
         return Text("This recording has no bench file: it was imported.")
     titles = ("model", "driver", "port", "channels")
     failures = {sensor.name: _failure(sensor.name, state.failure) for sensor in state.bench.sensors}
-    return _table(
+    return columns(
         ("sensor", *(("start",) if any(failures.values()) else ()), *titles),
         [
             [
-                Text(sensor.name, "bold"),
+                _name(sensor.name, chosen),
                 *((Text(failures[sensor.name], BAD),) if any(failures.values()) else ()),
                 *map(Text, (sensor.model, sensor.driver, sensor.port)),
                 Text(" ".join(channel.name for channel in sensor.channels)),
@@ -69,6 +68,12 @@ def sensors_of_bench(state: State) -> RenderableType:
             for sensor in state.bench.sensors
         ],
     )
+
+
+def _name(sensor: str, chosen: str) -> Text:
+    """Return the name of a sensor, which a click chooses."""
+    click = {"@click": f"screen.choose({sensor!r})"}
+    return Text(sensor, Style(bold=True, reverse=sensor == chosen, meta=click))
 
 
 def _failure(sensor: str, failures: str) -> str:
@@ -80,7 +85,7 @@ def _failure(sensor: str, failures: str) -> str:
     return ""
 
 
-def sensor_states(sensors: Sequence[SensorPreview], *, width: int) -> Table:
+def sensor_states(sensors: Sequence[SensorPreview], *, width: int, chosen: str = "") -> Text:
     """Return a row per sensor: state, identity, actual rate, temperature, port."""
     rows = []
     for each in sensors:
@@ -88,7 +93,7 @@ def sensor_states(sensors: Sequence[SensorPreview], *, width: int) -> Table:
         temperature = None if about is None else about.temperature
         rows.append(
             (
-                Text(each.sensor.name, "bold"),
+                _name(each.sensor.name, chosen),
                 _state(each),
                 Text("" if about is None else about.model or each.sensor.model),
                 Text("" if about is None else about.serial_number),
@@ -97,13 +102,14 @@ def sensor_states(sensors: Sequence[SensorPreview], *, width: int) -> Table:
             )
         )
     titles = ("sensor", "state", "model", "serial no.", "Hz", "°C")
-    room = max(8, width - _width(titles, rows))
-    return _table(
+    room = max(8, width - width_of(titles, rows))
+    return columns(
         (*titles, "port"),
         [
             (*row, Text(_tail(each.sensor.port, room)))
             for row, each in zip(rows, sensors, strict=True)
         ],
+        right=NUMBERS,
     )
 
 
@@ -120,7 +126,7 @@ def _state(each: SensorPreview) -> Text:
     return Text("▲ clipping", BAD) if each.is_clipping else Text("● live", GOOD)
 
 
-def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Table:
+def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Text:
     """Return a row per channel: the last second as numbers, the last ten as a trace."""
     rows, shown = [], []
     for each in sensors:
@@ -141,13 +147,14 @@ def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Table:
                 )
             )
     titles = ("channel", "mean", "RMS", "peak", "unit")
-    room = min(max(LEAST_TRACE, width - _width(titles, rows)), WIDEST_TRACE)
-    return _table(
+    room = min(max(LEAST_TRACE, width - width_of(titles, rows)), WIDEST_TRACE)
+    return columns(
         (*titles, "last 10 s"),
         [
             (*row, Text(trace(values, width=room), "#4cc9f0"))
             for row, values in zip(rows, shown, strict=True)
         ],
+        right=NUMBERS,
     )
 
 
@@ -171,18 +178,3 @@ def sentence(finding: Finding) -> str:
     return ADVICE[finding.problem].format(
         sensor=finding.sensor, channel=finding.channel, value=finding.value, text=finding.text
     )
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style=f"bold {MUTED}")
-    for title in titles:
-        table.add_column(title, no_wrap=True, justify="right" if title in NUMBERS else "left")
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def _width(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> int:
-    """Return the cells that columns take, each with the space after it."""
-    widest = (max(len(t), *(row[n].cell_len for row in rows), 0) for n, t in enumerate(titles))
-    return sum(widest) + 2 * len(titles)

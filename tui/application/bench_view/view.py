@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, ClassVar
 
-from rich.console import Group
 from rich.text import Text
 from textual import on, work
 from textual.binding import Binding, BindingType
@@ -60,6 +59,8 @@ class BenchView(View):
         self._sensors: Sequence[SensorPreview] = ()
         self._ended: threading.Event | None = None
         self._is_frozen = False
+        self._chosen = ""
+        self._n_lines, self._alert = (-1, -1), ""
 
     def parts(self) -> ComposeResult:
         """Yield the sensors, what is wrong, and one line on what to do."""
@@ -78,18 +79,23 @@ class BenchView(View):
         if is_live:
             width = self.app.size.width - 4
             traces = channel_traces(self._sensors, width=width)
-            states = sensor_states(self._sensors, width=width)
-            table.update(Group(states, "", traces))
+            states = sensor_states(self._sensors, width=width, chosen=self._chosen)
+            shown = Text("\n\n", no_wrap=True).join((states, traces))
         else:
-            table.update(sensors_of_bench(state))
+            shown = sensors_of_bench(state, chosen=self._chosen)
         lines = [Text(f"▲ {line}", BAD) for line in state.failure.splitlines()]
         lines += checks(self._sensors) if is_live else []
         self.set_class(bool(lines), "-alert")
         if len(lines) > MOST_LINES:
             more = Text(f"and {len(lines) - MOST_LINES + 1} more", MUTED)
             lines = [*lines[: MOST_LINES - 2], more, lines[-1]]
-        self.query_one("#alert", Static).update(Text("\n").join(lines))
-        self.query_one("#progress", Static).update(Text(state.note or self._todo(), MUTED))
+        n_lines = shown.plain.count("\n"), len(lines)
+        table.update(shown, layout=n_lines != self._n_lines)
+        alert = Text("\n").join(lines)
+        self.query_one("#alert", Static).update(alert, layout=alert.plain != self._alert)
+        todo = Text(state.note or self._todo(), MUTED)
+        self.query_one("#progress", Static).update(todo, layout=False)
+        self._n_lines, self._alert = n_lines, alert.plain
 
     def _todo(self) -> str:
         if self._ended is not None:
