@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import Array, InlineTable, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,15 +31,109 @@ def set_sensor_values(path: str | Path, values: Mapping[str, Mapping[str, str]])
     OSError
         If the file cannot be written; it is unchanged then.
     """
-    path = Path(path).resolve()
-    document = tomlkit.parse(path.read_text(encoding="utf-8"))
+    document = tomlkit.parse(Path(path).read_text(encoding="utf-8"))
     for table in document["sensors"]:
         for key, value in values.get(str(table["name"]), {}).items():
             _set(table, key, value)
+    replace_file(path, tomlkit.dumps(document))
+
+
+def with_sensor(text: str, values: Mapping[str, Any], *, replaces: str = "") -> str:
+    """Return the text of a bench file with another sensor, or with other values of one.
+
+    Parameters
+    ----------
+    text : str
+        TOML, valid or not as a bench file.
+    values : mapping
+        Keys of the table of the sensor; None for one that it is not to have. Of tables in it, and
+        of channels where there are as many, only what differs is changed. Other keys stay.
+    replaces : str
+        Name of the sensor that gets them; a new one, if empty.
+    """
+    document = tomlkit.parse(text)
+    sensors = document.setdefault("sensors", tomlkit.aot())
+    for table in sensors:
+        if replaces and str(table.get("name")) == replaces:
+            _change(table, values)
+            return tomlkit.dumps(document)
+    new = tomlkit.table()
+    _change(new, values)
+    new.add(tomlkit.nl())
+    sensors.append(new)
+    return tomlkit.dumps(document)
+
+
+def without_sensor(text: str, name: str) -> str:
+    """Return the text of a bench file without a sensor, nor what is simulated of it."""
+    document = tomlkit.parse(text)
+    sensors = document["sensors"]
+    for number, table in enumerate(sensors):
+        if str(table.get("name")) == name:
+            del sensors[number]
+            break
+    simulated = document.get("simulation", {}).get("sensors", {})
+    if name in simulated:
+        del simulated[name]
+    return tomlkit.dumps(document)
+
+
+def _change(table: Any, values: Mapping[str, Any]) -> None:  # noqa: ANN401 - tomlkit's are many
+    """Give a table values; those that it has already stay as they are written."""
+    for key, value in values.items():
+        before = table.get(key)
+        if value is None:
+            table.pop(key, None)
+        elif isinstance(value, dict) and isinstance(before, dict):
+            _change(before, value)
+        elif _has_as_many(value, before):
+            for one, changed in zip(before, value, strict=True):
+                _change(one, changed)
+        elif before is None and isinstance(value, dict):
+            if some := {name: one for name, one in value.items() if one is not None}:
+                table[key] = some
+        elif before is None and _is_tables(value):
+            table[key] = _lines([{n: v for n, v in one.items() if v is not None} for one in value])
+        elif before != value:
+            table[key] = value
+
+
+def _is_tables(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(one, dict) for one in value)
+
+
+def _has_as_many(value: object, before: object) -> bool:
+    return (
+        isinstance(value, list)
+        and isinstance(before, list)
+        and _is_tables(value)
+        and len(value) == len(before)
+    )
+
+
+def _lines(tables: list[dict[str, Any]]) -> Array:
+    """Return an array of tables, a line for each."""
+    lines = tomlkit.array()
+    for one in tables:
+        inline = tomlkit.inline_table()
+        inline.update(one)
+        lines.append(inline)
+    return lines.multiline(multiline=True)
+
+
+def replace_file(path: str | Path, text: str) -> None:
+    """Write a file whole or not at all; a link stays one, and the mode of the file as it is.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; it is unchanged then.
+    """
+    path = Path(path).resolve()
     descriptor, new = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(tomlkit.dumps(document))
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         Path(new).chmod(path.stat().st_mode)

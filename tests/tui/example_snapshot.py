@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.acquisition.before_test.device_check import DiscoveredDevice
 from daq.drivers.bench_file import parse
+from daq.drivers.interface import DeviceInformation
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import (
     ChannelLabel,
@@ -32,7 +34,7 @@ from estimator.diagnostics.diagnose import diagnose
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from daq.bench.model import Bench
@@ -282,6 +284,22 @@ class ProgressCallback:
     def preview(self) -> Preview | None:
         """Return what was prepared."""
         return self.sensors
+
+    def read_bench(self) -> str:
+        """Return the text of the bench."""
+        return "" if self.bench is None else self.bench.text
+
+    def save_bench(self, text: str) -> None:
+        """Take it as the bench."""
+        self.bench = parse(text)
+        self.told.append("save bench")
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Return a device on any port but one."""
+        if port == "/dev/nothing":
+            return ()
+        about = DeviceInformation("", "A352AD10", "S9", "1.4", 200.0, 25.0)
+        return [DiscoveredDevice("epson", port, {"baud_rate": 460800}, about)]
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Note it."""

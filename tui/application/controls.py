@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from daq.acquisition.before_test.device_check import DiscoveredDevice
     from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
@@ -80,6 +81,36 @@ class Controls(Protocol):
     @property
     def preview(self) -> Preview | None:
         """Reads the sensors before a test; None where there are none to be read."""
+        ...
+
+    def read_bench(self) -> str:
+        """Return the text of the bench file; not called where no recording can be started.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read.
+        """
+        ...
+
+    def save_bench(self, text: str) -> None:
+        """Write the text of the bench file, and use that bench from now on. Blocks.
+
+        Raises
+        ------
+        BenchFileError, OSError
+            If it has errors, or cannot be written.
+        """
+        ...
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Return the devices on a port. Blocks.
+
+        Raises
+        ------
+        HuddleError
+            If the port cannot be opened.
+        """
         ...
 
     def announce(self, event: str, text: str, path: Path | None) -> None:

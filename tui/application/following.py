@@ -19,6 +19,7 @@ from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
 from tui.application.harmless_lines import HarmlessLines
 from tui.application.messages import (
+    BenchEdited,
     DeletionRequested,
     ErrorReported,
     Messenger,
@@ -105,7 +106,7 @@ class FollowingApp(App[None]):
 
     def _new_view(self, kind: type[View]) -> View:
         if kind is BenchView:
-            return BenchView(self.state, self._controls.preview)
+            return BenchView(self.state, self._controls)
         return kind(self.state)
 
     def on_unmount(self) -> None:
@@ -284,6 +285,20 @@ class FollowingApp(App[None]):
         self.state = replace(self.state, reference=message.reference)
         name = message.reference.path.name
         self.notify(f"compared with {name}: 2 curves, 3 differences", timeout=8, markup=False)
+
+    @on(BenchEdited)
+    @work(thread=True, group="control")
+    def _on_edited(self, message: BenchEdited) -> None:
+        def save() -> bool:
+            self._controls.save_bench(message.text)
+            return True
+
+        if self._try(save):
+            self.call_from_thread(self._show_bench)
+
+    def _show_bench(self) -> None:
+        self.state = replace(self.state, bench=self._controls.bench, failure="")
+        self.notify("The bench file is saved.", timeout=5)
 
     @on(DeletionRequested)
     def _on_deletion(self, message: DeletionRequested) -> None:

@@ -74,6 +74,13 @@ class DeletionRequested(Message):
 
 
 @dataclass
+class BenchEdited(Message):
+    """The bench file is to become this text."""
+
+    text: str
+
+
+@dataclass
 class PreviewUpdated(Message):
     """The sensors of the bench, as they are now; nothing is recorded."""
 

@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from daq.acquisition.before_test.device_check import discover
 from daq.acquisition.before_test.preview import preview
+from daq.bench.editing import replace_file
+from daq.drivers.bench_file import parse
 from daq.errors import HuddleError
 from daq.host_clock import SystemClock
 from daq.recording.control import ask
@@ -31,9 +34,10 @@ from tui.runs.recorder_process import RecorderProcess
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from daq.acquisition.before_test.device_check import DiscoveredDevice
     from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
@@ -104,6 +108,21 @@ class BenchControls:
     def preview(self) -> Preview | None:
         """Reads the sensors of the bench."""
         return partial(read_sensors, self.bench, self.ports)
+
+    def read_bench(self) -> str:
+        """Return the text of the bench file."""
+        return self.path.read_text(encoding="utf-8")
+
+    def save_bench(self, text: str) -> None:
+        """Write the bench file, if it has no errors."""
+        bench = parse(text, self.path)
+        replace_file(self.path, text)
+        self.bench = bench
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Look for devices on a port that nobody reads."""
+        with self.ports:
+            return asyncio.run(discover(port, SystemClock()))
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
@@ -179,6 +198,20 @@ class RecordingControls:
     @property
     def preview(self) -> None:
         """Return nothing: the sensors of a recording may be anywhere."""
+
+    def read_bench(self) -> str:
+        """Raise an error: what a recording was made with is not to be changed."""
+        raise HuddleError("this is a recording; huddle tui BENCH changes a bench file")
+
+    def save_bench(self, text: str) -> None:
+        """Raise an error."""
+        del text
+        self.read_bench()
+
+    def find_devices(self, port: str) -> Sequence[DiscoveredDevice]:
+        """Return none."""
+        del port
+        return ()
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from rich.console import Console
+from textual.widgets import Input
 
 from daq.acquisition.before_test.preview import SensorPreview
 from daq.drivers.interface import DeviceInformation
@@ -130,6 +131,53 @@ async def test_frozen_traces_stay(told: ProgressCallback) -> None:
         await pilot.press("f")
         await shown(pilot, app)
         assert "frozen: f goes on" in screen_text(app)
+
+
+async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
+    told: ProgressCallback,
+) -> None:
+    app = HuddleApp(told)
+    async with app.run_test(size=NARROW) as pilot:
+
+        async def press(*keys: str) -> str:
+            await pilot.press(*keys)
+            await app.workers.wait_for_complete()
+            await shown(pilot, app)
+            return " ".join(screen_text(app).split())
+
+        assert "No such" not in await press("a")
+        assert "found nothing" in await press(*"/dev/nothing", "enter")
+        assert "new sensor, driver epson" in await press(*["backspace"] * 7, *"tty9", "enter")
+        assert app.screen.query_one("#serial_number", Input).value == "S9"
+        assert "port" in await press("D")  # what a field means is with the cursor
+        sensitivity = app.screen.query_one("#sensitivity", Input)
+        for name, value in (("channels", "X Y Z"), ("sensitivity", "1 2")):
+            app.screen.query_one(f"#{name}", Input).value = value
+        sensitivity.focus()
+        assert "2 for 3 channels; expected 1 or 3" in await press("end")
+        sensitivity.value = "0"
+        assert "expected counts" in await press("end")
+        sensitivity.value = "1710799.9 1 -1"
+        baud = app.screen.query_one("#setting-baud_rate", Input)
+        baud.focus()
+        assert "baud" in await press("end")
+        baud.value = "12"
+        assert "baud_rate = 12" in await press("enter")  # refused, and said why
+        baud.value = "460800"
+        await press("enter")
+        assert told.bench is not None
+        added = told.bench.sensors[-1]
+        assert (added.name, added.port, added.serial_number) == ("D", "/dev/tty9", "S9")
+        assert [channel.sensitivity for channel in added.channels] == [1710799.9, 1, -1]
+        await press("up", "e")
+        app.screen.query_one("#model", Input).value = "M-A370"
+        await press("enter")
+        assert told.bench.sensors[-1] == added.model_copy(update={"model": "M-A370"})
+        await press("delete", "n")
+        assert len(told.bench.sensors) == 4
+        await press("delete", "y")
+    assert [sensor.name for sensor in told.bench.sensors] == ["A", "B", "C"]
+    assert told.told == ["save bench"] * 3
 
 
 def test_why_a_test_did_not_start_is_on_the_row_of_the_sensor() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from rich.text import Text
 from textual import on, work
@@ -11,6 +11,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
+from daq.bench.editing import without_sensor
 from daq.errors import HuddleError
 from tui.application.bench_view.sensors import (
     channel_traces,
@@ -18,17 +19,19 @@ from tui.application.bench_view.sensors import (
     sensor_states,
     sensors_of_bench,
 )
-from tui.application.messages import ErrorReported, PreviewUpdated
+from tui.application.dialogs import QuestionScreen
+from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
+from tui.application.messages import BenchEdited, ErrorReported, PreviewUpdated
 from tui.application.state import BENCH
 from tui.application.view import BAD, MUTED, View
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from textual.app import ComposeResult
 
     from daq.acquisition.before_test.preview import SensorPreview
-    from tui.application.controls import Preview
+    from tui.application.controls import Controls, Preview
     from tui.application.state import State
 
 
@@ -43,6 +46,11 @@ class BenchView(View):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("p", "preview", "Check sensors"),
         Binding("f", "freeze", "Freeze"),
+        Binding("down", "choose_next(1)", "Choose", key_display="↑↓", show=False),
+        Binding("up", "choose_next(-1)", "Choose", show=False),
+        Binding("a", "add", "Add"),
+        Binding("e", "edit", "Edit"),
+        Binding("delete", "remove", "Remove", key_display="del", show=False),
         Binding("s", "app.start", "Start test"),
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
@@ -50,12 +58,16 @@ class BenchView(View):
     KEYS = (
         ("p", "check the sensors: read them live without recording; p again ends it"),
         ("f", "freeze the traces; f again lets them go on"),
+        ("↑ ↓, click", "choose a sensor"),
+        ("a", "add a sensor: huddle looks what is on its port, if you do not name a driver"),
+        ("e", "change the chosen sensor in the bench file; comments there stay"),
+        ("del", "remove the chosen sensor from the bench file; asked before"),
         ("s", "start a test: operator, note, and when it ends by itself"),
     )
 
-    def __init__(self, state: State, preview: Preview | None = None) -> None:
+    def __init__(self, state: State, controls: Controls) -> None:
         super().__init__(state)
-        self._preview = preview
+        self._controls = controls
         self._sensors: Sequence[SensorPreview] = ()
         self._ended: threading.Event | None = None
         self._is_frozen = False
@@ -111,9 +123,11 @@ class BenchView(View):
         """Offer only what can be done now."""
         del parameters
         state = self.state
+        is_busy = state.is_recording or state.is_starting
+        if action in {"add", "edit", "remove"}:
+            return state.can_start and not is_busy and state.bench is not None
         if action == "preview":
-            is_busy = state.is_recording or state.is_starting
-            return self._preview is not None and state.can_start and not is_busy
+            return self._controls.preview is not None and state.can_start and not is_busy
         return self._ended is not None if action == "freeze" else True
 
     def on_screen_suspend(self) -> None:
@@ -134,11 +148,76 @@ class BenchView(View):
         """Read the sensors, or end that."""
         if self._ended is not None:
             self.end_preview()
-        elif self._preview is not None:
+        elif (preview := self._controls.preview) is not None:
             self._ended = threading.Event()
-            self._read(self._preview, self._ended)
+            self._read(preview, self._ended)
         self.show(self.state)
         self.refresh_bindings()
+
+    # ------------------------------------------------------------ sensors of the file
+
+    def action_choose(self, name: str) -> None:
+        """Choose a sensor."""
+        self._chosen = name
+        self.show(self.state)
+
+    def action_choose_next(self, step: int) -> None:
+        """Choose the sensor below, or above."""
+        names = [] if self.state.bench is None else [one.name for one in self.state.bench.sensors]
+        if names:
+            at = names.index(self._chosen) + step if self._chosen in names else min(0, step)
+            self.action_choose(names[at % len(names)])
+
+    def action_add(self) -> None:
+        """Ask for a new sensor."""
+        self.end_preview()
+
+        def ask(found: tuple[str, dict[str, Any]] | None) -> None:
+            if found is not None:
+                self._ask(*found)
+
+        self.app.push_screen(PortForm(self._controls.find_devices), ask)
+
+    def action_edit(self) -> None:
+        """Ask for what is to change of the chosen sensor."""
+        bench = self.state.bench
+        sensor = (
+            None
+            if bench is None
+            else next((one for one in bench.sensors if one.name == self._chosen), None)
+        )
+        if sensor is None:
+            self.action_choose_next(1)
+            return
+        self.end_preview()
+        self._ask(sensor.driver, None, replaces=sensor.name)
+
+    def _ask(self, driver: str, values: Mapping[str, Any] | None, *, replaces: str = "") -> None:
+        try:
+            text = self._controls.read_bench()
+        except (HuddleError, OSError) as error:
+            self.app.post_message(ErrorReported(str(error)))
+            return
+        known = sensor_table(text, replaces) if values is None else values
+        self.app.push_screen(SensorForm(text, driver, known, replaces=replaces), self._save)
+
+    def action_remove(self) -> None:
+        """Remove the chosen sensor, once that has been confirmed."""
+        name = self._chosen
+        if self.state.bench is None or name not in {one.name for one in self.state.bench.sensors}:
+            return
+
+        def remove(really: bool | None) -> None:
+            if really:
+                self._save(without_sensor(self._controls.read_bench(), name))
+
+        question = f"Remove sensor {name} from the bench file?"
+        self.app.push_screen(QuestionScreen("remove", question, does="removes"), remove)
+
+    def _save(self, text: str | None) -> None:
+        if text is not None:
+            self.end_preview()
+            self.app.post_message(BenchEdited(text))
 
     def action_freeze(self) -> None:
         """Keep the traces as they are, or let them go on."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from textual import on
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, VerticalScroll
+from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from textual.app import ComposeResult
+    from textual.events import Resize
 
+FRAME = 6
+"""Rows of the frame, and of what a field means."""
 Result = TypeVar("Result")
 
 
@@ -60,21 +63,26 @@ class Form(ModalScreen[Result | None], Generic[Result]):
 
     def compose(self) -> ComposeResult:
         """Lay out a line for each field."""
-        with VerticalScroll(classes="form") as form:
-            for field in self._fields:
-                with Horizontal():
-                    yield Label(field.title)
-                    yield Input(
-                        field.value,
-                        id=field.name,
-                        placeholder=field.placeholder,
-                        compact=True,
-                        max_length=200,
-                    )
+        with Vertical(classes="form") as form:
+            with VerticalScroll(can_focus=False):
+                for field in self._fields:
+                    with Horizontal():
+                        yield Label(field.title)
+                        yield Input(
+                            field.value,
+                            id=field.name,
+                            placeholder=field.placeholder,
+                            compact=True,
+                            max_length=200,
+                        )
             yield Static(id="hint")
         form.border_title = self._title
         form.border_subtitle = f"tab next · enter {self._does} · esc goes back"
-        form.can_focus = False
+
+    def on_resize(self, event: Resize) -> None:
+        """Leave room for what a field means."""
+        room = max(1, event.size.height - FRAME)
+        self.query_one(VerticalScroll).styles.height = min(len(self._fields), room)
 
     def problem(self, name: str) -> str:
         """Return what is wrong with a field; empty if nothing is."""
