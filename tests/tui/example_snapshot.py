@@ -285,6 +285,11 @@ class ProgressCallback:
         """Return what was prepared."""
         return self.sensors
 
+    def pin(self, path: Path) -> str:
+        """Note it."""
+        self.told.append(f"pin {path.name}")
+        return f"{path.name} is kept"
+
     def read_bench(self) -> str:
         """Return the text of the bench."""
         return "" if self.bench is None else self.bench.text

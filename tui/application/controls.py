@@ -113,6 +113,16 @@ class Controls(Protocol):
         """
         ...
 
+    def pin(self, path: Path) -> str:
+        """Keep a recording of a service whatever its limits of storage, or no longer; say which.
+
+        Raises
+        ------
+        HuddleError
+            If no service has made it: then nothing removes it.
+        """
+        ...
+
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Tell the world of the end of a test (``ended``), or of ``trouble``. Blocks."""
         ...

@@ -24,6 +24,7 @@ from tui.application.messages import (
     ErrorReported,
     Messenger,
     OpeningRequested,
+    PinRequested,
     Progress,
     RecordingOpened,
     ReferenceReady,
@@ -285,6 +286,13 @@ class FollowingApp(App[None]):
         self.state = replace(self.state, reference=message.reference)
         name = message.reference.path.name
         self.notify(f"compared with {name}: 2 curves, 3 differences", timeout=8, markup=False)
+
+    @on(PinRequested)
+    @work(thread=True, group="control")
+    def _on_pin(self, message: PinRequested) -> None:
+        said = self._try(partial(self._controls.pin, message.path))
+        if said is not None:
+            self.call_from_thread(self.notify, said, timeout=8, markup=False)
 
     @on(BenchEdited)
     @work(thread=True, group="control")

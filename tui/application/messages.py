@@ -74,6 +74,13 @@ class DeletionRequested(Message):
 
 
 @dataclass
+class PinRequested(Message):
+    """A recording of a service is to be kept, or no longer."""
+
+    path: Path
+
+
+@dataclass
 class BenchEdited(Message):
     """The bench file is to become this text."""
 

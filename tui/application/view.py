@@ -112,6 +112,8 @@ def status_line(state: State, view: str, *, width: int) -> Text:
     if now is not None:
         doing.append(f"  {clock_time(now.elapsed)}")
     if state.verdict is not None:
+        if width < ALL_TABS:  # its sign says the same as its word
+            doing = Text.assemble(doing[:1], doing[doing.plain.find("  ") + 1 :])
         doing.append(f"  {WORDS[state.verdict.verdict]}", STYLES[state.verdict.verdict])
     room = width - 2 - line.cell_len - doing.cell_len
     if len(state.name) + 2 <= room:

@@ -82,13 +82,20 @@ def pin_runs(source: Path, names: Sequence[str], *, pinned: bool) -> None:
     """
     place = Place.of(source)
     runs = place.runs()
-    found = [run for name in names for run in _named(runs, name)]
+    found = [run for name in names for run in runs_named(runs, name)]
     place.store.pin([run.key for run in found], pinned=pinned)
     for run in found:
         for_people(None).print(f"run {run.name} {'is kept' if pinned else 'is no longer pinned'}")
 
 
-def _named(runs: Sequence[Run], name: str) -> list[Run]:
+def runs_named(runs: Sequence[Run], name: str) -> list[Run]:
+    """Return the runs with a recording of this file name, or with this due time.
+
+    Raises
+    ------
+    RunNotFoundError
+        If there is none.
+    """
     short = name.rpartition("/")[2]
     found = [
         run

@@ -24,6 +24,7 @@ from daq.recording.reader import Recording
 from daq.recording.storage.names import recording_path
 from daq.results.sources import sources
 from daq.results.store import store_results
+from tui.commands.runs import RunNotFoundError, runs_named
 from tui.output.console import write_json
 from tui.output.extras import require
 from tui.output.json_document import document
@@ -31,6 +32,7 @@ from tui.output.results import curves_csv
 from tui.runs.estimate_settings import settings_for
 from tui.runs.find_running import running_recording
 from tui.runs.recorder_process import RecorderProcess
+from tui.service.records.places import NoServiceError, Place
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
@@ -108,6 +110,10 @@ class BenchControls:
     def preview(self) -> Preview | None:
         """Reads the sensors of the bench."""
         return partial(read_sensors, self.bench, self.ports)
+
+    def pin(self, path: Path) -> str:
+        """Keep a recording of the service of this bench, or no longer."""
+        return pin(self.path, path)
 
     def read_bench(self) -> str:
         """Return the text of the bench file."""
@@ -199,6 +205,10 @@ class RecordingControls:
     def preview(self) -> None:
         """Return nothing: the sensors of a recording may be anywhere."""
 
+    def pin(self, path: Path) -> str:
+        """Keep a recording of the service in its folder, or no longer."""
+        return pin(path.parent, path)
+
     def read_bench(self) -> str:
         """Raise an error: what a recording was made with is not to be changed."""
         raise HuddleError("this is a recording; huddle tui BENCH changes a bench file")
@@ -235,6 +245,26 @@ class RecordingControls:
     ) -> tuple[Path, ...]:
         """Write CSV and JSON beside the recording."""
         return save_result(path, snapshot, settings, verdict, folder=path.parent)
+
+
+def pin(source: Path, path: Path) -> str:
+    """Keep a recording of a service, or no longer where it is pinned; return which.
+
+    Raises
+    ------
+    HuddleError
+        If no service has made it.
+    """
+    place = Place.of(source)
+    try:
+        runs = runs_named(place.runs(), path.name)
+    except (NoServiceError, RunNotFoundError):
+        said = f"{path.name} was not made by huddle serve: nothing removes it by itself"
+        raise HuddleError(said) from None
+    pinned = not all(run.pinned for run in runs)
+    place.store.pin([run.key for run in runs], pinned=pinned)
+    kept = "is kept whatever the limits of storage" if pinned else "is no longer pinned"
+    return f"{path.name} {kept}"
 
 
 def read_sensors(

@@ -139,6 +139,9 @@ async def test_deleting_is_asked_and_only_y_does_it(told: ProgressCallback, tmp_
     async with app.run_test(size=NARROW) as pilot:
         await pilot.press("4")
         await settled(pilot, app)
+        await pilot.press("p")
+        await settled(pilot, app)
+        assert told.told == ["pin old.h5"]
         await pilot.press("delete", "enter", "delete", "escape")
         await settled(pilot, app)
         assert path.exists()

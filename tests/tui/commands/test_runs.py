@@ -7,23 +7,22 @@ import io
 import json
 from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import pytest
 from typer.testing import CliRunner
 
+from daq.errors import HuddleError
 from tests.torture.damaged_files import make_recording
 from tests.tui.service.bench_files import START
 from tui.cli.main import app
+from tui.commands.tui_controls import pin
 from tui.output.csv_text import csv_text
 from tui.service.processes.locks import Lock
 from tui.service.records.places import Place, service_lock
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore, StoreError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def huddle(*arguments: str, code: int = 0) -> str:
@@ -77,6 +76,11 @@ def test_pinned_by_recording_or_time(place: Path) -> None:
     huddle("pin", str(place), "recordings/a.h5", "--remove")
     assert [run.pinned for run in store.runs()] == [False, True, False]
     assert "no such run" in CliRunner().invoke(app, ["pin", str(place), "b.h5"]).stderr
+    for kept in (True, False):  # by a key of the application
+        assert pin(place, Path("a.h5")).endswith("of storage" if kept else "no longer pinned")
+        assert store.runs()[0].pinned == kept
+    with pytest.raises(HuddleError, match="nothing removes it"):
+        pin(place, Path("b.h5"))
 
 
 def test_verify_walks_what_is_kept(place: Path) -> None:

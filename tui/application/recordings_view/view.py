@@ -17,6 +17,7 @@ from tui.application.messages import (
     CatalogueRead,
     DeletionRequested,
     OpeningRequested,
+    PinRequested,
     ReferenceRequested,
 )
 from tui.application.recordings_view.rows import COLUMNS, about, matches, row, size
@@ -53,6 +54,7 @@ class RecordingsView(View):
         Binding("slash", "filter", "Filter", key_display="/"),
         Binding("e", "estimate", "Estimate"),
         Binding("c", "compare", "Compare"),
+        Binding("p", "pin", "Pin", show=False),
         Binding("delete", "delete", "Delete", key_display="del"),
         Binding("r", "read", "Read again", show=False),
     ]
@@ -61,6 +63,7 @@ class RecordingsView(View):
         ("/", "show only recordings with these words: bench, date, verdict, file, operator"),
         ("e", "open it and estimate with other settings"),
         ("c", "compare it with what is shown: curves in 2, differences in 3"),
+        ("p", "keep a recording of huddle serve whatever its limits of storage, or no longer"),
         ("del", "delete it with its results and reports; asked before"),
         ("r", "read the folder again"),
     )
@@ -221,6 +224,12 @@ class RecordingsView(View):
         chosen = self._chosen()
         if chosen is not None:
             self.post_message(ReferenceRequested(chosen.path))
+
+    def action_pin(self) -> None:
+        """Keep the chosen recording, or no longer."""
+        chosen = self._chosen()
+        if chosen is not None:
+            self.post_message(PinRequested(chosen.path))
 
     def action_delete(self) -> None:
         """Delete the chosen recording, once that has been confirmed."""

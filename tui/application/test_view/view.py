@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
     from textual.app import ComposeResult
+    from textual.events import MouseScrollDown, MouseScrollUp
 
     from daq.estimation.snapshot import Snapshot
     from tui.application.state import State
@@ -74,7 +75,7 @@ class TestView(View):
         ("u", "unit of the curves: dB, unit²/Hz, g²/Hz, ng/√Hz"),
         ("l", "like channels of all sensors in one plot; l again: one channel"),
         (", .  < >", "cursor left and right, and far: values are read off above the plot"),
-        ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor"),
+        ("+ - [ ], wheel", "zoom about the cursor, and move; esc: all of it, no cursor"),
         ("f", "freeze the curves; recording goes on"),
         ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
@@ -132,6 +133,16 @@ class TestView(View):
     def action_cursor(self, share: float) -> None:
         """Move the cursor by a share of the plot."""
         self._change(partial(moved, step=share))
+
+    def on_mouse_scroll_up(self, event: MouseScrollUp) -> None:
+        """Zoom in."""
+        event.stop()
+        self.action_zoom(0.5)
+
+    def on_mouse_scroll_down(self, event: MouseScrollDown) -> None:
+        """Zoom out."""
+        event.stop()
+        self.action_zoom(2.0)
 
     def action_zoom(self, factor: float) -> None:
         """Show this factor of the frequencies."""
