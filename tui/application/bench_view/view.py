@@ -45,13 +45,13 @@ class BenchView(View):
     VIEW = BENCH
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("p", "preview", "Check sensors"),
+        Binding("s", "app.start", "Start test"),
         Binding("f", "freeze", "Freeze"),
         Binding("down", "choose_next(1)", "Choose", key_display="↑↓", show=False),
         Binding("up", "choose_next(-1)", "Choose", show=False),
         Binding("a", "add", "Add"),
         Binding("e", "edit", "Edit"),
         Binding("delete", "remove", "Remove", key_display="del", show=False),
-        Binding("s", "app.start", "Start test"),
         Binding("x", "app.stop", "Stop"),
         Binding("m", "app.mark", "Mark"),
     ]

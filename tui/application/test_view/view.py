@@ -75,7 +75,7 @@ class TestView(View):
         ("u", "unit of the curves: dB, unit²/Hz, g²/Hz, ng/√Hz"),
         ("l", "like channels of all sensors in one plot; l again: one channel"),
         (", .  < >", "cursor left and right, and far: values are read off above the plot"),
-        ("+ - [ ], wheel", "zoom about the cursor, and move; esc: all of it, no cursor"),
+        ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor"),
         ("f", "freeze the curves; recording goes on"),
         ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
