@@ -36,7 +36,7 @@ def bench(dims: tuple[int, ...], *, snr: float = 1e3) -> ComplexArray:
 def test_false_alarms_at_the_one_percent_level(
     dims: tuple[int, ...], degrees: int, n_averages: int
 ) -> None:
-    n_draws = 3000 if len(dims) == 3 else 1000
+    n_draws = 1500 if len(dims) == 3 else 500
     draws = wishart(bench(dims), n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
     test = model_test(maximise(draws, max(dims)), n_effective=n_averages)
     assert np.all(test.degrees == degrees)

@@ -149,10 +149,10 @@ def test_the_allan_deviation_of_each_term_is_the_closed_form(
     term: Term, closed: Callable[[FloatArray], FloatArray]
 ) -> None:
     values = np.array([1.0 if each is term else 0.0 for each in Term])
-    f: FloatArray = np.arange(1, 200_001, dtype=np.float64) * 1e-3
-    psd = terms_at(f, 1e-3) @ values
+    f: FloatArray = np.arange(1, 100_001, dtype=np.float64) * 2e-3
+    psd = terms_at(f, 2e-3) @ values
     parameters = NoiseParameters(
-        values, np.zeros(4), np.zeros((4, 4)), 4e-3, 200.0, len(f), 0, 1.0, 0.1, 1.0, 1.0, 0.0
+        values, np.zeros(4), np.zeros((4, 4)), 8e-3, 200.0, len(f), 0, 1.0, 0.1, 1.0, 1.0, 0.0
     )
     found = allan_deviation(f, psd, np.full(len(f), 1e-6), INDEPENDENT, parameters)
     some = (found.tau > 1) & (found.tau < 50)
