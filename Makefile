@@ -35,9 +35,6 @@ check: $(VENV)/.installed-dev  ## formatting, rules, types, who may import whom
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
-	$(BIN)/mypy docs/images/make.py
-	$(BIN)/mypy examples/noise_from_arrays.py examples/bench_to_report.py
-	MYPYPATH=examples/driver $(BIN)/mypy -p huddle_ax3
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run

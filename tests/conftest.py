@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import gc
 import inspect
 import os
 import signal
@@ -22,9 +23,19 @@ from tests.virtual_time import VirtualTimeLoop
 from tests.waiting import limit
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Generator, Iterator
 
 USGS_RECORDING = "usgs-tst-huddle"
+FIRST = (
+    "tests/acceptance/",
+    "tests/tui/commands/test_run.py",
+    "tests/daq/drivers/test_conformance",
+    "tests/tui/",
+    "tests/examples/",
+    "tests/torture/",
+    "tests/test_",
+)
+"""Modules that take longest: with the others behind them, all workers end at the same time."""
 
 
 def _open_descriptors() -> dict[int, str]:
@@ -127,8 +138,27 @@ def pytest_sessionfinish() -> None:
     devices.stop()
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keep what was collected out of the garbage collector: a tenth of the time of all tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
+
+
+def _turn(item: pytest.Item) -> int:
+    """Return the place of a test's module in FIRST."""
+    places = (n for n, start in enumerate(FIRST) if item.nodeid.startswith(start))
+    return next(places, len(FIRST))
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Watch the tasks of every asynchronous test, and multiply the time limits."""
+    """Sort the modules, watch the tasks of asynchronous tests, and multiply the time limits."""
+    items.sort(key=_turn)
     usual = float(config.getini("timeout"))
     for item in items:
         marker = item.get_closest_marker("timeout")

@@ -148,15 +148,15 @@ def test_samples_that_are_not_numbers_cost_the_segments_they_touch() -> None:
 
 def test_a_unit_of_the_samples_is_turned_into_that_of_the_motion() -> None:
     sensors = triaxial()
-    velocity = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s")
+    velocity = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s", segment="1s")
     assert velocity.unit == "mm/s"
-    motion = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s", unit="m/s²")
+    motion = huddle.self_noise(sensors, fs=RATE, sample_unit="mm/s", unit="m/s²", segment="1s")
     omega = 2 * np.pi * motion.frequency[:, None]
     np.testing.assert_allclose(
         motion.data_psd[1:], velocity.data_psd[1:] * (omega[1:] * 1e-3) ** 2, rtol=1e-12
     )
-    assert huddle.self_noise(sensors, fs=RATE, unit="m/s²").unit == "m/s²"
-    assert huddle.self_noise(sensors, fs=RATE).unit == "counts"
+    assert huddle.self_noise(sensors, fs=RATE, unit="m/s²", segment="1s").unit == "m/s²"
+    assert huddle.self_noise(sensors, fs=RATE, segment="1s").unit == "counts"
 
 
 def test_data_arrays_keep_their_unit_and_times() -> None:
@@ -171,11 +171,13 @@ def test_data_arrays_keep_their_unit_and_times() -> None:
         }
     )
     for given in (dataset, dict(dataset.data_vars)):
-        found = huddle.self_noise(given, unit="m/s²")
-        expected = huddle.self_noise(triaxial(), fs=RATE, sample_unit="mm/s", unit="m/s²")
+        found = huddle.self_noise(given, unit="m/s²", segment="1s")
+        expected = huddle.self_noise(
+            triaxial(), fs=RATE, sample_unit="mm/s", unit="m/s²", segment="1s"
+        )
         np.testing.assert_array_equal(found.noise_psd, expected.noise_psd)
         assert found.snapshot.start_utc_ns == int(start.astype(np.int64))
-    assert huddle.self_noise(dataset, sample_unit="nm/s").unit == "nm/s"
+    assert huddle.self_noise(dataset, sample_unit="nm/s", segment="1s").unit == "nm/s"
 
 
 def test_numbers_of_numpy_are_options() -> None:

@@ -18,6 +18,8 @@ PATIENCE = float(os.environ.get("HUDDLE_TEST_PATIENCE", "1"))
 USUAL = 300.0
 """Seconds."""
 LOOK = 0.02
+SHARE = 0.1
+"""Of the time may be spent on looking whether something is the case."""
 
 
 def limit(seconds: float = USUAL) -> float:
@@ -28,9 +30,12 @@ def limit(seconds: float = USUAL) -> float:
 def wait_until(reached: Callable[[], bool], what: str, *, seconds: float = USUAL) -> None:
     """Return when something is the case; fail after a time limit, saying what was waited for."""
     deadline = time.monotonic() + limit(seconds)
+    began = time.monotonic()
     while not reached():
-        assert time.monotonic() < deadline, f"after {limit(seconds):g} s not yet: {what}"
-        time.sleep(LOOK)
+        looked = time.monotonic()
+        assert looked < deadline, f"after {limit(seconds):g} s not yet: {what}"
+        time.sleep(max(LOOK, (looked - began) / SHARE))
+        began = time.monotonic()
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:

@@ -96,7 +96,7 @@ def open_bench(
 
 def _driver(baud: int | None = None) -> type[Driver] | None:
     """Return the driver that the terminal needs; None: Textual's own, or the one of a browser."""
-    if sys.platform == "win32" or BROWSER in os.environ:
+    if sys.platform == "win32" or BROWSER in os.environ or not sys.stdin.isatty():
         return None
     from tui.application.terminal.driver import (  # noqa: PLC0415 - not on Windows
         driver_for,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from typing import TYPE_CHECKING
 
 import h5py
@@ -96,6 +97,13 @@ def sensor_named_twice(file: h5py.File) -> None:
     file["committed"].attrs["sensors"] = ["a", "a"]
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("whole") / "r.h5"
+    make_recording(path)
+    return path
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -116,11 +124,11 @@ def sensor_named_twice(file: h5py.File) -> None:
     ],
 )
 def test_what_a_recording_never_holds_is_refused(
-    tmp_path: Path, change: Callable[[h5py.File], None], said: str
+    whole: Path, tmp_path: Path, change: Callable[[h5py.File], None], said: str
 ) -> None:
     path = tmp_path / "r.h5"
-    make_recording(path)
-    make_recording(tmp_path / "other.h5")
+    shutil.copyfile(whole, path)
+    shutil.copyfile(whole, tmp_path / "other.h5")
     with h5py.File(path, "r+") as file:
         change(file)
     with pytest.raises(NotARecordingError, match=said):

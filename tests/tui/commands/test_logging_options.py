@@ -19,8 +19,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LONG = ("run", "record", "watch", "serve", "devices", "demo", "import", "simulate", "reproduce")
-DEMO = ("demo", "--table", "--duration", "12s", "--speed", "8")
 pseudo_terminals = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
+
+
+def run(bench: Path, folder: Path) -> list[str]:
+    """Return the command for a run as short as it may be."""
+    out = str(folder / "r.h5")
+    return python_command(
+        "tui", "run", str(bench), "--duration", "6s", "--segment", "0.5s", "--out", out
+    )
 
 
 @pytest.mark.parametrize("command", LONG)
@@ -35,9 +42,9 @@ def test_the_application_logs_to_a_file_only() -> None:
 
 
 @pseudo_terminals
-def test_json_is_all_there_is_on_standard_error() -> None:
+def test_json_is_all_there_is_on_standard_error(bench: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        python_command("tui", *DEMO, "--log-format", "json"),
+        [*run(bench, tmp_path), "--log-format", "json"],
         capture_output=True,
         text=True,
         check=True,
@@ -51,9 +58,9 @@ def test_json_is_all_there_is_on_standard_error() -> None:
 
 
 @pseudo_terminals
-def test_the_level_holds_for_the_recorder_too() -> None:
+def test_the_level_holds_for_the_recorder_too(bench: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        python_command("tui", *DEMO, "--log-level", "error", "--log-format", "json"),
+        [*run(bench, tmp_path), "--log-level", "error", "--log-format", "json"],
         capture_output=True,
         text=True,
         check=True,
@@ -62,14 +69,16 @@ def test_the_level_holds_for_the_recorder_too() -> None:
 
 
 @pseudo_terminals
-def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar() -> None:
+def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar(
+    bench: Path, tmp_path: Path
+) -> None:
     import pty  # noqa: PLC0415 - not on Windows
 
     ours, theirs = pty.openpty()
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "60"}
     try:
         with subprocess.Popen(
-            python_command("tui", *DEMO),
+            run(bench, tmp_path),
             stdout=subprocess.DEVNULL,
             stderr=theirs,
             env=environment,

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,25 +21,13 @@ from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.waiting import finish, wait_until
 from tui.cli.main import app
-from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
+    from typer.testing import Result
+
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")
-
-SPEED = 8.0
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Yield a bench file that reaches three simulated accelerometers."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    path = tmp_path_factory.mktemp("bench") / "bench.toml"
-    with simulated(parse(text), speed=SPEED) as reachable:
-        path.write_text(dump(reachable), encoding="utf-8")
-        yield path
 
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
@@ -51,6 +38,13 @@ def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def huddle(*arguments: str, code: int = 0) -> Result:
+    """Run a command in this process: what it imports is there already."""
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == code, result.output
+    return result
 
 
 def wait_for_samples(process: subprocess.Popen[str], path: Path, n_samples: int) -> None:
@@ -69,22 +63,19 @@ def wait_for_samples(process: subprocess.Popen[str], path: Path, n_samples: int)
     wait_until(are_committed, f"{n_samples} samples of every sensor in {path}")
 
 
-def estimate(path: Path, *options: str) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["estimate", str(path), "--json", "-", *options])
-    assert result.exit_code == 0, result.output
-    found: dict[str, Any] = json.loads(result.stdout)
+def estimate(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(huddle("estimate", str(path), "--json", "-").stdout)
     return found
 
 
 def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.h5"
-    pdf = tmp_path / "run.pdf"
-    wanted = ("--duration", "14s", "--out", str(out), "--json", "-", "--report", str(pdf))
-    code, said, err = finish(start("run", str(bench), *wanted))
-    assert code == 0, err
-    assert pdf.read_bytes().startswith(b"%PDF-")
-    assert f"{pdf} written" in err
-    live, offline = json.loads(said), estimate(out)
+    page = tmp_path / "page.html"
+    wanted = ("--duration", "14s", "--out", str(out), "--json", "-", "--report", str(page))
+    done = huddle("run", str(bench), *wanted)
+    assert "self-noise" in page.read_text(encoding="utf-8")
+    assert f"{page} written" in done.stderr
+    live, offline = json.loads(done.stdout), estimate(out)
     assert live["segments"] == offline["segments"] >= 8
     assert live["recordings"] == offline["recordings"]  # checksum of the file with its results
     assert live["recordings"][0]["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
@@ -106,12 +97,8 @@ def test_a_result_that_cannot_be_written_elsewhere_is_in_the_recording(
     bench: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "r.h5"
-    with start(
-        "run", str(bench), "--duration", "60s", "--out", str(out), "--json", "/dev/full"
-    ) as run:
-        code, _, err = finish(run)
-    assert code == 3
-    assert "/dev/full" in err
+    wanted = ("--duration", "20s", "--out", str(out), "--json", "/dev/full")
+    assert "/dev/full" in huddle("run", str(bench), *wanted, code=3).stderr
     with Recording.open(out) as recording:
         assert recording.results()
 
@@ -148,11 +135,10 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
 
     monkeypatch.setattr("tui.commands.run.follow", fail)
     out = tmp_path / "r.h5"
-    done = CliRunner().invoke(app, ["run", str(bench), "--duration", "60s", "--out", str(out)])
-    assert done.exit_code == 0, done.output
+    huddle("run", str(bench), "--duration", "20s", "--out", str(out))
     with Recording.open(out) as recording:
         assert recording.events[-1].text == "duration reached"
-        assert min(sensor.n_samples for sensor in recording.sensors) >= 60 * 190
+        assert min(sensor.n_samples for sensor in recording.sensors) >= 20 * 190
         assert recording.results()
 
 
@@ -174,10 +160,8 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     with_report = tmp_path / "bench.toml"
     text = bench.read_text(encoding="utf-8")
     with_report.write_text(text.replace("[recording]", '[recording]\nreport = "html"'), "utf-8")
-    process = start("run", str(with_report), "--out", str(out), "--until-cov", "0.4", "--json", "-")
-    code, said, err = finish(process)
-    assert code == 0, err
-    document = json.loads(said)
+    wanted = ("--out", str(out), "--until-cov", "0.4", "--json", "-")
+    document = json.loads(huddle("run", str(with_report), *wanted).stdout)
     inside = slice(4, 41)  # 2 to 20 Hz
     cov = np.array([channel["cov"] for channel in document["channels"]], dtype=float)[:, inside]
     # The last, complete look differs a little from the live one that ended the run.
@@ -199,17 +183,15 @@ def test_record_says_what_is_safe(bench: Path, tmp_path: Path) -> None:
         assert status["sensors"][name]["samples"] >= 900  # connecting takes part of the duration
     with Recording.open(out) as recording:
         assert recording.duration == 5
-    code, _, err = finish(start("record", str(bench), "--duration", "5s", "--out", str(out)))
-    assert code == 3
-    assert "exists already" in err
+    again = huddle("record", str(bench), "--duration", "5s", "--out", str(out), code=3)
+    assert "exists already" in again.stderr
 
 
 def test_a_run_too_short_for_any_estimate_is_refused_before_it_begins(
     bench: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "short.h5"
-    result = CliRunner().invoke(app, ["run", str(bench), "--duration", "3s", "--out", str(out)])
-    assert result.exit_code == 2
+    huddle("run", str(bench), "--duration", "3s", "--out", str(out), code=2)
     assert not out.exists()
 
 
@@ -218,8 +200,7 @@ def test_a_recording_that_is_there_is_not_taken_for_the_new_one(
 ) -> None:
     out = tmp_path / "old.h5"
     out.write_bytes(b"last night")
-    result = CliRunner().invoke(app, ["run", str(bench), "--out", str(out)])
-    assert result.exit_code == 3
+    result = huddle("run", str(bench), "--out", str(out), code=3)
     assert "exists already" in result.stderr
     assert not result.stdout
     assert out.read_bytes() == b"last night"
@@ -233,10 +214,9 @@ def test_ports_that_are_not_there_are_named_and_exit_3(bench: Path, tmp_path: Pa
     )
     path = tmp_path / "broken.toml"
     path.write_text(dump(broken.model_copy(update={"sensors": sensors})), encoding="utf-8")
-    code, _, err = finish(start("run", str(path), "--out", str(tmp_path / "none.h5")))
-    assert code == 3
+    result = huddle("run", str(path), "--out", str(tmp_path / "none.h5"), code=3)
     for name in "ABC":
-        assert f"none-{name}" in err
+        assert f"none-{name}" in result.stderr
 
 
 def children_of(pid: int) -> list[int]:
@@ -249,9 +229,7 @@ def children_of(pid: int) -> list[int]:
 
 def test_check_finds_what_is_on_a_port(bench: Path) -> None:
     port = parse(bench.read_text(encoding="utf-8")).sensors[0].port
-    code, said, err = finish(start("check", "--port", port, "--json", "-"))
-    assert code == 0, err
-    (device,) = json.loads(said)["devices"]
+    (device,) = json.loads(huddle("check", "--port", port, "--json", "-").stdout)["devices"]
     assert device["driver"] == "epson"
     assert device["information"]["model"].startswith("A352")
 
@@ -266,9 +244,8 @@ def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> No
 
 
 def test_demo_shows_which_estimate_is_right() -> None:
-    code, said, err = finish(start("demo", "--duration", "60s", "--speed", "4", "--json", "-"))
-    assert code == 0, err
-    channels = json.loads(said)["channels"]
+    document = huddle("demo", "--duration", "60s", "--speed", "4", "--json", "-").stdout
+    channels = json.loads(document)["channels"]
     covers = {
         method: [entry["covers"] for entry in channels if entry["method"] == method]
         for method in ("three-channel", "three-sensor")

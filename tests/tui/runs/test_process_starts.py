@@ -17,9 +17,7 @@ import pytest
 from daq.bench.loading import dump
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
-from daq.recording.reader import Recording
 from tests.daq.archive import months
-from tui.runs.recorder_process import RecorderProcess
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.steps import ProcessSteps
 from tui.simulation.devices import simulated
@@ -65,23 +63,6 @@ def demo_bench() -> str:
 def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None:
     subprocess.run([sys.executable, "-m", "tui"], check=False, capture_output=True)
     assert record.exists()
-
-
-def test_simulators_and_the_recorder_run_none(record: Path) -> None:
-    out = Path("recorded.h5").absolute()
-    with simulated(parse(demo_bench()), speed=8.0) as reachable:
-        Path("bench.toml").write_text(dump(reachable), encoding="utf-8")
-        recorder = RecorderProcess(Path("bench.toml"), out, duration=4.0)
-        try:
-            recorder.wait_for_file()
-            assert recorder.ends_within(60)
-            recorder.check()
-        finally:
-            recorder.stop()
-            recorder.close()
-    with Recording.open(out) as recording:
-        assert recording.closed
-    assert not record.exists()
 
 
 def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None:
