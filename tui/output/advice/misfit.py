@@ -81,7 +81,9 @@ def _changes(advice: NoiseChanges, names: Names) -> Explanation:
     return Explanation(
         f"The noise changes during the recording, most in {names.channels[advice.channel]} at "
         f"{where(advice)}: by {percent(advice.deviation)} between {advice.n_parts} parts "
-        f"({percent(advice.expected)} if it were steady). The estimate is the mean.{corrected}",
+        f"({percent(advice.expected)} if it were steady). The estimate is the mean. Intervals are "
+        f"those of steady noise; another recording of this length would differ by "
+        f"{percent(advice.deviation / math.sqrt(advice.n_parts))} (standard error).{corrected}",
         "Estimate parts of the recording by themselves (--start, --end).",
     )
 

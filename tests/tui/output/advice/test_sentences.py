@@ -135,6 +135,8 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
         (
             "most in b.y at 2–8 Hz: by 45 % between 12 parts (10 % if it were steady)",
             "scatter 1.4 times as much",
+            "Intervals are those of steady noise",
+            "by 13 % (standard error)",
         ),
     ),
     (
