@@ -1,4 +1,4 @@
-"""Numbers in, numbers out: spectra, self-noise, likelihood, diagnostics.
+"""Numerical estimation: spectra, self-noise, likelihood, diagnostics.
 
-numpy and scipy alone: no files, no devices, no sentences.
+Uses only numpy and scipy: no files, no devices, no user-visible sentences.
 """

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 
 class EstimatorError(ValueError):
-    """Root of the errors of this package."""
+    """Base class of the errors of this package."""
 
     is_usage_error = False
     """Whether an argument is wrong; otherwise the data are insufficient."""
 
 
 class InvalidMatrixError(EstimatorError):
-    """A cross-spectral matrix is mis-shaped, or at no frequency finite, Hermitian and possible."""
+    """A cross-spectral matrix has a wrong shape, or is valid at no frequency."""
 
 
 class InsufficientDataError(EstimatorError):
@@ -19,12 +19,12 @@ class InsufficientDataError(EstimatorError):
 
 
 class BandError(EstimatorError):
-    """A band that holds none of the frequencies."""
+    """A band without frequencies."""
 
     is_usage_error = True
 
 
 class UnknownMethodError(EstimatorError):
-    """No self-noise method of that name."""
+    """No self-noise method has this name."""
 
     is_usage_error = True

@@ -1,4 +1,4 @@
-"""Every self-noise method behind one signature."""
+"""All self-noise methods, with a common signature."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 
 Method: TypeAlias = "Callable[..., SelfNoise]"
-"""``method(csm, *, dims, n_effective, correct, **options)``, as `self_noise` calls it."""
+"""``method(csm, *, dims, n_effective, correct, **options)``."""
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
@@ -46,7 +46,7 @@ def self_noise(
     real: BoolArray | None = None,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
-    """Self-noise PSD of every channel by a named method.
+    """Return the self-noise PSD of every channel by a named method.
 
     Parameters
     ----------
@@ -58,14 +58,14 @@ def self_noise(
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
-        Independent averages in `csm`.
+        Number of independent averages in `csm`.
     correct : bool
         Remove the small-sample bias.
     real : bool, shape (n_freqs,), optional
-        Where the spectra are real-valued and scatter twice as much: at 0 Hz and at the Nyquist
-        frequency (`estimator.spectra.welch.WelchSettings.real`). Nowhere by default.
+        Whether the spectra are real-valued, with twice the variance: at 0 Hz and at the Nyquist
+        frequency (`estimator.spectra.welch.WelchSettings.real`). Default: nowhere.
     **options
-        What the method alone takes; see there.
+        Options of the method.
 
     Returns
     -------
@@ -74,9 +74,9 @@ def self_noise(
     Raises
     ------
     UnknownMethodError
-        If there is no method of that name.
+        If no method has this name.
     EstimatorError
-        As the method says, or if `real` is not one bool a frequency.
+        As the method, or if `real` is not one bool per frequency.
     """
     if method not in METHODS:
         raise UnknownMethodError(f"method {method!r}: expected one of {', '.join(METHODS)}")

@@ -1,9 +1,9 @@
-"""The duration of recording for a target precision.
+"""The recording time for a target precision.
 
-The scatter that a method predicts for itself, taken at the true cross-spectral matrix of the
-planned set-up, falls with the root of the averages left after the motion's dimensions are paid for:
-as long as the averages are enough to find the motion. Weak motion needs more of them for that than
-the precision would; with fewer, nothing can be predicted.
+A method's predicted scatter, at the true cross-spectral matrix of the planned set-up, decreases
+with the root of the averages minus the motion's dimensions, if the averages suffice to resolve the
+motion. For weak motion, this needs more averages than the precision; with fewer, no prediction is
+possible.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
 BOUND = "cramer-rao-bound"
-REFERENCE = 1e6  # averages at which a method is asked for its scatter
+REFERENCE = 1e6  # number of averages at which the scatter of a method is evaluated
 FOUND = 30.0
-"""Averages, times the coherence of two sensors in the direction in which it is least, from which on
-c.o.v. are as predicted: simulated ones exceed it by 5 % there, by 20 to 200 % at 8."""
-ROUNDING = 1e-24  # coherence: what rounding leaves of none
+"""Averages times the coherence of two sensors in the direction of its minimum, from which the
+c.o.v. is as predicted: in simulations it is 5 % higher at 30, and 20 to 200 % higher at 8."""
+ROUNDING = 1e-24  # coherence that is zero within rounding
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Needs and results of one method.
+    """Requirements and results of one method.
 
     Attributes
     ----------
     method : str
-        A name in `estimator.methods.METHODS`, or "cramer-rao-bound": what no method can beat.
+        A name in `estimator.methods.METHODS`, or "cramer-rao-bound": the lower limit of any method.
     n_effective : float64, shape (n_freqs, n_channels)
-        Independent averages needed for the wanted c.o.v., or to find the motion at all; NaN
-        where the method says nothing.
+        Number of independent averages required for the target c.o.v. and to resolve the motion; NaN
+        if the method gives no estimate.
     n_segments : float64, shape (n_freqs, n_channels)
-        Overlapping segments worth that many.
+        Number of overlapping segments equivalent to `n_effective`.
     duration : float64, shape (n_freqs, n_channels)
-        Recording length in seconds.
+        Recording time, s.
     bias : float64, shape (n_freqs, n_channels)
-        Fractional bias however long one records: misalignment, wrong dimension.
+        Fractional bias independent of the recording time: misalignment, wrong dimension.
     efficiency : float64, shape (n_freqs, n_channels)
-        `estimator.likelihood.fisher.efficiency`: share of this recording's length that the best
-        possible estimate would need. Means nothing where there is a bias; NaN for two-channel,
-        which is told the response and so is not bound by what can be known without.
+        `estimator.likelihood.fisher.efficiency`: recording time of the best possible estimate over
+        this one's. Meaningless with a bias; NaN for two-channel, which is given the response and so
+        may exceed the bound.
     weak : bool, shape (n_freqs, n_channels)
-        Where the motion is so weak that to find it takes longer than the precision would. The
-        c.o.v. will be lower than wanted.
+        Whether resolving weak motion takes longer than the precision. The c.o.v. will be lower than
+        the target.
     """
 
     method: str
@@ -80,13 +80,13 @@ def planned_csm(
     Parameters
     ----------
     directions : float64, shape (n_channels, d)
-        Direction cosines of every channel, times its gain where gains differ; grouped by sensor.
+        Direction cosines of every channel, times its gain if gains differ; grouped by sensor.
     snr : float
-        Motion over noise, the mean over all channels.
+        PSD of the motion over PSD of the noise, mean over all channels.
     noise_psd : float64, shape (n_channels,), optional
-        Noise of the channels relative to each other; equal by default.
+        Relative noise of the channels; default: equal.
     motion : float64, shape (d, d), optional
-        PSD matrix of the motion, up to a factor; equal in all directions by default.
+        PSD matrix of the motion, up to a factor; default: equal in all directions.
 
     Returns
     -------
@@ -128,31 +128,31 @@ def plan(
     settings: WelchSettings,
     cov: float,
 ) -> list[Plan]:
-    """Return what every method needs for a wanted coefficient of variation.
+    """Return the requirements of every method for a target coefficient of variation.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
-        True cross-spectral matrix, as of `planned_csm`.
+        True cross-spectral matrix, as from `planned_csm`.
     noise_psd : float64, shape (n_freqs, n_channels)
-        True noise, part of `csm`.
+        True noise, included in `csm`.
     dims : tuple of int
-        Channels of each sensor; at least three sensors.
+        Number of channels of each sensor; at least three sensors.
     settings : WelchSettings
     cov : float
-        Wanted coefficient of variation of the noise PSD of every channel.
+        Target coefficient of variation of the noise PSD of every channel.
 
     Returns
     -------
     list of Plan
-        One for each method, in the order of `METHODS`, and last the Cramér-Rao bound.
+        One per method, in the order of `METHODS`, then the Cramér-Rao bound.
 
     Raises
     ------
     InsufficientDataError
         With fewer than three sensors.
     InvalidMatrixError
-        If `csm` or `noise_psd` is mis-shaped, or not finite, or a noise PSD not positive.
+        If `csm` or `noise_psd` has a wrong shape or is not finite, or a noise PSD is not positive.
     EstimatorError
         If `cov` is not a finite number above zero.
     """
@@ -165,10 +165,10 @@ def plan(
     for method in METHODS:
         try:
             found = self_noise(method, csm, dims=dims, n_effective=REFERENCE, correct=False)
-        except InsufficientDataError:  # not with such sensors
+        except InsufficientDataError:  # the method does not apply to these sensors
             plans.append(_plan(method, unknown, bias=unknown, share=unknown, settings=settings))
             continue
-        # the scatter in parts of the truth, as the estimate itself may be biased
+        # scatter relative to the true noise, because the estimate may be biased
         scatter = found.cov * np.abs(found.noise_psd) / noise_psd
         used = {"two-channel": 0, "three-channel": 1}.get(method, max(dims))
         plans.append(
@@ -261,7 +261,7 @@ def _plan(
     settings: WelchSettings,
     least: FloatArray | float = 0.0,
 ) -> Plan:
-    """Make a plan of the averages for the precision and the least to find the motion."""
+    """Return a plan from the averages for the precision and those to resolve the motion."""
     needed = np.maximum(averages, least)
     known = np.isfinite(needed)
     window = get_window(settings.window, settings.segment_length)
@@ -281,11 +281,11 @@ def _plan(
 
 
 def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> FloatArray:
-    """Averages from which on a method finds the motion, shape (n_freqs, n_channels); NaN: never.
+    """Return the averages that resolve the motion, shape (n_freqs, n_channels); NaN for never.
 
-    The motion of a channel is inferred from the cross-spectra between the other sensors: of the
-    like channels, or of all. The triad methods take all pairs of them for equally good, maximum
-    likelihood goes by the best.
+    The motion of a channel follows from the cross-spectra between the other sensors: of like
+    channels, or of all. Triad methods weight all pairs equally; maximum likelihood depends on the
+    best pair.
     """
     sensor = np.repeat(np.arange(len(dims)), dims)
     if method == "two-channel":
@@ -312,7 +312,7 @@ def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> 
 
 
 def segments_needed(window: FloatArray, hop: int, n_effective: float) -> int:
-    """Count the overlapping segments, in one run, that are worth `n_effective` averages.
+    """Return the number of overlapping segments equivalent to `n_effective` averages.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def segments_needed(window: FloatArray, hop: int, n_effective: float) -> int:
     Returns
     -------
     int
-        The least number for which `effective_averages` is as much or more.
+        The smallest number of contiguous segments with at least these `effective_averages`.
     """
     most = 1
     while effective_averages(window, hop, most) < n_effective:

@@ -1,4 +1,4 @@
-"""Names for the array types that cross this package's boundary."""
+"""Array types in the interface of this package."""
 
 from __future__ import annotations
 

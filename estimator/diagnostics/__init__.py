@@ -1,1 +1,1 @@
-"""Diagnosis of a test from its averages: bands, orientation, advice."""
+"""Diagnosis of a test from its averaged spectra: bands, orientation, advice."""

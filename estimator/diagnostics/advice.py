@@ -1,7 +1,7 @@
-"""What there is to know about a test: one type for each kind of advice, in numbers.
+"""Advice on a test: one class per kind, with numbers.
 
-Sensors and channels are positions from 0, in the order of the cross-spectral matrix. Front ends
-turn advice into sentences.
+Sensors and channels are indices from 0, in the order of the cross-spectral matrix. Front ends
+convert advice to sentences.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from estimator.diagnostics.kinds import AdviceKind, Level
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """A finding about a test; each kind is a class of its own.
+    """Advice on a test; each kind is a subclass.
 
     Attributes
     ----------
     kind : AdviceKind
-        Of the class.
+        Kind of the class.
     level : Level
     sensors : tuple of int
         The sensors concerned; empty for all.
@@ -41,9 +41,9 @@ class NoSignal(Advice):
     ----------
     channels : tuple of int
     whole_sensor : bool
-        Whether these are all channels of a sensor that has several.
+        Whether these are all channels of a sensor with several channels.
     share_of_frequencies : float
-        At which the worst of them is dead.
+        Share of the frequencies at which the worst of them is dead.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.NO_SIGNAL
@@ -61,7 +61,7 @@ class Copies(Advice):
     channels : tuple of (int, int)
         The original, and the channel that repeats it.
     share_of_frequencies : float
-        At which they are the same.
+        Share of the frequencies at which they are equal.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.COPIES
@@ -71,16 +71,16 @@ class Copies(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoSharedMotion(Advice):
-    """The one of `sensors` records none of the motion that others share.
+    """A sensor records none of the motion that others share.
 
     Attributes
     ----------
     partners : tuple of int
-        The sensors that share it.
+        The sensors that share the motion.
     share : float
-        Of the motion, that the sensor has in common with any of these at most; 0 for none.
+        Largest share of the motion that the sensor has in common with one of them; 0 for none.
     share_of_partners : float
-        The same of two partners, at least.
+        Smallest share of the motion that two partners have in common.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.NO_SHARED_MOTION
@@ -98,12 +98,12 @@ class TooFewSensors(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissingChannels(Advice):
-    """Channels of `sensors` are missing, so that fewer than three sensors are whole.
+    """Channels of `sensors` are missing, so that fewer than three sensors are complete.
 
     Attributes
     ----------
     whole_sensors : tuple of int
-        Those whose channels all have a signal of their own.
+        The sensors with a signal of their own on every channel.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.MISSING_CHANNELS
@@ -119,11 +119,11 @@ class TooFewDimensions(Advice):
     n_factors : int
         Dimensions of the motion in the model.
     statistic : float
-        Of the model test, over its expectation, in the whole `band`.
+        Statistic of the model test over its expectation, in the whole `band`.
     worst_statistic : float
-        The same where it is largest.
+        Largest of these ratios in any band.
     worst_band : (float, float)
-        There, Hz.
+        Band with this ratio, Hz.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.TOO_FEW_DIMENSIONS
@@ -142,21 +142,20 @@ class ModelMisfit(Advice):
     n_factors : int
         Dimensions of the motion in the model.
     statistic : float
-        Of the model test, over its expectation, in the whole `band`.
+        Statistic of the model test over its expectation, in the whole `band`.
     worst_statistic : float
-        The same where it is largest.
+        Largest of these ratios in any band.
     worst_band : (float, float)
-        There, Hz.
+        Band with this ratio, Hz.
     p_value : float
-        The least.
+        Smallest p value.
     unexplained : float
-        Of the noise, as a fraction, where the statistic is largest.
+        Misfit in `worst_band`, as a fraction of the noise.
     error : float
-        What the estimate may be off by there, as a fraction of the noise; see
+        Possible error of the estimate in `worst_band`, as a fraction of the noise; see
         `estimator.diagnostics.rules`.
     largest_error : float
-        The same where waves cross sensors that stand apart; infinite where these sensors do not
-        bound it.
+        Possible error if waves cross distant sensors; infinite if these sensors do not bound it.
     is_wrong : bool
         Whether `error` is so large that the estimate is wrong.
     """
@@ -175,18 +174,18 @@ class ModelMisfit(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionAcross(Advice):
-    """Sensors that are compared by fewer than three channels miss motion across these.
+    """Sensors compared by fewer than three channels do not measure motion across these.
 
     Attributes
     ----------
     n_channels : int
-        Channels of each sensor that are compared: 1 (axes) or 2 (planes).
+        Number of compared channels per sensor: 1 (axes) or 2 (planes).
     larger_sensors : tuple of int
-        Sensors with more channels; empty where no sensor has.
+        Sensors with more channels; may be empty.
     snr : float
-        The largest ratio of the motion's PSD to the noise's.
+        Largest ratio of the motion's PSD to the noise's.
     added_by_one_degree : float
-        Noise that an angle of 1° between planes or axes adds at most, as a fraction of the noise.
+        Maximum noise added by an angle of 1° between planes or axes, as a fraction of the noise.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.MOTION_ACROSS
@@ -203,7 +202,7 @@ class MissingDimension(Advice):
     Attributes
     ----------
     n_dimensions : float
-        Of the motion: the least, as a median over the frequencies of a band.
+        Dimensions of the motion: median over the frequencies of a band, smallest of all bands.
     n_channels : int
         Dimensions that the sensors sense.
     condition : float
@@ -237,7 +236,7 @@ class WeakMotion(Advice):
     Attributes
     ----------
     snr : float
-        The largest ratio of the motion's PSD to the noise's.
+        Largest ratio of the motion's PSD to the noise's.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.WEAK_MOTION
@@ -251,10 +250,10 @@ class MotionLeftIn(Advice):
     Attributes
     ----------
     share : float
-        What is left in three-sensor and three-channel estimates at most, as a fraction of the
+        Maximum motion left in three-sensor and three-channel estimates, as a fraction of the
         noise.
     n_effective : float
-        Averages.
+        Number of independent averages.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.MOTION_LEFT_IN
@@ -264,7 +263,7 @@ class MotionLeftIn(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedChannels(Advice):
-    """Two channels of the second of `sensors` have traded places.
+    """Two channels of the second of `sensors` are swapped.
 
     Attributes
     ----------
@@ -278,17 +277,17 @@ class SwappedChannels(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rotated(Advice):
-    """Two sensors do not point the same way.
+    """Two sensors have different orientations.
 
     Attributes
     ----------
     angle_deg : float
-        Of the rotation between them.
+        Angle of the rotation between them.
     horizontal_deg : float
-        In the horizontal plane, with the sign of `RelativeResponse.horizontal_deg`; NaN without
-        two horizontal channels.
+        Angle in the horizontal plane, with the sign of `RelativeResponse.horizontal_deg`; NaN
+        without two horizontal channels.
     error_deg : float
-        Standard error of both.
+        Standard error of both angles.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.ROTATED
@@ -318,7 +317,7 @@ class ReversedPolarity(Advice):
     Attributes
     ----------
     channel, counterpart : int
-        Of the second and of the first of `sensors`.
+        Channels of the second and of the first of `sensors`.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.REVERSED_POLARITY
@@ -333,7 +332,7 @@ class Gain(Advice):
     Attributes
     ----------
     channel, counterpart : int
-        Of the second and of the first of `sensors`.
+        Channels of the second and of the first of `sensors`.
     ratio : float
         Gain of the channel over that of its counterpart.
     """
@@ -351,7 +350,7 @@ class Delay(Advice):
     Attributes
     ----------
     delay : float
-        By which the second of `sensors` lags the first, s; negative where it leads.
+        Lag of the second of `sensors` behind the first, s; negative if it leads.
     delay_samples : float
         The same, in samples.
     """
@@ -368,14 +367,14 @@ class UnequalResponses(Advice):
     Attributes
     ----------
     channel : int
-        Into whose noise most leaks.
+        The channel whose noise has the largest leakage.
     share : float
-        What leaks at least, as a fraction of the noise estimate of that channel, in the third of
-        an octave where it is largest.
+        Minimum leakage, as a fraction of the noise estimate of that channel, in the third of an
+        octave with the largest fraction.
     share_without : float
         The same without equalisation.
     equalised_by : tuple of str
-        "known", "estimated", both, or neither: where the responses come from that are equalised.
+        Sources of the equalised responses: "known", "estimated", both, or neither.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.UNEQUAL_RESPONSES

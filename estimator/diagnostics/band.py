@@ -1,4 +1,4 @@
-"""What one band of frequencies shows of the test."""
+"""Diagnosis of one frequency band."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ class BandDiagnosis:
     Attributes
     ----------
     low, high : float
-        Of its frequencies, Hz.
+        Lowest and highest frequency, Hz.
     coherence : float
-        Median of the least coherence between like channels of any two sensors that have signal.
+        Median of the smallest coherence between like channels of two sensors with signal.
     condition : float
-        Of the worst ``S_jk``.
+        Condition number of the worst ``S_jk``.
     dimension : float
         Effective dimension of the motion.
     snr : float64, shape (n_channels,)
-        Motion over noise, PSD by PSD.
+        PSD of the motion over PSD of the noise.
     noise_lost : bool, shape (n_channels,)
-        Whether a channel's noise is lost in its own scatter at most frequencies, as that of a quiet
-        sensor among noisy ones: its SNR is not known, and may be high.
+        Whether a channel's noise is below its standard error at most frequencies, as for a quiet
+        sensor among noisy ones: its SNR is then unknown, and may be high.
     test : BandTest
-        Of the common-motion model.
+        Test of the common-motion model.
     shared : float64, shape (n_sensors, n_sensors)
-        Share of the motion that each two sensors have in common, of
+        Share of the motion that two sensors have in common, from
         `estimator.diagnostics.shared_motion`; NaN for sensors without signal.
     n_frequencies : int
     """

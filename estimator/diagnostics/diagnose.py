@@ -56,9 +56,10 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
 LOST = 0.5
-"""Share of the frequencies of a band at which the noise of a channel is lost in its scatter."""
+"""Share of a band's frequencies with noise below its standard error from which `noise_lost` is
+set."""
 DIMENSION_LEVEL = 0.01
-"""Of the test that further dimensions have no coherence, all pairs of sensors together."""
+"""Level of the test for further dimensions, for all pairs of sensors together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,28 +73,27 @@ class Diagnostics:
     pairs : tuple of (int, int)
         Pairs of sensors, from 0.
     coherence : float64, shape (n_freqs, n_pairs)
-        The least between like channels.
+        Smallest coherence between like channels.
     condition : float64, shape (n_freqs, n_pairs)
-        Condition number of ``S_jk`` in units of its channels' amplitudes: near-singular where
-        it exceeds the square root of the averages, say. Infinite where singular.
+        Condition number of ``S_jk`` in units of its channels' amplitudes. Above about the square
+        root of the number of averages the matrix is nearly singular. Infinite if singular.
     dimension : float64, shape (n_freqs,)
-        Dimensions of the motion that the averages show (canonical coherences between two
-        sensors, tested at 1 %).
+        Significant dimensions of the motion (canonical coherences between two sensors, tested at
+        1 %).
     snr : float64, shape (n_freqs, n_channels)
-        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for channels that are
-        dead or copies of others, of which the model and its test know nothing, and where psi is
-        within its standard error of zero.
+        ``(S_ii - psi_i) / psi_i`` with the maximum likelihood noise psi; NaN for dead channels and
+        copies, which the model excludes, and if psi is within its standard error of zero.
     model : ModelTest
-        At every frequency.
+        Test at every frequency.
     n_factors : int
         Dimensions of the motion in that model.
     untested : Untested or None
-        Why that model was not tested at any frequency; None where it was.
+        Why the model was tested at no frequency; None if it was tested.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
-        Of the pairs that can be compared: of sensors with all their channels.
+        Relative responses of the comparable pairs: sensors with all their channels.
     advice : tuple of Advice
-        Worst first.
+        Most severe first.
     stability : Stability or None
         None without segments, or with too few.
     """
@@ -134,22 +134,22 @@ def diagnose(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     dims : tuple of int
-        Channels of each sensor, three or more.
+        Number of channels of each of three or more sensors.
     n_effective : float
-        Independent averages. With no more than channels everything that needs the likelihood
-        (SNR and model test) is NaN, and so with fewer than three sensors that have signal.
+        Number of independent averages. Results of the likelihood (SNR and model test) are NaN if
+        it does not exceed the number of channels, or with fewer than three sensors with signal.
     n_factors : int, optional
-        Dimensions of the motion in the model that is tested: those of the estimate that the
-        diagnosis goes with; ``max(dims)`` by default.
+        Dimensions of the motion in the tested model: those of the diagnosed estimate; default:
+        ``max(dims)``.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
     vertical : int, optional
-        Which channel of every sensor is vertical, for the horizontal angles.
+        Index of the vertical channel of every sensor, for the horizontal angles.
     course : SegmentCourse, optional
-        The segments one by one, all channels: shows disturbances and changes, for which the tests
-        are then corrected.
+        Spectra of single segments, all channels: reveal disturbances and changes, for which the
+        tests are then corrected.
 
     Returns
     -------
@@ -158,9 +158,9 @@ def diagnose(
     Raises
     ------
     InvalidMatrixError
-        As `estimator.self_noise.coherency.coherency` says, or if `frequency` does not fit.
+        As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
     InsufficientDataError
-        With fewer than three sensors, or if averages are not a finite number above zero.
+        With fewer than three sensors, or if `n_effective` is not a finite number above zero.
     """
     check_dims(dims)
     check_averages(n_effective)
@@ -267,7 +267,7 @@ def _shared(
     inside: BoolArray,
     n_effective: float,
 ) -> FloatArray:
-    """Share of the motion that each two sensors have in common; NaN for those without signal."""
+    """Return the share of motion that two sensors have in common; NaN for those without signal."""
     shared = np.full((n_sensors, n_sensors), np.nan)
     if len(there.sensors):
         found = shared_motion(canonical, there.dims, inside, n_effective)
@@ -276,13 +276,13 @@ def _shared(
 
 
 def _least(values: FloatArray) -> FloatArray:
-    """Least of the numbers of each row, shape (n_freqs,); NaN where there is none."""
+    """Return the smallest finite number of each row, shape (n_freqs,); NaN without one."""
     least = np.where(np.isnan(values), np.inf, values).min(axis=1)
     return np.where(np.isnan(values).all(axis=1), np.nan, least)
 
 
 def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
-    """Condition number of the coherency between two sensors, shape (n_freqs,)."""
+    """Return the condition number of the coherency between two sensors, shape (n_freqs,)."""
     a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
     singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
     least = singular[:, -1]
@@ -290,7 +290,7 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
 
 
 def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> Maximum | Untested:
-    """Fit motion of q dimensions, or return why that is not possible."""
+    """Fit motion of q dimensions, or return why this is impossible."""
     if len(there.sensors) < 3:
         return Untested.TOO_FEW_SENSORS
     if n_effective <= matrix.shape[1]:
@@ -304,11 +304,11 @@ def _fit(matrix: ComplexArray, there: Presence, q: int, n_effective: float) -> M
 def _test(
     fit: Maximum | Untested, there: Presence, n_effective: float, n_freqs: int
 ) -> tuple[ModelTest, Untested | None]:
-    """Test the model at every frequency; NaN, and why, where it is tested at none.
+    """Test the model at every frequency; return NaN and the reason if no test is possible.
 
-    Where two channels alone sense a dimension their noise can be divided between them anyhow. Such
-    a direction of ln psi, known to no better than a factor e, is a parameter that does not help
-    the fit. With equal sensors there is none, but for further dimensions.
+    If only two channels sense a dimension, the division of their noise is arbitrary. Such a
+    direction of ln psi, with an error of more than a factor e, does not count as a parameter. With
+    equal sensors this happens only for further dimensions.
     """
     unknown = np.full(n_freqs, np.nan)
     if isinstance(fit, Untested):
@@ -330,7 +330,7 @@ def _test(
 def _dimension(
     canonical: CanonicalCoherence, matrix: ComplexArray, dims: tuple[int, ...], n_effective: float
 ) -> FloatArray:
-    """Canonical coherences between sensors that are not zero by their sampling noise.
+    """Return the number of significant canonical coherences between sensors, shape (n_freqs,).
 
     Bartlett's test that all but the r largest are zero, for complex averages:
     ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
@@ -364,7 +364,7 @@ def _responses(
     checked = coherency(csm, there.dims) if len(there.whole) > 1 else None
     for first, second in combinations(range(len(there.sensors)), 2):
         pair = there.sensors[first], there.sensors[second]
-        if not set(pair) <= set(there.whole):  # a like channel's motion might be missing
+        if not set(pair) <= set(there.whole):  # motion along a missing channel is unknown
             continue
         try:
             response = relative_response(
@@ -377,7 +377,7 @@ def _responses(
                 coherence=coherence,
                 checked=checked,
             )
-        except InsufficientDataError:  # nothing to compare them by
+        except InsufficientDataError:  # not comparable
             continue
         found.append(replace(response, first=pair[0], second=pair[1]))
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Enumerations of a diagnosis: kinds of advice, levels, reasons why a test was not made."""
+"""Enumerations of a diagnosis: kinds of advice, levels, reasons for missing tests."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class AdviceKind(enum.StrEnum):
     MODEL_MISFIT = "model-misfit"
     """One common motion does not explain the averages."""
     SHARED_NOISE = "shared-noise"
-    """Channels share noise: those of one sensor, or of two."""
+    """Channels of one sensor, or of two, share noise."""
     DISTURBED_SEGMENTS = "disturbed-segments"
-    """Single segments differ from all others in what is no common motion."""
+    """Single segments differ from all others beyond their common motion."""
     NOISE_CHANGES = "noise-changes"
     """The noise differs between parts of the recording."""
     MOTION_ACROSS = "motion-across"
-    """Sensors of fewer than three channels miss motion across their planes or axes."""
+    """Sensors of fewer than three channels do not measure motion across their planes or axes."""
     MISSING_DIMENSION = "missing-dimension"
     """The motion has fewer dimensions than the sensors sense."""
     NEARLY_SINGULAR = "nearly-singular"
@@ -66,10 +66,10 @@ class AdviceKind(enum.StrEnum):
 
 
 class Untested(enum.StrEnum):
-    """Why the model of one common motion has not been tested."""
+    """Reason why the model of one common motion was not tested."""
 
     UNFINISHED = "unfinished"
-    """The recording has just begun; the test follows with the first segments."""
+    """The recording has just started; the test follows with the first segments."""
     NO_SEGMENTS = "no-segments"
     """There are no averages."""
     TOO_FEW_SENSORS = "too-few-sensors"

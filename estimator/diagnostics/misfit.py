@@ -1,4 +1,4 @@
-"""Advice on what one common motion does not explain, where it is known what that is."""
+"""Advice on known causes of misfit: shared noise, disturbed segments, changing noise."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class SharedNoise(Advice):
     errors : tuple of float
         Their standard errors.
     three_sensor : float
-        Largest bias of the three-sensor noise of any channel, as a fraction of the noise; NaN where
-        there is no such estimate.
+        Largest bias of the three-sensor noise of any channel, as a fraction of the noise; NaN
+        without such an estimate.
     maximum_likelihood : float
-        The same of the maximum likelihood noise.
+        The same for the maximum likelihood noise.
     channel : int
-        The channel whose estimate is worst.
+        The channel with the largest bias.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.SHARED_NOISE
@@ -47,17 +47,17 @@ class SharedNoise(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DisturbedSegments(Advice):
-    """Single segments differ from all others in what is no common motion.
+    """Single segments differ from all others beyond their common motion.
 
     Attributes
     ----------
     n_disturbed, n_segments : int
     times : tuple of float
-        Starts of the first of them, seconds from the start.
+        Start times of the first disturbed segments, s from the start.
     excess : float
-        What they add to the noise, as a fraction, at the frequencies where it is most.
+        Noise added by these segments, as a fraction, at the frequencies with the largest fraction.
     channel : int
-        The channel that shows most of it.
+        The channel with the largest excess.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.DISTURBED_SEGMENTS
@@ -78,10 +78,10 @@ class NoiseChanges(Advice):
     deviation : float
         Standard deviation between parts, as a fraction of the noise.
     expected : float
-        The same of steady noise.
+        Expected standard deviation for steady noise.
     n_parts : int
     inflation : float
-        By which the model test and the tests of shared noise are corrected.
+        Correction of the model test and the tests of shared noise.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.NOISE_CHANGES

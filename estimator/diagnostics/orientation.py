@@ -1,4 +1,4 @@
-"""What to know about two sensors: rotated, skewed, swapped, reversed, off in gain, late."""
+"""Advice on two sensors: rotation, orthogonality, swapped or reversed channels, gain, delay."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ DELAY_SAMPLES = 0.1
 
 
 def _swapped(response: RelativeResponse) -> dict[int, int]:
-    """Channels of the second sensor that follow another channel of the first, and which.
+    """Return swapped channels: channel of the second sensor → channel of the first it follows.
 
-    Only if exactly two trade places: three that do, or two of which one is reversed, cannot be told
-    from a sensor that is rotated.
+    Only exactly two swapped channels are detected: a cycle of three, or a swap with one reversal,
+    is equivalent to a rotation of the sensor.
     """
     if not response.reversed_channels:
         return {}
@@ -49,7 +49,7 @@ def _swapped(response: RelativeResponse) -> dict[int, int]:
 def orientation(
     response: RelativeResponse, dims: tuple[int, ...], nyquist: float
 ) -> Iterator[Advice]:
-    """Say what there is to know about one sensor as seen by another."""
+    """Yield advice on one sensor relative to another."""
     pair = (response.first, response.second)
     band = (response.low, response.high)
     counterpart, own = (sum(dims[:sensor]) for sensor in pair)

@@ -1,8 +1,8 @@
-"""How two sensors answer the same motion: the rotation, gain and delay between them.
+"""Relative response of two sensors to the same motion: rotation, gain and delay.
 
-With motion common to all, ``S_jk S_ik^-1 = H_j H_i^-1`` for any third sensor k: the noise of the
-three drops out, however strong it is. Averaged over a band it is real but for a delay, and its
-rows are the channels of sensor j in terms of those of sensor i.
+For common motion, ``S_jk S_ik^-1 = H_j H_i^-1`` for any third sensor k, independent of the noise of
+all three sensors. Averaged over a band and without its delay this matrix is real; its rows express
+the channels of sensor j by those of sensor i.
 """
 
 from __future__ import annotations
@@ -19,46 +19,45 @@ if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-LEAST_COHERENCE = 0.5
-"""Frequencies with a lower coherence are not used: their phase could mislead the delay."""
-_STEPS = 4  # of least squares from the coarse delay
-_PARTS = 8  # of the band, for the scatter of the angles
+MIN_COHERENCE = 0.5
+"""Frequencies with a lower coherence are not used: their phase could bias the delay."""
+_STEPS = 4  # steps of least squares from the coarse delay
+_PARTS = 8  # parts of the band, for the scatter of the angles
 
 
 @dataclass(frozen=True, slots=True)
 class RelativeResponse:
-    """Sensor `second` as seen by sensor `first`.
+    """Response of sensor `second` relative to sensor `first`.
 
     Attributes
     ----------
     first, second : int
         The sensors, from 0.
     low, high : float
-        Band averaged, Hz.
+        Limits of the averaged band, Hz.
     matrix : float64, shape (d, d)
-        Channels of `second` in terms of those of `first`, delay removed: gain and direction.
+        Channels of `second` in terms of those of `first`, without delay: gain and direction.
     rotation : float64, shape (d, d)
-        Orthogonal matrix nearest to `matrix` once rows are normalised (polar decomposition).
+        Orthogonal matrix nearest to `matrix` with normalised rows (polar decomposition).
     rotation_deg : float
-        Its angle, reversed channels put right; 0 for one channel.
+        Angle of the rotation after correction of reversed channels; 0 for one channel.
     horizontal_deg : float
-        Angle in the horizontal plane between the first horizontal channels of the two,
-        positive where that of `second` turns away from the second horizontal channel of
-        `first`: counterclockwise seen from above for north and east. NaN without two
-        horizontal channels.
+        Angle in the horizontal plane between the first horizontal channels of the two sensors.
+        Positive if that of `second` is rotated away from the second horizontal channel of `first`:
+        counterclockwise from above for north and east. NaN without two horizontal channels.
     angle_error_deg : float
         Standard error of both angles, from their scatter over parts of the band.
     gains : float64, shape (d,)
-        Of the channels of `second` over those of `first`.
+        Gains of the channels of `second` over those of `first`.
     nonorthogonality_deg : float
         Largest deviation from a right angle between channels of `second`, if those of `first`
         are orthogonal.
     reversed_channels : tuple of int
         Channels of `second` with opposite polarity.
     delay : float
-        Seconds by which `second` lags behind `first`.
+        Lag of `second` behind `first`, s.
     coherence : float
-        Mean over the band of the coherence in the direction in which it is least.
+        Coherence in the direction of its minimum, mean over the band.
     """
 
     first: int
@@ -80,7 +79,7 @@ class RelativeResponse:
 def matched_coherence(
     csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
 ) -> FloatArray:
-    """Magnitude squared coherence of like channels of two sensors.
+    """Return the magnitude squared coherence of like channels of two sensors.
 
     Parameters
     ----------
@@ -92,7 +91,7 @@ def matched_coherence(
     Returns
     -------
     float64, shape (n_freqs, min(dims[first], dims[second]))
-        NaN where a channel has no power.
+        NaN if a channel has no power.
     """
     common = np.arange(min(dims[first], dims[second]))
     a, b = (sum(dims[:sensor]) + common for sensor in (first, second))
@@ -102,9 +101,9 @@ def matched_coherence(
 
 
 class CanonicalCoherence:
-    """Magnitude squared coherence of groups of channels, direction by direction.
+    """Magnitude squared canonical coherence of groups of channels.
 
-    Each root and each pair is computed once.
+    Matrix roots and pairs are cached.
 
     Parameters
     ----------
@@ -125,13 +124,13 @@ class CanonicalCoherence:
         Returns
         -------
         float64, shape (n_freqs, min(len(first), len(second)))
-            Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``. Whatever
-            way the sensors point, the same. Zero where the matrix is not finite.
+            Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``, independent
+            of the sensors' orientations. Zero if the matrix is not finite.
         """
         one, two = sorted((tuple(first), tuple(second)), key=len)
         pair = frozenset((one, two))
         if pair not in self._found:
-            # The squares are eigenvalues: half the work of singular values.
+            # Eigenvalues of the product are the squares, at half the cost of singular values.
             whitened = self._root(one) @ self._csm[:, np.array(one)[:, None], two] @ self._root(two)
             squares = np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))
             found = np.zeros((self._n_freqs, len(one)))
@@ -140,7 +139,7 @@ class CanonicalCoherence:
         return self._found[pair]
 
     def _root(self, channels: tuple[int, ...]) -> ComplexArray:
-        """Inverse root of a group's own matrix; a direction without power stays without."""
+        """Return the inverse root of a group's matrix, zero in directions without power."""
         if channels not in self._roots:
             w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
             alive = w > 1e-12 * w[:, -1:]
@@ -150,7 +149,7 @@ class CanonicalCoherence:
 
 
 def own_channels(dims: tuple[int, ...], sensor: int) -> range:
-    """Return which channels are a sensor's."""
+    """Return the indices of a sensor's channels."""
     return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))
 
 
@@ -166,29 +165,29 @@ def relative_response(
     coherence: CanonicalCoherence | None = None,
     checked: Coherency | None = None,
 ) -> RelativeResponse:
-    """Rotation, gains, non-orthogonality and delay of one sensor against another.
+    """Return rotation, gains, non-orthogonality and delay of one sensor against another.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
-        channels grouped by sensor; at least three sensors, both with d channels and the others
-        with no fewer together.
+        channels grouped by sensor; at least three sensors, both with d channels, and the others
+        with at least d channels in total.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     dims : tuple of int
         Channels of each sensor.
     first, second : int
         The sensors, from 0.
     band : (low, high), optional
-        Hz; every frequency above zero by default.
+        Hz; default: all frequencies above zero.
     vertical : int, optional
-        The channel of every sensor that is vertical. By default none of two channels is, and of
-        three nothing is known.
+        Index of the vertical channel of every sensor. Default: none for two channels, unknown for
+        three.
     coherence : CanonicalCoherence, optional
-        Of the same matrix, where several pairs of sensors are compared.
+        Canonical coherence of the same matrix, to avoid its computation for several pairs.
     checked : Coherency, optional
-        Of the same matrix, likewise.
+        Coherency of the same matrix, likewise.
 
     Returns
     -------
@@ -197,22 +196,21 @@ def relative_response(
     Raises
     ------
     InsufficientDataError
-        If the two have different numbers of channels, there is no third sensor to compare by,
-        or the band holds no frequency at which they are coherent.
+        If the two have different numbers of channels, no third sensor exists, or they are coherent
+        at no frequency of the band.
     InvalidMatrixError
-        As `estimator.self_noise.coherency.coherency` says, or if `frequency` does not fit.
+        As `estimator.self_noise.coherency.coherency`, or if `frequency` does not fit.
     EstimatorError
-        If there are no two such sensors.
+        If `first` or `second` is invalid.
 
     Notes
     -----
-    ``T = [sum_f w S_jk exp(2 pi i f tau)] [sum_f w S_ik]^-1`` with all the other sensors as k
-    (least squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P the mean
-    PSD of sensor i and g their coherence in the direction in which it is least, so that every
-    frequency counts by its signal-to-noise ratio and incoherent ones do not count. The delay tau
-    is sought on a grid, where ``Re sum_f w T(f) exp(2 pi i f tau)`` is largest: as far as half a
-    segment either way, however many periods of the band that is. From there the phase that is
-    left, weighted alike, has a slope through the origin: least squares.
+    ``T = [sum_f w S_jk exp(2 pi i f tau)] [sum_f w S_ik]^-1`` with all other sensors as k (least
+    squares if these have more channels), and weights ``w = g / ((1 - g) P)``: P is the mean PSD of
+    sensor i and g the coherence in the direction of its minimum, so that frequencies are weighted
+    by their signal-to-noise ratio. The delay tau first maximises
+    ``Re sum_f w T(f) exp(2 pi i f tau)`` on a grid of up to half a segment in both directions. Then
+    least squares fit a line through the origin to the remaining phase, with the same weights.
     """
     check_dims(dims)
     csm = np.asarray(csm, dtype=np.complex128)
@@ -236,17 +234,17 @@ def relative_response(
     rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
     if len(rest) < d:
         raise InsufficientDataError(
-            f"sensors {first} and {second}: the others have {len(rest)} channels, {d} are needed"
+            f"sensors {first} and {second}: the others have {len(rest)} channels; expected {d}"
         )
     g = coherence.between(*own)[:, -1]
     seen = coherence.between(own[0], rest)[:, -1]
     weight = g / np.maximum(1 - g, 1e-9)
-    weight[~usable | (np.minimum(g, seen) < LEAST_COHERENCE)] = 0.0
+    weight[~usable | (np.minimum(g, seen) < MIN_COHERENCE)] = 0.0
     if not weight.any():
         raise InsufficientDataError(
             f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
             f"alive and coherent, with each other and with the others, in all {d} directions by "
-            f"more than {LEAST_COHERENCE}"
+            f"more than {MIN_COHERENCE}"
         )
     inside = np.flatnonzero(weight)
     f, weight = frequency[inside], weight[inside]
@@ -285,20 +283,20 @@ def relative_response(
 
 
 def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:
-    """Mean PSD of a sensor's channels."""
+    """Return the mean PSD of a sensor's channels."""
     channels = np.arange(dims[sensor]) + sum(dims[:sensor])
     return np.asarray(csm[:, channels, channels].real.mean(axis=1))
 
 
 def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> FloatArray:
-    """Band average of ``S_jk S_ik^-1``, real part, shape (d, d)."""
+    """Return the band average of ``S_jk S_ik^-1``, real part, shape (d, d)."""
     left = np.einsum("f,fab->ab", weight, S_jk)
     right = np.einsum("f,fab->ab", weight, S_ik)
     return np.asarray((left @ np.linalg.pinv(right)).real)
 
 
 def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> float:
-    """Seconds by which the second sensor lags: where its answers add up, then by their phase."""
+    """Return the lag of the second sensor in s: from a grid, refined by the phase."""
     transfer = S_jk @ np.linalg.pinv(S_ik)
     known = np.isfinite(transfer).all(axis=(1, 2))
     f, weight, transfer = f[known], weight[known], transfer[known]
@@ -312,14 +310,14 @@ def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexA
 
 
 def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
-    """Delay at which the real part of the sum over frequencies is largest, on a grid.
+    """Return the delay on a grid that maximises the real part of the sum over frequencies.
 
-    The sum at all delays is a Fourier transform over frequency; frequencies are taken to the
-    nearest multiple of their least distance.
+    The sum at all delays is a Fourier transform over frequency; frequencies are rounded to the
+    nearest multiple of their smallest distance.
     """
     step = float(np.diff(f).min()) if len(f) > 1 else float(f[0])
     place = np.rint((f - f[0]) / step).astype(np.int64)
-    # eight delays to the period of the highest frequency, so that no peak lies between them
+    # eight delays per period of the highest frequency resolve every peak
     n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
     spectrum = np.zeros((n, *transfer.shape[1:]), np.complex128)
     np.add.at(spectrum, place, transfer)
@@ -334,10 +332,10 @@ def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None
 
 
 def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
-    """Nearest rotation, and which channels had to be turned round for it to be one.
+    """Return the nearest rotation and the reversed channels.
 
-    Of the reversals that leave a proper rotation the one that turns least is taken; channels
-    of sensors meant to stand alike are rarely turned by more than a right angle.
+    Of the reversals that leave a proper rotation, the one with the smallest angle is chosen:
+    sensors meant to be parallel are rarely rotated by more than a right angle.
     """
     d = len(matrix)
     directions = matrix / np.linalg.norm(matrix, axis=1)[:, None]
@@ -348,14 +346,14 @@ def _rotation(matrix: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
         nearest = u @ v
         if np.linalg.det(nearest) > 0:
             candidates.append((float(np.trace(nearest)), signs, nearest))
-            if code == 0:  # nothing is reversed
+            if code == 0:  # no reversed channels
                 break
     _, signs, nearest = max(candidates, key=lambda entry: entry[0])
     return nearest, tuple(int(channel) for channel in np.flatnonzero(signs < 0))
 
 
 def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[float, float]:
-    """Angle of the rotation, and of the first horizontal channel, degrees."""
+    """Return the angles of the rotation and of the first horizontal channel, degrees."""
     rotation, turned_round = _rotation(matrix)
     d = len(matrix)
     sine = np.linalg.norm(rotation - rotation.T) / (2 * np.sqrt(2)) if d > 1 else 0.0
@@ -369,7 +367,7 @@ def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[flo
 
 
 def _parts(weight: FloatArray) -> list[BoolArray]:
-    """Stretches of the band of like total weight, each of a few frequencies at least."""
+    """Return parts of the band with equal total weight, each with at least a few frequencies."""
     share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
     parts = [share == number for number in range(_PARTS)]
     return parts if len(weight) >= 4 * _PARTS and all(part.sum() for part in parts) else []

@@ -2,9 +2,9 @@
 
 A misfit of the model is graded by its possible effect on the noise estimate. The averages show a
 misfit of ``sqrt((statistic - 1) / (n - d))`` of the noise, where ``statistic`` is in units of its
-expectation. The error of the estimate is larger, because the fit absorbs most of a misfit before
-the test sees the rest. Computed on true matrices, it is larger by up to `TYPICAL` times for noise
-that channels share, for noise of a sensor's own mount, and for one more dimension of motion. For
+expectation. The error of the estimate is larger, because the fit absorbs most of a misfit and the
+test sees only the rest. Computed on true matrices, it is larger by up to `TYPICAL` times for noise
+shared by channels, for noise of a sensor's mount, and for one more dimension of motion. For
 waves that cross sensors 0.1 m apart it is larger by up to `CROSSING` times with four sensors or
 more, by up to `CROSSING_THREE` times with three triaxial sensors, and without bound with three
 sensors of fewer channels. See `docs/decisions/0012`.
@@ -54,9 +54,9 @@ TYPICAL = 10.0
 CROSSING = 20.0
 CROSSING_THREE = 100.0
 LARGE_ERROR = 0.5
-"""Of the noise: an estimate with this error is wrong."""
+"""Error, as a fraction of the noise, from which an estimate is wrong."""
 SMALL_ERROR = 0.05
-"""Of the noise: a smaller error does no harm."""
+"""Error, as a fraction of the noise, below which it is harmless."""
 
 
 def advise(
@@ -71,25 +71,25 @@ def advise(
     shared: SharedPairs | None = None,
     further: tuple[Advice, ...] = (),
 ) -> tuple[Advice, ...]:
-    """Say what there is to know about a test, worst first.
+    """Return the advice on a test, most severe first.
 
     Parameters
     ----------
     bands : tuple of BandDiagnosis
-        Rising.
+        Ascending.
     responses : tuple of RelativeResponse
     given : Coherency
         The averages.
     dims : tuple of int
     n_factors : int
-        Dimensions of the motion in the model that was tested.
+        Dimensions of the motion in the tested model.
     n_effective : float
     nyquist : float
         Hz.
     shared : SharedPairs, optional
-        Pairs of channels that share noise: what they explain is no further misfit.
+        Pairs of channels that share noise: their part of the statistic is no further misfit.
     further : tuple of Advice
-        What is known besides.
+        Other advice to include.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def advise(
 
 
 def _overlap(one: Advice, other: Advice) -> bool:
-    """Whether two pieces of advice are about the same frequencies, at some."""
+    """Return whether the bands of two pieces of advice overlap."""
     if one.band is None or other.band is None:
         return True
     return one.band[0] <= other.band[1] and other.band[0] <= one.band[1]
@@ -130,9 +130,9 @@ def _overlap(one: Advice, other: Advice) -> bool:
 def _strangers(
     bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
 ) -> Iterator[Advice]:
-    """Sensors that record none of the motion that others share.
+    """Yield advice on sensors that record none of the motion shared by others.
 
-    What else the averages show in these bands follows from that, and is not said.
+    Other findings in these bands are consequences, and not reported.
     """
     of_bands = [dict(outsiders(band.shared, n_effective, band.n_frequencies)) for band in bands]
     for sensor in range(n_sensors):
@@ -163,7 +163,7 @@ def _stranger(
 def _runs(
     bands: Iterable[BandDiagnosis], applies: Callable[[BandDiagnosis], bool]
 ) -> Iterator[list[BandDiagnosis]]:
-    """Neighbouring bands to which something applies, together."""
+    """Yield runs of neighbouring bands to which a condition applies."""
     for true, run in groupby(bands, applies):
         if true:
             yield list(run)
@@ -174,13 +174,13 @@ def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
 
 
 def _is_weak(band: BandDiagnosis) -> bool:
-    """Whether the motion is weaker than the noise in every channel, the quietest included."""
+    """Return whether the motion is weaker than the noise in every channel."""
     known = band.snr[~np.isnan(band.snr)]
     return len(known) > 0 and bool(known.max() < 1) and not band.noise_lost.any()
 
 
 def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
-    """Channels that are dead or copies, and sensors that are too few without them."""
+    """Yield advice on dead channels and copies, and on too few sensors without them."""
     valid = given.valid
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     dead = ((given.flags[valid] & Flag.DEAD_CHANNEL) != 0).mean(axis=0)
@@ -212,12 +212,12 @@ def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
 
 
 def _statistic(*bands: BandDiagnosis) -> float:
-    """Return the statistic of the model test over its expectation, of bands together."""
+    """Return the statistic of the model test over its expectation, for several bands."""
     return sum(b.test.statistic for b in bands) / sum(b.test.degrees for b in bands)
 
 
 def _too_few_dimensions(bands: tuple[BandDiagnosis, ...], n_factors: int) -> Iterator[Advice]:
-    """Where fewer dimensions were asked for than the sensors sense."""
+    """Yield advice on a model with fewer dimensions than the sensors sense."""
     rejected = rejected_below(band.test for band in bands)
     for run in _runs(bands, lambda band: band.test.p_value < rejected):
         worst = max(run, key=_statistic)
@@ -264,7 +264,7 @@ def _incoherence(
 def _unexplained(
     bands: tuple[BandDiagnosis, ...], shared: SharedPairs | None
 ) -> tuple[BandDiagnosis, ...]:
-    """Return bands with what shared noise leaves of the model test."""
+    """Return bands without the part of the model test that shared noise explains."""
     if shared is None:
         return bands
     return tuple(
@@ -276,7 +276,7 @@ def _unexplained(
 def _shared_noise(
     bands: tuple[BandDiagnosis, ...], shared: SharedPairs, dims: tuple[int, ...]
 ) -> Iterator[Advice]:
-    """Return the pairs that share noise, those of the same sensors together."""
+    """Yield advice on pairs that share noise, grouped by their sensors."""
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     sensors = [tuple(sorted({int(sensor_of[i]), int(sensor_of[j])})) for i, j in shared.pairs]
     bias = np.fmax(np.abs(shared.three_sensor), np.abs(shared.maximum_likelihood))
@@ -298,13 +298,13 @@ def _shared_noise(
 
 
 def _largest(bias: FloatArray) -> float:
-    """Return the number of largest magnitude; NaN where none is known."""
+    """Return the finite number of largest magnitude; NaN without one."""
     known = bias[np.isfinite(bias)]
     return float(known[np.argmax(np.abs(known))]) if len(known) else float("nan")
 
 
 def _sensor_space(bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...]) -> Iterator[Advice]:
-    """Section 5: the motion's dimension against that of what the compared channels sense."""
+    """Yield advice of section 5: the motion's dimension against that of the compared channels."""
     strong = [band for band in bands if not _is_weak(band) and np.isfinite(band.snr).any()]
     if not strong:
         return
@@ -351,7 +351,7 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
 
 
 def left_in(d: int, n_effective: float) -> float:
-    """Return how much weak motion the triad methods leave in at most, as a fraction of the noise.
+    """Return the maximum weak motion left in by triad methods, as a fraction of the noise.
 
     Parameters
     ----------
@@ -362,16 +362,16 @@ def left_in(d: int, n_effective: float) -> float:
     Returns
     -------
     float
-        The largest over the SNR s of ``ρ (1 − g)^(n / d)``, with ``ρ = s / (1 + 2 s)`` what two
-        like sensors do not predict and ``g = (s / (1 + s))²`` their coherence: exact for d = 1
-        (`docs/decisions/0010`), and for d = 2 and 3 no less than was measured there.
+        The maximum over the SNR s of ``ρ (1 − g)^(n / d)``, where ``ρ = s / (1 + 2 s)`` is the
+        motion that two like sensors do not predict and ``g = (s / (1 + s))²`` their coherence:
+        exact for d = 1 (`docs/decisions/0010`), an upper bound of measurements for d = 2 and 3.
     """
     s = np.geomspace(1e-4, 10, 501)
     return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())
 
 
 def _left_in(bands: tuple[BandDiagnosis, ...], d: int, n_effective: float) -> Iterator[Advice]:
-    """Where motion is weak in most channels: by scatter the SNR of some comes out far too high."""
+    """Yield advice on weak motion in most channels: scatter makes some SNRs far too high."""
     share = left_in(d, n_effective)
     if share < SMALL_ERROR:
         return

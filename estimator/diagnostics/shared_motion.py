@@ -1,8 +1,8 @@
-"""Which sensors share a motion, and which record none of it.
+"""Sensors that share a motion, and sensors that record none of it.
 
-The share of a motion that two sensors have in common is the mean of their canonical coherences over
-all directions and the frequencies of a band. Of n averages of independent sensors with d channels
-it is d / n on average, which is subtracted.
+The share of motion that two sensors have in common is the mean of their canonical coherences over
+all directions and the frequencies of a band. For independent sensors with d channels and n averages
+its mean is d / n, which is subtracted.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray
 
 AGREE = 0.3
-"""Share of the motion that two sensors have in common, from which on they agree."""
+"""Share of common motion from which two sensors agree."""
 NONE = 0.1
-"""The same, as a part of what the others share with one another, below which a sensor has none."""
+"""Share of common motion, relative to that of the other sensors, below which a sensor has none."""
 ERRORS = 3.0
 """Standard errors of a share below which a sensor has none."""
 
@@ -31,7 +31,7 @@ ERRORS = 3.0
 def shared_motion(
     canonical: CanonicalCoherence, dims: tuple[int, ...], inside: BoolArray, n_effective: float
 ) -> FloatArray:
-    """Return the share of motion in common, shape (n_sensors, n_sensors); symmetric.
+    """Return the shares of common motion, shape (n_sensors, n_sensors), symmetric.
 
     Parameters
     ----------
@@ -39,13 +39,13 @@ def shared_motion(
     dims : tuple of int
         Channels of each sensor.
     inside : bool, shape (n_freqs,)
-        The band.
+        The frequencies of the band.
     n_effective : float
 
     Returns
     -------
     float64
-        NaN on the diagonal, and throughout with too few averages.
+        NaN on the diagonal, and everywhere with too few averages.
     """
     share = np.full((len(dims), len(dims)), np.nan)
     if n_effective <= 2 * max(dims, default=0):
@@ -60,7 +60,7 @@ def shared_motion(
 def outsiders(
     share: FloatArray, n_effective: float, n_frequencies: int
 ) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Yield sensors that share no motion with the two or more others that agree, and these.
+    """Yield sensors that share no motion with two or more agreeing others, and these others.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def outsiders(
         From `shared_motion`.
     n_effective : float
     n_frequencies : int
-        Of the band.
+        Number of frequencies of the band.
     """
     n_sensors = len(share)
     agree = share >= AGREE

@@ -1,8 +1,8 @@
-"""Noise that channels share: which pairs, how much, and what it does to the estimates.
+"""Noise shared by channels: pairs, amounts, and effect on the estimates.
 
-Pairs are named by stepwise regression of the scores of all pairs, over all frequencies or in one
-band (`estimator.likelihood.score_test`). Where a few pairs do not explain what is left of the
-averages, as where waves cross the bench, none is named.
+Stepwise regression of the scores of all pairs, over all frequencies or in one band
+(`estimator.likelihood.score_test`), finds the pairs. If a few pairs do not explain the residuals of
+the averages, as for waves across the bench, none is reported.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 UNEXPLAINED = 1e-3
-"""Probability of what named pairs leave unexplained, below which none is named."""
+"""Smallest p value of the residual after removal of the found pairs; below it none is reported."""
 SEEN = 3.0
-"""Standard deviations from which on a band shows that pairs share noise, once they are found."""
+"""Standard deviations from which a band shows shared noise of pairs already found."""
 OF_BANDS = 0.5
 """Level of all single bands together, over that of all frequencies. The scores of pairs depend on
-each other, so that both together raise fewer false alarms than their sum."""
+each other, so that both together cause fewer false alarms than their sum."""
 SMALL_PART = 0.1
-"""Of the statistic: a part that may be left although it is no scatter, where much is shared."""
+"""Part of the statistic that may remain unexplained, though significant, if much is shared."""
 A_PARAMETER = 8.0
-"""By how much each further pair of a group must lower the statistic, to be preferred."""
-MOST_STEPS = 4
-"""Pairs or groups that are named."""
-MOST_BINS = 16
-"""Frequencies at which the effect on the estimates is computed."""
-MOST_SHIFT = 5.0
-"""Largest bias stated, in ln of the PSD; the theory is of first order: beyond, it is just large."""
+"""Required decrease of the statistic for each further pair of a group."""
+MAX_STEPS = 4
+"""Maximum number of reported pairs or groups."""
+MAX_BINS = 16
+"""Maximum number of frequencies for the effect on the estimates."""
+MAX_SHIFT = 5.0
+"""Largest reported bias, in ln of the PSD: the theory is of first order."""
 MANY = 1e9
-"""Averages of matrices without scatter."""
+"""Number of averages that stands for matrices without scatter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class SharedPairs:
     Attributes
     ----------
     bands : tuple of int
-        Numbers of the bands in which they do.
+        Indices of the bands with this shared noise.
     pairs : tuple of (int, int)
         Channels, from 0.
     amount : float64, shape (n_pairs,)
@@ -66,7 +66,7 @@ class SharedPairs:
     three_sensor, maximum_likelihood : float64, shape (n_channels,)
         Bias of the noise estimates as a fraction of the noise.
     explained : float64, shape (n_bands,)
-        Of the statistic of the model test of every band.
+        Part of the model test's statistic that the pairs explain, in every band.
     """
 
     bands: tuple[int, ...]
@@ -78,7 +78,7 @@ class SharedPairs:
     explained: FloatArray
 
     def among(self, channels: Sequence[int], n_channels: int) -> SharedPairs:
-        """Return the same with channels numbered among all, dead ones included."""
+        """Return a copy with channel indices that count all channels, including dead ones."""
         closed, likely = np.full((2, n_channels), np.nan)
         closed[list(channels)], likely[list(channels)] = self.three_sensor, self.maximum_likelihood
         return replace(
@@ -103,7 +103,7 @@ def shared_noise(
     Parameters
     ----------
     maximum : Maximum
-        Of the likelihood.
+        Maximum of the likelihood.
     bands : sequence of bool, shape (n_freqs,)
         Frequencies of each band.
     dims : tuple of int
@@ -112,12 +112,12 @@ def shared_noise(
     neighbours : float64, shape (n_lags,)
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
     inflation : float
-        Variance of the scores over what averages of steady noise make of them.
+        Variance of the scores over that for steady noise.
 
     Returns
     -------
     SharedPairs or None
-        None where no pair shares noise, or a few pairs do not explain the averages.
+        None if no pair shares noise, or a few pairs do not explain the averages.
     """
     found = [
         pair_scores(maximum, band, n_effective=n_effective, neighbours=neighbours) for band in bands
@@ -145,7 +145,7 @@ def shared_noise(
         return None
     there = reduce(add, (scores[n] for n in of_bands))
     amount, error = there.amounts(chosen)
-    if np.any(np.abs(amount) > 1 + SEEN * error):  # no coherency: the scores say something else
+    if np.any(np.abs(amount) > 1 + SEEN * error):  # no coherency: the misfit has another cause
         return None
     amounts = np.zeros(len(there.pairs))
     amounts[chosen] = amount
@@ -167,20 +167,20 @@ def shared_noise(
 
 
 def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArray | None:
-    """Choose the pairs whose shared noise explains the scores, the clearest first.
+    """Select the pairs whose shared noise explains the scores, most significant first.
 
     Parameters
     ----------
     scores : Scores
     level : float
-        Chance that any pair is chosen where none shares noise.
+        Probability that any pair is selected if none shares noise.
     groups : sequence of int64, shape (n,)
-        Numbers of pairs that may share noise together, as those of two sensors.
+        Indices of pairs that may share noise together, such as those of two sensors.
 
     Returns
     -------
     int64, shape (n_chosen,), or None
-        None where a few pairs or groups do not explain the scores.
+        None if a few pairs or groups do not explain the scores.
     """
     n_tested = int(np.count_nonzero(scores.z))
     if not n_tested:
@@ -188,7 +188,7 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
     limit = NormalDist().inv_cdf(1 - level / n_tested / 2)
     chosen = np.empty(0, np.int64)
     statistic, rank = 0.0, 0
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         left = scores.without(chosen)
         z = left.z
         z[chosen] = 0.0
@@ -233,7 +233,7 @@ def _groups(scores: Scores, dims: tuple[int, ...]) -> list[IntArray]:
 
 
 def _showing(scores: Mapping[int, Scores], chosen: IntArray) -> tuple[int, ...]:
-    """Return the bands that share the noise: all, unless their amounts differ."""
+    """Return the bands with the shared noise: all, unless their amounts differ."""
     if _is_steady(list(scores.values()), chosen):
         return tuple(scores)
     showing = tuple(n for n, each in scores.items() if np.any(np.abs(each.z[chosen]) > SEEN))
@@ -241,7 +241,7 @@ def _showing(scores: Mapping[int, Scores], chosen: IntArray) -> tuple[int, ...]:
 
 
 def _is_steady(scores: Sequence[Scores], chosen: IntArray) -> bool:
-    """Whether bands have the same amounts, but for scatter or a small part of them."""
+    """Return whether the amounts of all bands agree, within scatter or a small part."""
     total = sum(each.statistic(chosen)[0] for each in scores)
     differ = max(total - reduce(add, scores).statistic(chosen)[0], 0.0)
     degrees = (len(scores) - 1) * len(chosen)
@@ -261,9 +261,9 @@ def _effect(
     dims: tuple[int, ...],
     n_effective: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the bias of three-sensor and maximum likelihood noise, of each channel."""
+    """Return the bias of three-sensor and maximum likelihood noise, per channel."""
     rows = np.flatnonzero(inside & usable(maximum, n_effective))
-    rows = rows[:: -(-len(rows) // MOST_BINS)]
+    rows = rows[:: -(-len(rows) // MAX_BINS)]
     psi = maximum.psi[rows]
     root = np.sqrt(psi)
     outer = root[:, :, None] * root[:, None, :]
@@ -280,11 +280,11 @@ def _effect(
     if len(dims) >= 3:
         off = three_sensor(shared, dims=dims, n_effective=MANY).noise_psd
         closed = (off - three_sensor(sound, dims=dims, n_effective=MANY).noise_psd) / psi
-    likely = np.expm1(np.clip(shift(maximum, rows, scores, amounts), -MOST_SHIFT, MOST_SHIFT))
+    likely = np.expm1(np.clip(shift(maximum, rows, scores, amounts), -MAX_SHIFT, MAX_SHIFT))
     return _median(closed), _median(likely)
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """Return the median of the finite numbers of each column; NaN where there is none."""
+    """Return the median of the finite numbers of each column; NaN without any."""
     known = [column[np.isfinite(column)] for column in values.T]
     return np.array([float(np.median(each)) if len(each) else math.nan for each in known])

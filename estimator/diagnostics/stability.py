@@ -1,13 +1,13 @@
-"""How steady a test is: disturbed segments, and what the parts of a recording say of its scatter.
+"""Stability of a test: disturbed segments, and scatter between parts of a recording.
 
-The averages of a fit are taken apart by time. In channels whitened by their own noise, with P the
-projector on what the motion leaves free, a segment's residual ``P x`` has the power P_ii in every
-channel, if the segment is like the others. Likewise the part of the recording b says of the noise
+The averages of a fit are divided by time. Channels are whitened by their noise; P is the projector
+on the directions without motion. The residual ``P x`` of an undisturbed segment has the power P_ii
+in every channel. The noise of part b of the recording follows from
 
     ``ln psi_b - ln psi = J^-1 diag(P S_b P - P)``,   ``J = |P_ij|**2``,
 
-linear in its averages S_b. The parts scatter as their averages do if the noise is steady; more if
-the noise changes, and then the scores of shared noise and the model test scatter more as well.
+linear in its averages S_b. If the noise is steady, the parts scatter like their averages. If the
+noise changes, they scatter more, and so do the scores of shared noise and the model test.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 PARTS = 12
-"""Parts of a recording that are compared."""
-FEWEST_SEGMENTS = 4
-"""In each part."""
+"""Number of compared parts of a recording."""
+MIN_SEGMENTS = 4
+"""Minimum number of segments per part."""
 FREQUENCIES = 8
-"""Of a group whose residuals are taken together."""
+"""Number of frequencies per group of residuals."""
 DISTURBED = 8.0
-"""Standard deviations, by the median, of the residuals of a group in a disturbed segment."""
-MOST_DISTURBED = 0.2
-"""Share of segments; with more of them the noise changes, and no segment is an exception."""
+"""Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
+MAX_DISTURBED = 0.2
+"""Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
 SURE = 2.0
-"""Standard errors by which scatter must exceed its expectation to count as more."""
+"""Standard errors by which scatter must exceed its expectation to be significant."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentCourse:
-    """Segments one by one, at a few frequencies.
+    """Spectra of single segments at a few frequencies.
 
     Attributes
     ----------
     spectra : complex, shape (n_segments, n_kept, n_channels)
-        In the order of time, in any unit.
+        In order of time, in any unit.
     bins : int64, shape (n_kept,)
-        Their places among the frequencies of the averages.
+        Their indices among the frequencies of the averages.
     times : float64, shape (n_segments,)
-        Start of each in seconds.
+        Start time of each segment, s.
     runs : int64, shape (n_segments,)
-        Number of the recording of each, from 0.
+        Index of each segment's recording, from 0.
     """
 
     spectra: NDArray[np.complexfloating]
@@ -74,7 +74,7 @@ class Scatter:
     n_parts : int
     deviation : float64, shape (n_groups, n_channels)
     expected : float64, shape (n_groups, n_channels)
-        Of steady noise.
+        Expected deviation for steady noise.
     """
 
     n_parts: int
@@ -83,7 +83,7 @@ class Scatter:
 
     @property
     def typically_expected(self) -> FloatArray:
-        """Medians of `expected` over the live channels, (n_groups,); NaN where there is none."""
+        """Return medians of `expected` over the live channels, (n_groups,); NaN without any."""
         rows = [row[np.isfinite(row)] for row in self.expected]
         return np.array([np.median(row) if len(row) else np.nan for row in rows])
 
@@ -97,24 +97,25 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True)
 class Stability:
-    """The course of a test.
+    """Stability of a test.
 
     Attributes
     ----------
     low, high : float64, shape (n_groups,)
-        Hz.
+        Limits of the groups of frequencies, Hz.
     parts : Scatter
-        Between parts of equal length.
+        Scatter between parts of equal length.
     runs : Scatter or None
-        Between recordings; None for one recording.
+        Scatter between recordings; None for one recording.
     inflation : float
-        Variance of the scores of pairs of channels over that of steady noise; 1 unless surely more.
+        Variance of the scores of pairs of channels over that for steady noise; 1 unless
+        significantly more.
     n_segments : int
-        Segments looked at.
+        Number of examined segments.
     disturbed : int64, shape (n_disturbed,)
-        Their numbers among these.
+        Indices of the disturbed segments.
     excess : float
-        What these add to the noise, as a fraction; of the worst group and channel.
+        Noise added by these segments, as a fraction, for the worst group and channel.
     channel : int
         That channel.
     """
@@ -147,17 +148,17 @@ def stability(
     n_effective: float,
     neighbours: FloatArray,
 ) -> Stability | None:
-    """Compare the segments of a recording with each other, its parts, and recordings.
+    """Compare segments, parts of a recording, and recordings with each other.
 
     Parameters
     ----------
     course : SegmentCourse
     maximum : Maximum
-        Of the likelihood of the averages of all segments, at all frequencies.
+        Maximum of the likelihood for the averages of all segments, at all frequencies.
     frequency : float64, shape (n_freqs,)
         Hz.
     n_effective : float
-        Independent averages of all segments.
+        Number of independent averages of all segments.
     neighbours : float64, shape (n_lags,)
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
 
@@ -169,7 +170,7 @@ def stability(
     there = np.flatnonzero(course.bins < len(frequency))
     there = there[usable(maximum.take(course.bins[there]), n_effective)]
     n_segments, bins = len(course.spectra), course.bins[there]
-    n_parts = min(PARTS, n_segments // FEWEST_SEGMENTS)
+    n_parts = min(PARTS, n_segments // MIN_SEGMENTS)
     if n_parts < 3 or len(bins) < FREQUENCIES:
         return None
     at = maximum.take(bins)
@@ -188,7 +189,7 @@ def stability(
     projector = free @ free.conj().swapaxes(1, 2)
     of_parts = _Parts(np.array_split(residual, n_parts), projector, n_effective, correlation)
     numbers, lengths = np.unique(course.runs, return_counts=True)
-    several = len(numbers) > 1 and min(lengths) >= FEWEST_SEGMENTS
+    several = len(numbers) > 1 and min(lengths) >= MIN_SEGMENTS
     runs = [residual[course.runs == run] for run in numbers] if several else []
     without = _Parts([residual[~out]], projector, n_effective, correlation)
     excess = without.lack(groups) if out.any() else np.zeros((1, residual.shape[2]))
@@ -208,14 +209,14 @@ def stability(
 
 
 def _disturbed(residual: ComplexArray, groups: list[IntArray]) -> BoolArray:
-    """Return which segments have residuals that stand out; none where too many do."""
+    """Return whether each segment has outlying residuals; none if too many have."""
     power = np.stack(
         [(np.abs(residual[:, group]) ** 2).sum(axis=(1, 2)) for group in groups], axis=1
     )
     median = np.median(power, axis=0)
     scatter = 1.4826 * np.median(np.abs(power - median), axis=0)
     out = ((power - median) > DISTURBED * scatter).any(axis=1)
-    return out if out.mean() <= MOST_DISTURBED else np.zeros_like(out)
+    return out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)
 
 
 class _Parts:
@@ -230,7 +231,7 @@ class _Parts:
     ) -> None:
         total = sum(map(len, parts))
         self._n_parts, self._projector, self._correlation = len(parts), projector, correlation
-        # Independent averages of a part, by the mean of the variances.
+        # Independent averages per part, from the mean of the variances.
         self._averages = n_effective * len(parts) / sum(total / len(part) for part in parts)
         self._covariance = np.stack(
             [
@@ -243,7 +244,7 @@ class _Parts:
         self._noise = np.einsum("fpq,bfq->bfp", self._inverse, diagonal)
 
     def scatter(self, groups: list[IntArray]) -> Scatter:
-        """Return the scatter of the noise between parts, and that of steady noise."""
+        """Return the scatter of the noise between parts, and its expectation for steady noise."""
         root = np.sqrt(np.einsum("fpp->fp", self._inverse) / self._averages)
         deviation = [self._noise[:, group].mean(axis=1).std(axis=0, ddof=1) for group in groups]
         expected = [
@@ -258,16 +259,16 @@ class _Parts:
         return Scatter(self._n_parts, np.stack(deviation), np.stack(expected))
 
     def lack(self, groups: list[IntArray]) -> FloatArray:
-        """Return by which fraction the noise of all segments exceeds that of the first part."""
+        """Return the excess of the noise of all segments over the first part, as a fraction."""
         return np.stack(
             [1 / np.maximum(1 + self._noise[0, group].mean(axis=0), 0.01) - 1 for group in groups]
         )
 
     def inflation_by_level(self, groups: list[IntArray]) -> float:
-        """Return the variance of products of two channels' noise as their levels change together.
+        """Return the variance of products of two channels' noise with jointly changing levels.
 
-        Noise of level l_b in part b has products of variance ``mean(l_b l_b')``, where the fit
-        expects the product of the means.
+        Noise of level l_b in part b has products of variance ``mean(l_b l_b')``; the fit expects
+        the product of the means.
         """
         i, j = np.array(list(combinations(range(self._noise.shape[2]), 2))).T
         found = []
@@ -277,13 +278,13 @@ class _Parts:
             surely = together > 1 + 2 * SURE * steady[i] * steady[j]
             found.append(np.where(surely, together, 1.0))
         product = np.array(found)
-        # The largest single number would be as much by chance as by the noise.
+        # The largest single number would mostly be chance: use means of rows and columns.
         return float(max(product.mean(axis=0).max(), product.mean(axis=1).max()))
 
     def inflation(self) -> float:
-        """Return the variance of the scores of pairs over that of steady noise, where surely more.
+        """Return the variance of the scores of pairs over that for steady noise.
 
-        However fast the noise changes.
+        Valid for any rate of change of the noise; 1 unless significantly more.
         """
         projector = self._projector
         i, j = np.array(list(combinations(range(projector.shape[1]), 2))).T
@@ -299,6 +300,6 @@ class _Parts:
         if not known.any():
             return 1.0
         ratio = float(np.mean(found[known] / theory[known]))
-        # Scores of all pairs are about as many independent numbers as channels.
+        # The number of independent scores is about the number of channels.
         error = float(np.sqrt(2 / ((self._n_parts - 1) * projector.shape[1])))
         return ratio if ratio > 1 + SURE * error else 1.0

@@ -1,4 +1,4 @@
-"""Advice on what changes while a test lasts."""
+"""Advice on changes during a test."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray, IntArray
 
 NAMED = 5
-"""Disturbed segments whose times are given."""
+"""Maximum number of disturbed segments with reported times."""
 MATERIAL = 0.1
-"""Change of the noise between parts, as a fraction, that is worth a word."""
+"""Change of the noise between parts, as a fraction, from which it is reported."""
 LARGE = 0.5
 SMALL = 0.05
 
 
 def changes(stability: Stability, times: FloatArray, sensor_of: IntArray) -> Iterator[Advice]:
-    """Yield advice on disturbed segments, or else on noise that changes.
+    """Yield advice on disturbed segments, or else on changing noise.
 
     Parameters
     ----------
     stability : Stability
     times : float64, shape (n_segments,)
-        Starts of the segments in seconds.
+        Start times of the segments, s.
     sensor_of : int64, shape (n_channels,)
     """
     n_disturbed = len(stability.disturbed)

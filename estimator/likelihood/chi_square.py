@@ -1,7 +1,7 @@
-"""The chi-square distribution, and the digamma function, for numbers one by one.
+"""The chi-square distribution and the digamma function, for single numbers.
 
-`scipy.special` has both, but importing it takes a quarter of a second of processor time: a third
-of what ``huddle estimate`` takes for four minutes of recording. The tests compare the two.
+`scipy.special` has both, but its import takes a quarter of a second of processor time: a third of
+that of ``huddle estimate`` for a recording of four minutes. The tests compare the two.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import math
 from functools import cache
 
 _EPS = 2.0**-52
-_TINY = 1e-300  # in place of zero in the continued fraction
-_ASYMPTOTIC = 10.0  # from here on the terms of _DIGAMMA are exact to rounding
+_TINY = 1e-300  # replaces zero in the continued fraction
+_ASYMPTOTIC = 10.0  # from this value on the terms of _DIGAMMA are exact to rounding
 _DIGAMMA = (-1 / 12, 1 / 120, -1 / 252, 1 / 240, -1 / 132, 691 / 32760, -1 / 12)
 
 
 def upper_tail(degrees: float, statistic: float) -> float:
-    """Probability that a chi-square variable exceeds a value.
+    """Return the probability that a chi-square variable exceeds a value.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ def upper_tail(degrees: float, statistic: float) -> float:
     Returns
     -------
     float
-        1 for values below zero, NaN where either is NaN.
+        1 for values below zero, NaN if either is NaN.
 
     Notes
     -----
-    ``Q(a, x)``, the regularised incomplete gamma function of half of each: one minus its power
-    series below ``x = a + 1``, and the continued fraction above (Abramowitz and Stegun 6.5.29 and
+    ``Q(a, x)`` is the regularised incomplete gamma function of half of each: one minus its power
+    series below ``x = a + 1``, and a continued fraction above (Abramowitz and Stegun 6.5.29 and
     6.5.31, the latter by Lentz's method).
     """
     a, x = degrees / 2, statistic / 2
@@ -73,7 +73,7 @@ def _continued_fraction(a: float, x: float) -> float:
 
 @cache
 def critical_value(degrees: float, probability: float) -> float:
-    """Value that a chi-square variable exceeds with a probability, by bisection."""
+    """Return the value that a chi-square variable exceeds with a probability, by bisection."""
     low, high = 0.0, degrees + 1
     while upper_tail(degrees, high) > probability:
         low, high = high, 2 * high
@@ -85,8 +85,8 @@ def critical_value(degrees: float, probability: float) -> float:
 def digamma(x: float) -> float:
     """Return the derivative of the logarithm of the gamma function, for x above zero.
 
-    Recurrence up to `_ASYMPTOTIC`, and Stirling's series from there (Abramowitz and Stegun 6.3.5
-    and 6.3.18).
+    Uses the recurrence up to `_ASYMPTOTIC`, then Stirling's series (Abramowitz and Stegun 6.3.5 and
+    6.3.18).
     """
     below = 0.0
     while x < _ASYMPTOTIC:

@@ -1,7 +1,7 @@
 """Dimension of the common motion by band: the smallest that the model test accepts.
 
 It is smaller than the number of channels of a sensor if the motion lacks a dimension. It is larger
-if the sensors do not measure one motion exactly and are numerous enough: rotation and gradients are
+if a sufficient number of sensors measure slightly different motions: rotation and gradients are
 then further factors of the same model.
 """
 
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray, IntArray
 
 LEVEL = 0.05
-"""A dimension is accepted when its pooled p value is above this. An unneeded factor costs
-precision, a missing one is a bias: one band in twenty pays rather than all risk it."""
+"""A dimension is accepted if its pooled p value is above this. An unneeded factor costs precision
+(in one band in twenty), a missing one causes a bias."""
 SURE = 0.01
-"""Below this p value a band that nothing explains is not left to chance."""
+"""p value below which the misfit of a band is not explained by chance."""
 ENOUGH_SENSORS = 5
-"""Sensors from which on further dimensions leave enough to tell the noise of each apart."""
+"""Number of sensors from which further dimensions still determine the noise of each sensor."""
 LEAST_BINS = 8
 MOST_BINS = 64
-"""Frequencies of a band that are tested: of more, every second, third, …"""
+"""Maximum number of tested frequencies per band: of more, every second, third, …"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +48,25 @@ class BandDimension:
     Attributes
     ----------
     low, high : float
-        Of the band's frequencies, Hz.
+        Lowest and highest frequency of the band, Hz.
     n_factors : int
         Dimension of the common motion.
     usual : int
-        Channels of the largest sensor, the dimension taken otherwise.
+        Number of channels of the largest sensor: the default dimension.
     accepted : bool
-        False if even the most factors that can be identified do not explain the band, and where it
-        is undetermined.
+        False if even the maximum number of identifiable factors does not explain the band, and if
+        the band is undetermined.
     test : BandTest
-        Of the chosen dimension.
+        Test of the chosen dimension.
     tried : tuple of BandTest
-        Of 0, 1, … `n_factors` factors.
+        Tests of 0, 1, … `n_factors` factors.
     cov : float
-        Median c.o.v. of the noise at one frequency with `n_factors`; infinite where that many
-        leave the noise undetermined.
+        Median c.o.v. of the noise at one frequency with `n_factors`; infinite if they leave the
+        noise undetermined.
     usual_cov : float
-        The same with the usual dimension; NaN if that could not be fitted.
+        The same with the usual dimension; NaN if it could not be fitted.
     n_sensors : int
-        Sensors that have a signal of their own.
+        Number of sensors with a signal of their own.
     gradients : bool
         Whether the further dimensions are the motion's gradients, see
         `estimator.likelihood.gradients`.
@@ -86,34 +86,34 @@ class BandDimension:
 
     @property
     def is_undetermined(self) -> bool:
-        """Whether the averages are explained, but by more than so few sensors can tell apart.
+        """Whether the averages are explained by more dimensions than these few sensors can resolve.
 
-        Further dimensions leave four sensors too few directions without motion to tell the noise of
-        all of them: the model then fits wrong noise as well as the true one.
+        With further dimensions, four sensors have too few directions without motion to determine
+        the noise of each: the model then also fits wrong noise.
         """
         return self.n_factors > self.usual and self.n_sensors < ENOUGH_SENSORS
 
     @property
     def is_biased(self) -> bool:
-        """Whether no dimension explains the band, beyond what chance does to one in a hundred."""
+        """Whether no dimension explains the band, at a level of one in a hundred."""
         return not self.accepted and self.test.p_value < SURE
 
 
 def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:
-    """Divide frequencies into bands of constant ratio, none with fewer than `least` of them.
+    """Divide frequencies into bands of constant ratio with at least `least` frequencies each.
 
     Parameters
     ----------
     frequency : float64, shape (n_freqs,)
-        Hz, rising; zero goes with the first band.
+        Hz, ascending; zero belongs to the first band.
     per_octave : int
     least : int
-        Frequencies; the last band takes up what does not make one.
+        Minimum number of frequencies per band; the last band also gets the remainder.
 
     Returns
     -------
     int64, shape (n_freqs,)
-        Number of the band, from 0, never falling.
+        Index of the band, from 0, non-decreasing.
     """
     first = [0]
     while True:
@@ -146,15 +146,15 @@ def choose_dimension(
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, channels grouped by sensor.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     dims : tuple of int
-        Channels of each sensor.
+        Number of channels of each sensor.
     n_effective : float
-        Independent averages; more than channels.
+        Number of independent averages; must exceed the number of channels.
     band : int64, shape (n_freqs,), optional
-        Number of the band of each frequency, never falling; `bands` by default.
+        Index of the band of each frequency, non-decreasing; default: `bands`.
     level : float
-        Of the pooled model test.
+        Level of the pooled model test.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
 
@@ -163,23 +163,23 @@ def choose_dimension(
     n_factors : int64, shape (n_freqs,)
         For ``maximum_likelihood(…, n_factors=n_factors)``.
     choices : tuple of BandDimension
-        One a band.
+        One per band.
 
     Raises
     ------
     InvalidMatrixError
-        As `estimator.self_noise.coherency.coherency` says, or if `frequency` or `band` do not fit.
+        As `estimator.self_noise.coherency.coherency`, or if `frequency` or `band` do not fit.
     InsufficientDataError
-        If there are fewer than three sensors that have signal, or averages are no more
-        than channels, or not finite.
+        If fewer than three sensors have signal, or the averages are not finite or do not exceed
+        the number of channels.
 
     Notes
     -----
-    Beyond ``max(dims)`` factors the likelihood carries the weak prior of
-    `estimator.likelihood.prior`, in the test as in the estimate. Three sensors are given
-    no more than ``max(dims)``: whatever one of them feels alone is noise to the other two, so
-    further factors would take noise for motion; the test can only warn. Channels that are dead,
-    or copies of earlier ones, count for nothing here: a fourth sensor of such channels is none.
+    Beyond ``max(dims)`` factors the likelihood includes the weak prior of
+    `estimator.likelihood.prior`, in the test as in the estimate. Three sensors get at most
+    ``max(dims)`` factors: motion that only one of them measures is indistinguishable from its
+    noise, so that further factors would remove noise; the test can only warn. Dead channels and
+    copies of earlier ones do not count: a sensor with only such channels does not count either.
     """
     check_dims(dims)
     check_averages(n_effective)
@@ -190,7 +190,7 @@ def choose_dimension(
     given, n_channels = given.part(list(there.channels)), len(there.channels)
     if len(there.sensors) < 3:
         raise InsufficientDataError(
-            f"{len(there.sensors)} sensors have a signal of their own: at least 3 are needed"
+            f"{len(there.sensors)} sensors have a signal of their own; expected at least 3"
         )
     if n_effective <= n_channels:
         raise InsufficientDataError(
@@ -199,7 +199,7 @@ def choose_dimension(
         )
     number = bands(frequency) if band is None else np.asarray(band)
     if number.shape != frequency.shape or np.any(np.diff(number) < 0):
-        raise InvalidMatrixError("band: expected one number a frequency, never falling")
+        raise InvalidMatrixError("band: expected one number per frequency, non-decreasing")
     matrix = testable(given, frequency)
     usual = max(dims)
     most = _most_testable(n_channels)
@@ -252,14 +252,14 @@ def choose_dimension(
 
 
 def _most_testable(n_channels: int) -> int:
-    """Most factors that leave the test a degree of freedom."""
+    """Return the maximum number of factors that leave the test a degree of freedom."""
     most = int(max_factors(n_channels))
     return most if (n_channels - most) ** 2 > n_channels else most - 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """One dimension in some bands; a row a frequency of these."""
+    """Fit of one dimension in some bands; one row per frequency."""
 
     number: IntArray
     psi: FloatArray
@@ -267,13 +267,13 @@ class _Fit:
     test: ModelTest
 
     def median_cov(self, band: int) -> float:
-        """Median c.o.v. in one band, infinite where the noise is undetermined; NaN for none."""
+        """Return the median c.o.v. in a band; infinite if the noise is undetermined."""
         known = self.cov[(self.number == band) & np.isfinite(self.psi).all(axis=1)]
         return float(np.median(np.nan_to_num(known, nan=np.inf))) if len(known) else float("nan")
 
 
 class _Search:
-    """The averages in their bands, and how one dimension does in some of these."""
+    """The averages in their bands, and the fits of one dimension in some bands."""
 
     def __init__(
         self,
@@ -294,7 +294,7 @@ class _Search:
         self._expected = 1 / psd  # in units of the coherency matrix
 
     def fit(self, q: int, some: list[int]) -> _Fit:
-        """Maximise the likelihood of q factors in some bands."""
+        """Maximise the likelihood of q factors in these bands."""
         rows = np.flatnonzero(np.isin(self._number, some))
         if q <= self._usual:
             maximum = maximise(self._matrix[rows], q)
@@ -315,6 +315,6 @@ class _Search:
         )
 
     def expect(self, fit: _Fit, open_bands: list[int]) -> None:
-        """Take the noise of the bands that are explained for what to expect of the others."""
+        """Set the expected noise of the open bands from the noise of the explained bands."""
         usual = ~np.isin(self._number, open_bands)
         self._expected = expected_noise(fit.psi * self._psd, usual, self._kind) / self._psd

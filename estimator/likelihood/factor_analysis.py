@@ -1,16 +1,16 @@
 """Maximum likelihood of complex factor analysis, ``S = A A* + diag(psi)``, at all frequencies.
 
 For given psi the best A is known: with ``w`` the eigenvalues (descending) and ``U`` the
-eigenvectors of ``psi^(-1/2) S psi^(-1/2)``, it takes up the q largest eigenvalues, as far as
-they exceed one, and what is left of -2/n times the log likelihood ratio is twice
+eigenvectors of ``psi^(-1/2) S psi^(-1/2)``, it explains the q largest eigenvalues above one, and
+the remainder of -2/n times the log likelihood ratio is twice
 
     f(psi) = sum over the other eigenvalues of (w - ln w - 1)           (Lawley and Maxwell)
 
 which is minimised over x = ln psi by Newton's method: exact gradient and Hessian from one
-eigendecomposition, steps kept in a trust region, every frequency at its own pace, and those that
-have arrived left out. Where the Hessian is not convex its expectation is taken as long as that
-promises much, and near the end negative curvature is turned round. A channel that falls towards
-zero noise, where Newton's steps in ln psi become one each, is put there at once if that is better.
+eigendecomposition, with a trust region. All frequencies are iterated together; converged ones are
+left out. If the Hessian is not convex, its expectation replaces it as long as the expected gain is
+large; near the end, negative curvature is reversed. A channel that tends to zero noise, where
+Newton's steps in ln psi become one each, is set to zero directly if the likelihood improves.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ if TYPE_CHECKING:
 
 MAX_ITERATIONS = 200
 DECREMENT = 1e-7
-"""Newton decrement at which a frequency has arrived: ln psi is then within 3e-4 standard errors
-of a single average, and the step still taken, if short, squares that."""
+"""Newton decrement at which a frequency has converged: ln psi is then within 3e-4 standard errors
+of a single average, and a final short step squares this error."""
 BOUNDARY = 1e-6
 """psi below this fraction of the channel's partial spectrum 1 / (S^-1)_ii counts as zero."""
-_LAST_STEP = 0.01  # in ln psi: longer ones, of a likelihood that is nearly flat, may lead downhill
+_LAST_STEP = 0.01  # in ln psi: longer final steps may decrease a nearly flat likelihood
 _MIN_RADIUS = 1e-9
 _FALLING = np.log(0.1 / BOUNDARY)
-"""A channel that falls further from less than this above its boundary is tried there at once: on
-its way the likelihood grows ever less, and ln psi by one a step."""
+"""A channel that still decreases from less than this above its boundary is tried at the boundary:
+ln psi would otherwise decrease by only one per step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Maximum:
-    """Where the likelihood is largest, and how it was reached.
+    """The maximum of the likelihood.
 
     Attributes
     ----------
     psi : float64, shape (n_freqs, n_channels)
-        Noise PSD at the maximum (one short Newton step beyond the rest below), unit**2/Hz, not
-        corrected for small samples; NaN where the matrix is singular.
+        Noise PSD at the maximum (one short Newton step after the values below), unit**2/Hz, not
+        corrected for small samples; NaN if the matrix is singular.
     discrepancy : float64, shape (n_freqs,)
-        ``sum(w - ln w - 1)`` over the eigenvalues no factor explains.
+        ``sum(w - ln w - 1)`` over the eigenvalues not explained by factors.
     eigenvalues : float64, shape (n_freqs, n_channels)
-        Of the whitened matrix, descending; the first ``n_factors`` belong to the motion. Those
-        of the unit matrix where the matrix is singular.
+        Eigenvalues of the whitened matrix, descending; the first ``n_factors`` belong to the
+        motion. Ones if the matrix is singular.
     eigenvectors : complex128, shape (n_freqs, n_channels, n_channels)
-        Theirs, as columns.
+        Eigenvectors, as columns.
     n_factors : int
     iterations : int64, shape (n_freqs,)
-        Evaluations of the likelihood and its derivatives.
+        Number of evaluations of the likelihood and its derivatives.
     gradient_norm : float64, shape (n_freqs,)
-        Largest derivative of the discrepancy by ln psi, boundary channels aside.
+        Largest derivative of the discrepancy by ln psi, except for boundary channels.
     converged : bool, shape (n_freqs,)
     boundary : bool, shape (n_freqs, n_channels)
-        Where the likelihood grows towards psi = 0 (Heywood's case); psi is then at the small
+        Whether the likelihood increases towards psi = 0 (Heywood case); psi is then the small
         positive number at which the search stopped.
     singular : bool, shape (n_freqs,)
-        Where the matrix is not Hermitian and positive definite, so that there is no maximum.
+        Whether the matrix is not Hermitian and positive definite, so that no maximum exists.
     penalty : float64, shape (n_channels, n_channels)
-        What was added to the Fisher information of ln psi per average, zero if nothing.
+        Addition to the Fisher information of ln psi per average; zero without a penalty.
     """
 
     psi: FloatArray
@@ -84,7 +84,7 @@ class Maximum:
     penalty: FloatArray
 
     def take(self, index: IntArray | BoolArray) -> Maximum:
-        """Return the same for some frequencies only."""
+        """Return a copy with only some frequencies."""
         return Maximum(
             psi=self.psi[index],
             discrepancy=self.discrepancy[index],
@@ -101,12 +101,12 @@ class Maximum:
 
 
 def max_factors(n_channels: int | IntArray) -> IntArray:
-    """Largest number of factors the model can identify, ``(p - q)**2 >= p``."""
+    """Return the maximum number of identifiable factors q, ``(p - q)**2 >= p``."""
     return np.floor(n_channels - np.sqrt(n_channels) + 1e-12).astype(np.int64)
 
 
 def check_factors(n_factors: int | IntArray, n_channels: int) -> None:
-    """Raise unless so many channels determine so many factors."""
+    """Raise an error unless this number of channels identifies this number of factors."""
     factors, most = np.asarray(n_factors), max_factors(n_channels)
     if factors.dtype.kind not in "iu":
         raise EstimatorError(f"{n_factors} factors of motion: expected a whole number")
@@ -123,7 +123,7 @@ def maximise(
     *,
     penalty: FloatArray | None = None,
 ) -> Maximum:
-    """Maximum likelihood noise PSD of every channel, at all frequencies at once.
+    """Return the maximum likelihood noise PSD of every channel, for all frequencies.
 
     Parameters
     ----------
@@ -133,7 +133,8 @@ def maximise(
         Dimension q of the common motion, ``0 <= q`` and ``(p - q)**2 >= p``.
     penalty : float64, shape (n_channels, n_channels), optional
         Adds ``x' penalty x / 2``, x = ln psi, to the discrepancy: the precision of a Gaussian
-        prior of x over the number of averages. Positive semidefinite, rows summing to zero.
+        prior of x divided by the number of averages. Positive semidefinite, with rows summing to
+        zero.
 
     Returns
     -------
@@ -144,15 +145,15 @@ def maximise(
     InvalidMatrixError
         If the shape is not that of square matrices.
     InsufficientDataError
-        If so many factors cannot be identified from so many channels.
+        If the number of channels does not identify this number of factors.
 
     Notes
     -----
-    The search starts from the best multiple of ``1 / (S^-1)_ii``; a frequency that has not arrived
-    after `MAX_ITERATIONS` is reported as such. Gradient ``sum_m (1 - w_m) |u_im|**2`` over the
-    residual eigenvalues; Hessian after Clarke (1970) carried over to complex matrices. Its
-    expectation ``|P_ij|**2``, P the projector on the residual eigenvectors, is the Fisher
-    information of ln psi with A eliminated.
+    The search starts from the best multiple of ``1 / (S^-1)_ii``; a frequency that has not
+    converged after `MAX_ITERATIONS` has ``converged`` False. The gradient is
+    ``sum_m (1 - w_m) |u_im|**2`` over the residual eigenvalues; the Hessian is that of Clarke
+    (1970), generalised to complex matrices. Its expectation ``|P_ij|**2``, with P the projector on
+    the residual eigenvectors, is the Fisher information of ln psi with A eliminated.
     """
     if csm.ndim != 3 or csm.shape[1] != csm.shape[2]:
         raise InvalidMatrixError(
@@ -179,7 +180,7 @@ def maximise(
         partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
         lowest = np.log(partial * BOUNDARY)
         start = partial
-        if n_factors == 0 and penalty is None:  # then that is the maximum
+        if n_factors == 0 and penalty is None:  # the diagonal is the maximum
             start = np.real(np.einsum("fii->fi", csm[usable]))
         _search(
             precision[usable],
@@ -193,7 +194,7 @@ def maximise(
 
 
 def _precision(csm: ComplexArray) -> tuple[BoolArray, ComplexArray, FloatArray]:
-    """Where matrices are Hermitian, positive definite; their inverses, and these' rounding."""
+    """Return whether matrices are Hermitian and positive definite, inverses, rounding errors."""
     p = csm.shape[-1]
     power = np.real(np.einsum("fii->fi", csm))
     usable = np.isfinite(csm).all(axis=(1, 2)) & (power > 0).all(axis=1)
@@ -219,7 +220,7 @@ def _search(
     found: Maximum,
     where: IntArray,
 ) -> None:
-    """Climb from x0, no lower than `lowest`, and enter what is found in the rows `where`."""
+    """Search from x0, with the lower bound `lowest`; write results to the rows `where`."""
     q = found.n_factors
     n = len(precision)
     penalty = found.penalty
@@ -244,7 +245,7 @@ def _search(
         gain += _quadratic(best.x[going], penalty) - _quadratic(trial.x, penalty)
         accept = gain >= 1e-4 * expected - rounding[going]
         poor = gain < 0.25 * expected - rounding[going]
-        poor &= ~falling[going].any(axis=1)  # then the fall was too far, not the step
+        poor &= ~falling[going].any(axis=1)  # there the jump to the boundary failed, not the step
         falling[going] = False
         radius[going] = np.where(
             poor,
@@ -274,15 +275,15 @@ def _search(
 
 
 def _falling(x: FloatArray, step: FloatArray, lowest: FloatArray) -> BoolArray:
-    """Channels on their way to zero noise, near it already and still at a full step."""
+    """Return the channels that tend to zero noise: near the boundary and still at full steps."""
     return np.asarray((x > lowest) & (x < lowest + _FALLING) & (step < -0.5))
 
 
 def _evaluate(precision: ComplexArray, x: FloatArray, q: int) -> Point:
     """Whiten by psi and diagonalise, on the inverse matrix.
 
-    There the residual eigenvalues are the large ones, and keep their digits however strong the
-    motion is and however small one psi becomes.
+    In the inverse the residual eigenvalues are the large ones, and so keep their precision for
+    strong motion and for small psi.
     """
     scale = np.exp(0.5 * x)
     inverse, u = np.linalg.eigh(precision * scale[:, :, None] * scale[:, None, :])

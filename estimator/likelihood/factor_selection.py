@@ -1,12 +1,12 @@
-"""The dimensions of motion that the averages resolve, frequency by frequency.
+"""The dimensions of motion that the averages resolve, at each frequency.
 
 Factors that the averages do not resolve are fitted to scatter, which removes noise: without motion
 17 to 30 % at n = 20, and 6 to 15 % at n = 1080. A model without these factors has no such bias. So
-the weakest factor counts only if it improves the fit by more than scatter would; then the next is
+the weakest factor is kept only if it improves the fit by more than scatter does; then the next is
 tested. Motion of an excluded factor counts as noise: `docs/decisions/0010`.
 
-This concerns motion that several sensors measure. Motion that one channel alone measures looks like
-its noise: `alone` finds these channels (`docs/decisions/0011`).
+This concerns motion that several sensors measure. Motion measured by only one channel is
+indistinguishable from its noise: `alone` finds these channels (`docs/decisions/0011`).
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SCATTER = 1.2
-"""Standard deviations by which a factor must lower the test statistic beyond its own number of
-parameters. With more, motion is left in the noise, with less, scatter is taken from it: at 1.2 the
-mean error for three to five sensors of one to three channels, n = 20 to 1080, is least."""
+"""Standard deviations by which a factor must lower the test statistic beyond its number of
+parameters. A higher value leaves motion in the noise, a lower one removes scatter from it: 1.2
+minimises the mean error for three to five sensors of one to three channels, n = 20 to 1080."""
 BEATS_PER_WINDOW = 3.0
-"""The same where a wrong answer is all of a channel's motion: at most one in 500 frequencies."""
+"""The same threshold in `alone`, where an error removes all motion of a channel: wrong for at most
+one in 500 frequencies."""
 CERTAIN = 8.0
-"""A factor whose strength exceeds this times the root of channels over averages is not tested."""
+"""A factor is not tested if its strength exceeds this times the root of channels over averages."""
 CAPTURED = 0.15
-"""Share of a channel outside the factors' space, below which these are tested, strong or not."""
+"""Factors are always tested if the share of a channel outside their space is below this."""
 
 
 def resolved(
@@ -45,18 +46,19 @@ def resolved(
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
-        What `maximum` is of.
+        The matrices of `maximum`.
     maximum : Maximum
-        With as many factors as the motion may have dimensions.
+        Fit with the maximum number of factors.
     n_effective : float
-        Averages; with no more than channels there is no test, and all factors stay.
+        Number of independent averages; all factors are kept, without a test, if it does not exceed
+        the number of channels.
 
     Yields
     ------
     rows : int64, shape (n,)
-        Frequencies that have the same number of factors; every frequency comes once.
+        Indices of frequencies with the same number of factors; each frequency occurs once.
     maximum : Maximum
-        At these.
+        Fit at these frequencies.
     """
     rows = np.arange(len(csm))
     while maximum.n_factors > 0 and n_effective > csm.shape[1]:
@@ -76,24 +78,24 @@ def resolved(
 def alone(
     csm: ComplexArray, absent: BoolArray, *, dims: tuple[int, ...], n_effective: float
 ) -> BoolArray:
-    """Find channels whose noise could equally be motion that no other sensor measures.
+    """Find channels whose noise cannot be distinguished from motion that no other sensor measures.
 
-    Only the sensor with most channels can have such: as many as it has more than any other. They
-    are those that the other sensors predict least. All of such a channel is taken for motion, and
-    it is alone where that fits the averages as well as any noise does, but for scatter. So a
-    channel that others reach from the side, by sensors that point in many directions, is not. What
-    is alone at most frequencies is so at all.
+    Only the sensor with most channels can have such channels: as many as it has more than any
+    other. The candidates are those that the other sensors predict least. A channel is alone if a
+    model in which it has no noise fits the averages as well as one with noise, within scatter.
+    Sensors in other orientations may measure the motion of a channel obliquely; it is then not
+    alone. A channel that is alone at most frequencies is alone at all.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         Coherency, channels grouped by sensor.
     absent : bool, shape (n_freqs, n_channels)
-        Channels that are dead or copies.
+        Dead channels and copies.
     dims : tuple of int
-        Channels of each sensor.
+        Number of channels of each sensor.
     n_effective : float
-        Averages; with no more than channels nothing is told apart.
+        Number of independent averages; no test if it does not exceed the number of channels.
 
     Returns
     -------
@@ -114,7 +116,7 @@ def alone(
         cross = csm[np.ix_(rows, own, others)]
         among, _ = inverse(csm[np.ix_(rows, others, others)])
         left = 1 - np.einsum("fio,fop,fip->fi", cross, among, cross.conj()).real
-        # Where little is predicted, the channel that has no like one is the likeliest.
+        # With little prediction, the channel without a counterpart is the most likely.
         left *= np.where(np.isin(place[own], place[others]), 1, 2)
         least = own[np.argsort(-left, axis=1)[:, :excess]]
         candidate = (least[:, :, None] == own).any(axis=1)
@@ -128,7 +130,7 @@ def alone(
                 misfit = _misfit_without_noise(matrix[here], int(channel), q, n_effective)
                 here[here] = misfit < explained[here]
         found[np.ix_(rows, own)] = candidate
-        # One frequency that slips through would stand for the whole band.
+        # A single missed frequency would dominate the whole band.
         mostly = found[rows].mean(axis=0) > 0.5
         found[np.ix_(rows, np.flatnonzero(mostly))] = True
     return found
@@ -137,9 +139,9 @@ def alone(
 def _misfit_without_noise(
     csm: ComplexArray, channel: int, q: int, n_effective: float
 ) -> FloatArray:
-    """Statistic of the model test with q factors and no noise in a channel, shape (n_freqs,).
+    """Return the statistic of the model test without noise in a channel, shape (n_freqs,).
 
-    The others, that channel taken off, then have a factor less, and an average.
+    The channel is regressed out of the others, which then have one factor and one average less.
     """
     rest = np.delete(np.arange(csm.shape[1]), channel)
     seen = csm[:, rest, channel]
@@ -149,7 +151,7 @@ def _misfit_without_noise(
 
 
 def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArray]:
-    """Statistic and degrees of freedom of the model test; zero where nothing is left for it."""
+    """Return statistic and degrees of freedom of the model test; zero without any freedom."""
     n_freqs, p = maximum.psi.shape
     if (p - maximum.n_factors) ** 2 <= p:
         return np.zeros(n_freqs), np.zeros(n_freqs)
@@ -158,10 +160,10 @@ def _misfit(maximum: Maximum, n_effective: float) -> tuple[FloatArray, FloatArra
 
 
 def _doubtful(maximum: Maximum, n_effective: float) -> BoolArray:
-    """Where a factor may be scatter: it is weak, or takes up nearly all of a channel.
+    """Return whether a factor may be scatter: it is weak, or explains nearly all of a channel.
 
-    A factor that is fitted to one channel's noise looks strong there: its strength is taken
-    without the foremost channel.
+    A factor fitted to the noise of one channel has a large strength in it: its strength is computed
+    without its largest channel.
     """
     q, p = maximum.n_factors, maximum.psi.shape[1]
     share = np.abs(maximum.eigenvectors[:, :, :q]) ** 2

@@ -1,8 +1,8 @@
 """Information of the averages on the noise: Fisher information, bounds, small-sample bias.
 
-In channels whitened by their own noise the model is ``I + A A*``. With P the projector on what
-the motion leaves free (the eigenvectors of the p - q smallest eigenvalues) the information on
-``ln psi`` that is left when A is unknown is, per average,
+In channels whitened by their noise the model is ``I + A A*``. P is the projector on the directions
+without motion (the eigenvectors of the p - q smallest eigenvalues). The information on ``ln psi``
+with unknown A is, per average,
 
     J_ij = |P_ij|**2
 
@@ -26,7 +26,7 @@ _LEAST_INFORMATION = 1e-12
 
 
 def information(residual_vectors: ComplexArray) -> FloatArray:
-    """Fisher information of ln psi per average, A unknown.
+    """Return the Fisher information of ln psi per average, for unknown A.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def information(residual_vectors: ComplexArray) -> FloatArray:
 
 
 def covariance(per_average: FloatArray) -> FloatArray:
-    """Inverse of the information, NaN where it is singular.
+    """Return the inverse of the information; NaN if it is singular.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ def covariance(per_average: FloatArray) -> FloatArray:
 
     Notes
     -----
-    Inverted after scaling to a unit diagonal: as a channel's psi goes to zero its information
-    goes as psi**2, which takes nothing from what is known of the others.
+    The information is scaled to a unit diagonal first: as a channel's psi goes to zero, its
+    information decreases as psi**2, without effect on the information on the others.
     """
     n_channels = per_average.shape[-1]
     root = np.sqrt(np.einsum("fii->fi", per_average))
@@ -73,7 +73,7 @@ def covariance(per_average: FloatArray) -> FloatArray:
 
 
 def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: float) -> FloatArray:
-    """Least coefficient of variation any unbiased estimate of the noise can have.
+    """Return the smallest coefficient of variation of any unbiased estimate of the noise.
 
     Parameters
     ----------
@@ -82,24 +82,24 @@ def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: flo
     noise_psd : float64, shape (n_freqs, n_channels)
         True noise, positive; the rest of `csm` must have low rank.
     n_effective : float
-        Averages.
+        Number of independent averages.
 
     Returns
     -------
     float64, shape (n_freqs, n_channels)
-        Infinite where the model cannot be identified.
+        Infinite if the model cannot be identified.
 
     Raises
     ------
     InvalidMatrixError
-        If shapes do not fit, something is not finite, or a noise PSD is not positive.
+        If shapes do not fit, a value is not finite, or a noise PSD is not positive.
     InsufficientDataError
         If `n_effective` is not a finite number above zero.
 
     Notes
     -----
-    Root of the diagonal of the inverse information divided by `n_effective`. The number of
-    factors is the rank of ``csm - diag(noise_psd)``, whitened, above its rounding.
+    The root of the diagonal of the inverse information divided by `n_effective`. The number of
+    factors is the numerical rank of the whitened ``csm - diag(noise_psd)``.
     """
     check_averages(n_effective)
     if noise_psd.ndim != 2 or csm.shape != (*noise_psd.shape, noise_psd.shape[1]):
@@ -120,7 +120,7 @@ def cramer_rao_cov(csm: ComplexArray, noise_psd: FloatArray, *, n_effective: flo
 
 
 def efficiency(cov: FloatArray, bound: FloatArray) -> FloatArray:
-    """Statistical efficiency: recording time the best estimate would need, over this one's.
+    """Return the statistical efficiency: recording time of the best estimate over this one's.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def efficiency(cov: FloatArray, bound: FloatArray) -> FloatArray:
 def interval(
     noise_psd: FloatArray, standard_error: FloatArray, *, level: float = 0.95
 ) -> tuple[FloatArray, FloatArray]:
-    """Confidence interval of a noise PSD, symmetric in its logarithm.
+    """Return the confidence interval of a noise PSD, symmetric in its logarithm.
 
     Parameters
     ----------
@@ -149,14 +149,14 @@ def interval(
     standard_error : float64, same shape
         unit**2/Hz.
     level : float
-        Probability that the true value lies inside.
+        Probability that the interval contains the true value.
 
     Returns
     -------
     low, high : float64, same shape
         ``noise_psd * exp(-/+ z c)`` with ``c = standard_error / noise_psd``. Above c = 1 the
-        upper end grows with c and no longer with its exponential, so that it stays finite
-        when the estimate stands at zero.
+        upper end is linear instead of exponential in c, so that it is finite for an estimate of
+        zero.
     """
     from scipy import special  # noqa: PLC0415 - takes a quarter of a second to import
 
@@ -170,7 +170,7 @@ def interval(
 
 
 def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) -> FloatArray:
-    """Eigenvalues of the motion, corrected for the scatter of the noise.
+    """Return the eigenvalues of the motion, corrected for the scatter of the noise.
 
     Parameters
     ----------
@@ -179,13 +179,13 @@ def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) 
     n_residual : int
         Number of eigenvalues without motion.
     n_effective : float
-        Averages.
+        Number of independent averages.
 
     Returns
     -------
     float64, shape (n_freqs, n_factors)
-        At least ``1 + sqrt(n_residual / n_effective)``, below which a factor cannot be told
-        from scatter.
+        At least ``1 + sqrt(n_residual / n_effective)``; weaker factors are indistinguishable from
+        scatter.
 
     Notes
     -----
@@ -200,33 +200,32 @@ def spiked_eigenvalues(sample: FloatArray, n_residual: int, n_effective: float) 
 
 
 def bias(maximum: Maximum, *, n_effective: float) -> FloatArray:
-    """Fractional bias of the maximum likelihood estimate, to first order in 1 / n.
+    """Return the fractional bias of the maximum likelihood estimate, to first order in 1 / n.
 
     Parameters
     ----------
     maximum : Maximum
         From `estimator.likelihood.factor_analysis.maximise`.
     n_effective : float
-        Averages.
+        Number of independent averages.
 
     Returns
     -------
     float64, shape (n_freqs, n_channels)
-        Negative; ``-q / n`` at high SNR. Only this leading part is returned where the noise
-        cannot be identified.
+        Negative; ``-q / n`` at high SNR. Only this leading part if the noise cannot be identified.
 
     Notes
     -----
     Cox and Snell's (1968) formula. The model is linear in psi, so only its curvature in A
-    counts: the bias is minus the regression of ``P E[dA dA*] P`` on the information,
+    matters: the bias is minus the regression of ``P E[dA dA*] P`` on the information,
 
         -(1/n) [ sum_k w_k / (w_k - 1) + J^-1 diag(P (J^-1 o K) P) ],
         K = sum_k u_k u_k* / (w_k - 1).
 
-    The first term is what factors take away from the noise whatever psi is (q at high SNR:
-    exactly so, because what remains there is a Wishart matrix with n - q degrees of freedom
-    and a covariance linear in psi, whose maximum likelihood estimate has no bias of first
-    order); the second the turning of the factors by the error of psi itself.
+    The first term is the noise removed by the factors for any psi. At high SNR it is exactly q:
+    the remainder is a Wishart matrix with n - q degrees of freedom and a covariance linear in
+    psi, whose maximum likelihood estimate has no bias of first order. The second term is due to
+    the rotation of the factors by the error of psi.
     """
     eigenvalues, n_factors = maximum.eigenvalues, maximum.n_factors
     n_channels = eigenvalues.shape[1]
@@ -234,7 +233,7 @@ def bias(maximum: Maximum, *, n_effective: float) -> FloatArray:
         return np.zeros_like(eigenvalues)
     n_residual = n_channels - n_factors
     taken = np.full(len(eigenvalues), float(n_factors))
-    for _ in range(3):  # the whitening noise is itself low by what is taken away
+    for _ in range(3):  # the noise used for whitening has the same bias
         lower = np.clip(1 - taken / n_effective, 0.1, 1.0)
         w = spiked_eigenvalues(eigenvalues[:, :n_factors] * lower[:, None], n_residual, n_effective)
         taken = (w / (w - 1)).sum(axis=1)

@@ -1,7 +1,7 @@
 """Likelihood ratio test of one common motion, per frequency and pooled.
 
-The alternative is any covariance matrix. The test fails if sensors measure different motion,
-and for tilt, noise common to two channels (a cable, a digitizer), and clock errors.
+The alternative is any covariance matrix. Sensors that measure different motion, tilt, noise common
+to two channels (a cable, a digitizer), and clock errors make the test fail.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ REJECT = 0.01
 
 @dataclass(frozen=True, slots=True)
 class ModelTest:
-    """The model against any covariance, at every frequency.
+    """Test of the model against any covariance, at every frequency.
 
     Attributes
     ----------
     statistic : float64, shape (n_freqs,)
-        Likelihood ratio, scaled so that its mean under the model is `degrees`; NaN where the
-        matrix is singular.
+        Likelihood ratio, scaled so that its mean under the model is `degrees`; NaN if the matrix is
+        singular.
     degrees : float64, shape (n_freqs,)
-        Of freedom of its chi-square.
+        Degrees of freedom of its chi-square distribution.
     p_value : float64, shape (n_freqs,)
-        Probability of so large a statistic if the model holds.
+        Probability of a statistic at least as large if the model holds.
     """
 
     statistic: FloatArray
@@ -50,7 +50,7 @@ class ModelTest:
 
 @dataclass(frozen=True, slots=True)
 class BandTest:
-    """The model over a band: sum of the statistics of its frequencies.
+    """Test of the model over a band: sum of the statistics of its frequencies.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class BandTest:
     degrees : float
         Its mean under the model; ``statistic / degrees`` is near 1 if the model holds.
     p_value : float
-        Probability of so large a sum if the model holds; NaN if no frequency is usable.
+        Probability of a sum at least as large if the model holds; NaN if no frequency is usable.
     n_frequencies : int
-        Frequencies summed.
+        Number of frequencies in the sum.
     """
 
     statistic: float
@@ -69,11 +69,11 @@ class BandTest:
     p_value: float
     n_frequencies: int
     spread: float = 1.0
-    """Variance of the sum over that of as many independent statistics."""
+    """Variance of the sum over that of independent statistics."""
 
 
 def less(test: BandTest, explained: float) -> BandTest:
-    """Return the test without the part of its statistic that is explained."""
+    """Return the test without an explained part of its statistic."""
     statistic = max(0.0, test.statistic - explained)
     if not (explained and math.isfinite(test.p_value)):
         return test
@@ -82,7 +82,7 @@ def less(test: BandTest, explained: float) -> BandTest:
 
 
 def calmed(test: BandTest, inflation: float) -> BandTest:
-    """Return the test where residuals scatter by `inflation` more than of steady noise."""
+    """Return the test for residuals with `inflation` times the variance for steady noise."""
     if inflation == 1 or not math.isfinite(test.p_value):
         return test
     statistic = test.statistic / inflation
@@ -96,9 +96,9 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     Parameters
     ----------
     maximum : Maximum
-        Of the likelihood, from `estimator.likelihood.factor_analysis.maximise`.
+        Maximum of the likelihood, from `estimator.likelihood.factor_analysis.maximise`.
     n_effective : float
-        Averages, more than channels.
+        Number of independent averages, more than the number of channels.
 
     Returns
     -------
@@ -107,23 +107,23 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     Raises
     ------
     InsufficientDataError
-        If the model has as many parameters as the matrix (nothing is left to test it with), or
-        the averages are fewer than the channels, or not finite.
+        If the model has as many parameters as the matrix (no degrees of freedom are left), or the
+        averages are not finite or fewer than the channels.
 
     Notes
     -----
     ``2 n sum(w - ln w - 1)`` over the p - q smallest eigenvalues has ``(p - q)**2 - p``
-    degrees of freedom. It is too large at small n. At high SNR what is left of the averages
-    without the motion is a Wishart matrix of order m = p - q over n - q averages, so that the
-    statistic against a *known* psi has the mean
+    degrees of freedom. It is too large at small n. At high SNR the averages without the motion are
+    a Wishart matrix of order m = p - q over n - q averages, so that the statistic against a
+    *known* psi has the mean
 
         -2 (n - q) [sum_{i<m} digamma(n - q - i) - m ln(n - q)],
 
-    and estimating psi takes ``p (1 + 1 / (6 (n - q)))`` of it. Dividing by mean over degrees of
+    which estimation of psi reduces by ``p (1 + 1 / (6 (n - q)))``. Division by mean over degrees of
     freedom (Bartlett) gives false alarms of 0.9 % at the 1 % level from n = 20 on (three to
-    five sensors of one to three channels). At low SNR, where q factors are more than n averages
-    can find (n SNR**2 < 100, say), the test is conservative. Under a penalty psi has
-    ``tr J (J + penalty)^-1`` parameters and not p, as ridge regression counts them.
+    five sensors of one to three channels). At low SNR, where n averages do not resolve q factors
+    (about n SNR**2 < 100), the test is conservative. With a penalty, psi has
+    ``tr J (J + penalty)^-1`` effective parameters instead of p, as in ridge regression.
     """
     check_averages(n_effective)
     p = maximum.eigenvalues.shape[1]
@@ -131,7 +131,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
     order, averages = p - q, n_effective - q
     if order**2 - p < 1:
         raise InsufficientDataError(
-            f"{q} factors explain any covariance of {p} channels: nothing is left for a test"
+            f"{q} factors explain any covariance of {p} channels: the test has no freedom left"
         )
     if averages <= order:
         raise InsufficientDataError(
@@ -146,7 +146,7 @@ def model_test(maximum: Maximum, *, n_effective: float) -> ModelTest:
 
 
 def p_values(degrees: FloatArray, statistic: FloatArray) -> FloatArray:
-    """Probability of so large a statistic under the model, at every frequency."""
+    """Return the probability of a statistic at least as large under the model, per frequency."""
     return np.array(list(map(upper_tail, degrees.tolist(), statistic.tolist())))
 
 
@@ -163,13 +163,14 @@ def _estimated_parameters(maximum: Maximum) -> FloatArray:
 def rejected_below(tests: Iterable[BandTest]) -> float:
     """Return the p value below which one of several bands fails.
 
-    `REJECT` is the chance that any band of a good test does: each has its part (Bonferroni).
+    `REJECT` is the probability that any band of a sound test fails, divided by the number of bands
+    (Bonferroni).
     """
     return REJECT / max(1, sum(math.isfinite(test.p_value) for test in tests))
 
 
 def neighbour_correlation(window: FloatArray, hop: int, n_segments: int) -> FloatArray:
-    """Correlation of averaged spectra between bins, by their distance.
+    """Return the correlation of averaged spectra between bins, by their distance.
 
     Parameters
     ----------
@@ -181,7 +182,7 @@ def neighbour_correlation(window: FloatArray, hop: int, n_segments: int) -> Floa
     Returns
     -------
     float64, shape (n_lags,)
-        For distances of 1, 2, … bins, as far as it exceeds 0.001.
+        Correlation at distances of 1, 2, … bins, while it exceeds 0.001.
 
     Notes
     -----
@@ -210,9 +211,9 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
     ----------
     test : ModelTest
     band : bool, shape (n_freqs,)
-        Frequencies to take; those without a statistic are left out.
+        Frequencies to pool; those without a statistic are ignored.
     neighbours : float64, shape (n_lags,), optional
-        From `neighbour_correlation`; by default that of Hann windows at 50 % overlap.
+        From `neighbour_correlation`; default: that of Hann windows at 50 % overlap.
 
     Returns
     -------
@@ -220,9 +221,9 @@ def pool(test: ModelTest, band: BoolArray, *, neighbours: FloatArray | None = No
 
     Notes
     -----
-    The statistics are sums of squares of amplitudes correlated by ``r_h`` between bins h apart,
-    so they are correlated by ``r_h**2`` themselves. The sum is taken as a multiple of a
-    chi-square of the same mean and variance (Satterthwaite).
+    The statistics are sums of squares of amplitudes with correlation ``r_h`` between bins h apart,
+    so their own correlation is ``r_h**2``. The sum is approximated by a multiple of a chi-square
+    variable of the same mean and variance (Satterthwaite).
     """
     r = HANN_HALF if neighbours is None else neighbours
     taken = band & np.isfinite(test.statistic)

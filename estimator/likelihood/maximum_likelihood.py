@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 BEYOND = 2
-"""Additional factors that the standard error allows for, with more factors than usual."""
+"""Additional factors covered by the standard error if there are more factors than usual."""
 
 
 def maximum_likelihood(
@@ -33,58 +33,59 @@ def maximum_likelihood(
     n_factors: int | IntArray | None = None,
     noise_spread: float = NOISE_SPREAD,
 ) -> SelfNoise:
-    """Self-noise PSD of every channel of three or more collocated sensors.
+    """Return the self-noise PSD of every channel of three or more collocated sensors.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
-        channels grouped by sensor. A frequency that is not finite or not positive definite
-        is flagged, and NaN; so are channels that are dead or equal, without loss to the others,
-        and those that no other sensor can check (NO_COUNTERPART, see `resolution.alone`).
+        channels grouped by sensor. The result is NaN with a flag at frequencies that are not
+        finite or not positive definite, for dead or duplicated channels (without effect on the
+        others), and for channels that no other sensor can check (NO_COUNTERPART, see
+        `factor_selection.alone`).
     dims : tuple of int
-        Channels of each sensor.
+        Number of channels of each sensor.
     n_effective : float
-        Independent averages; at least ``n_channels``.
+        Number of independent averages; at least ``n_channels``.
     correct : bool
         Remove the small-sample bias, see Notes.
     n_factors : int or int64, shape (n_freqs,), optional
-        Dimension of the common motion; by default the most channels that a sensor has alive,
-        ``max(dims)``. `estimator.likelihood.dimension` finds it.
-        With `correct`, fewer where the averages cannot tell so many from scatter, flagged
-        UNRESOLVED.
+        Dimension of the common motion; default: the largest number of live channels of a sensor.
+        `estimator.likelihood.dimension` finds it. With `correct`, factors that the averages do not
+        resolve are excluded, with the flag UNRESOLVED.
     noise_spread : float
-        Only where `n_factors` exceeds ``max(dims)``: standard deviation of ln psi expected
-        beforehand among like channels, about the ratios at frequencies of fewer factors. There
-        the matrix alone may not tell their noise apart, and c.o.v. and interval rest on this
-        (see `estimator.likelihood.prior`).
+        Used only if `n_factors` exceeds ``max(dims)``: prior standard deviation of ln psi among
+        like channels, about the ratios at frequencies of fewer factors. The matrix alone may not
+        determine their noise, and c.o.v. and interval depend on this prior (see
+        `estimator.likelihood.prior`).
 
     Returns
     -------
     SelfNoise
-        ``cov`` is the Cramér-Rao bound at the estimate, over ``n_effective - n_factors``
-        averages, and what an uncertain number of factors adds; the interval is symmetric in the
-        logarithm (`fisher.interval`). A channel whose
-        likelihood grows towards zero noise gets 0, no c.o.v., an upper end of the interval
-        and the flag BOUNDARY.
+        ``cov`` is the Cramér-Rao bound at the estimate, for ``n_effective - n_factors`` averages,
+        plus the effect of an uncertain number of factors; the interval is symmetric in the
+        logarithm (`fisher.interval`). A channel whose likelihood increases towards zero noise has
+        the estimate 0, no c.o.v., an upper end of the interval, and the flag BOUNDARY.
 
     Raises
     ------
     InvalidMatrixError
-        As `estimator.self_noise.coherency.coherency` says.
+        As `estimator.self_noise.coherency.coherency`.
     InsufficientDataError
         If there are fewer than three sensors, fewer averages than channels, or too many
-        factors for as many channels.
+        factors for the number of channels.
     EstimatorError
-        If `n_factors` is not whole or mis-shaped, or `noise_spread` not above zero.
+        If `n_factors` is not an integer or has a wrong shape, or `noise_spread` is not above zero.
 
-    Notes ----- Maximum likelihood estimates are low by q / n at high SNR (as the three-sensor
-    estimate is at any), and by more at low SNR: `fisher.bias`. The correction divides by 1 - q / n
-    and multiplies by one plus the rest, at most 1.5, beyond which an expansion in 1/n says nothing.
-    Factors that cannot be told from scatter, which no expansion corrects, are left out first
-    (`estimator.likelihood.factor_selection`); the fits with and without then differ by something
-    that is added to the standard error. No estimate whatever is unbiased where the averages cannot
-    find the motion: `docs/decisions/0010-small-samples.md`, with what is left.
+    Notes
+    -----
+    Maximum likelihood estimates are low by q / n at high SNR (like the three-sensor estimate at any
+    SNR), and by more at low SNR: `fisher.bias`. The correction divides by 1 - q / n and multiplies
+    by one plus the rest, limited to 1.5, beyond which the expansion in 1/n is invalid. Factors that
+    are indistinguishable from scatter are excluded first, because no expansion corrects them
+    (`estimator.likelihood.factor_selection`); the difference between both fits is added to the
+    standard error. No estimate is unbiased if the averages cannot resolve the motion:
+    `docs/decisions/0010-small-samples.md` has the remaining bias.
     """
     check_dims(dims)
     given = coherency(csm, dims)
@@ -108,12 +109,12 @@ def maximum_likelihood(
     lone = np.zeros_like(absent)
     lone[~few] = alone(matrix[~few], absent[~few], dims=dims, n_effective=n_effective)
     lone &= given.flags == 0
-    shared = factors - lone.sum(axis=1)  # dimensions that a channel alone feels are in no other
+    shared = factors - lone.sum(axis=1)  # without dimensions that only one channel measures
     kind = kinds(given, dims)
     noise_psd, cov, low, high = (np.full((n_freqs, p), np.nan) for _ in range(4))
     flags = given.flags.copy()
     flags[few] |= np.where(absent[few], 0, Flag.NO_COUNTERPART)
-    for q in np.unique(factors[~few]):  # rising: what is usual is fitted before it is expected
+    for q in np.unique(factors[~few]):  # ascending: usual fits come first, and give the prior
         rows = np.flatnonzero((factors == q) & ~few)
         if q <= max(dims):
             fits = _usual(matrix[rows], int(q), n_effective=n_effective, correct=correct)
@@ -154,10 +155,10 @@ def maximum_likelihood(
 def _usual(
     matrix: ComplexArray, q: int, *, n_effective: float, correct: bool
 ) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
-    """Fit q factors or, corrected, those that the averages resolve.
+    """Fit q factors or, with `correct`, those that the averages resolve.
 
-    Yields frequencies, their fit and the standard error of psi; to that where factors are left
-    out, the difference this makes.
+    Yields frequencies, their fit and the standard error of psi, which includes the effect of
+    excluded factors.
     """
     maximum = maximise(matrix, q)
     if not correct:
@@ -179,10 +180,10 @@ def _expecting(
     n_effective: float,
     spread: float,
 ) -> Iterator[tuple[IntArray, Maximum, FloatArray]]:
-    """Fit more factors than usual; the standard error allows for some more than were asked for.
+    """Fit more factors than usual; the standard error allows for some additional factors.
 
-    Factors that are only just visible are as likely to be missed, and then the motion they carry
-    is shared out among the noise of channels in ways that the fit itself thinks are certain.
+    Factors at the limit of detection are easily missed. Their motion is then attributed to the
+    noise of channels, and the standard error of the fit alone does not include this.
     """
     fit, wider = (
         maximise_expecting(matrix, q, expected, kind=kind, n_effective=n_effective, spread=spread)
@@ -200,8 +201,7 @@ def _expecting(
 def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]:
     """Replace dead and copied channels by independent unit noise.
 
-    Such a channel takes no part in the motion, and the likelihood of the others is what it would
-    be without it.
+    Such a channel has no motion, and does not change the likelihood of the others.
     """
     p = given.psd.shape[1]
     absent = given.absent
@@ -213,7 +213,7 @@ def _without_dead_and_copies(given: Coherency) -> tuple[ComplexArray, BoolArray]
 
 
 def small_sample_correction(maximum: Maximum, *, n_effective: float) -> FloatArray:
-    """Return what to multiply psi by, shape (n_freqs, n_channels), against its bias."""
+    """Return the factors that correct the bias of psi, shape (n_freqs, n_channels)."""
     lost = maximum.n_factors / n_effective
     bias = fisher.bias(maximum, n_effective=n_effective)
     return (1 + np.clip(-bias - lost, 0.0, 0.5)) / (1 - lost)

@@ -1,11 +1,11 @@
 """A weak prior of the noise, for motion of more dimensions than a sensor has channels.
 
-With gradients of the motion among the factors, parallel sensors give three separate problems of N
+If the factors include gradients of the motion, parallel sensors give three separate problems of N
 channels and three factors (the motion of one direction and its two gradients). For five sensors the
-information on their noise then has rank three: its mean is determined, its division among the
-sensors is not, and maximum likelihood arbitrarily goes to zero in one channel. So like channels (of
-one number in their sensors) are expected to have like noise, or noise in the ratios seen at the
-nearest frequencies that need no more dimensions than usual, within a factor ``exp(spread)``.
+information on their noise then has rank three: the mean is determined, but its division among the
+sensors is not, and maximum likelihood arbitrarily tends to zero in one channel. So like channels
+(with the same index in their sensors) are expected to have equal noise, or noise in the ratios of
+the nearest frequencies with the usual number of dimensions, within a factor ``exp(spread)``.
 Averages with more information outweigh the prior: a spread of 0.5 has the weight of four averages.
 """
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
 NOISE_SPREAD = 0.5
 NEAREST = 32
-"""Frequencies from which ratios are taken."""
+"""Number of frequencies for the ratios."""
 
 
 def kinds(given: Coherency, dims: tuple[int, ...]) -> IntArray:
-    """Say which channels are alike: those of one number in their sensors.
+    """Return the kind of each channel: its index in its sensor.
 
     Parameters
     ----------
     given : Coherency
     dims : tuple of int
-        Channels of each sensor.
+        Number of channels of each sensor.
 
     Returns
     -------
     int64, shape (n_channels,)
-        Equal for like channels; a channel that takes no part (`estimator.self_noise.live_channels`)
-        is like none.
+        Equal for like channels; a dead or copied channel (`estimator.self_noise.live_channels`) has
+        its own kind.
     """
     position = np.concatenate([np.arange(d) for d in dims])
     absent = np.ones(len(position), np.bool_)
@@ -56,21 +56,21 @@ def alike(kind: IntArray) -> FloatArray:
 
 
 def expected_noise(noise_psd: FloatArray, usual: BoolArray, kind: IntArray) -> FloatArray:
-    """Noise PSD to expect of every channel, up to a factor common to like channels.
+    """Return the expected noise PSD of every channel, up to a factor common to like channels.
 
     Parameters
     ----------
     noise_psd : float64, shape (n_freqs, n_channels)
-        Estimates, unit**2/Hz; used at the frequencies of `usual` only.
+        Estimates, unit**2/Hz; used only at the frequencies of `usual`.
     usual : bool, shape (n_freqs,)
-        Where these came from no more factors than a sensor has channels.
+        Whether the estimate has the usual number of factors or fewer.
     kind : int64, shape (n_channels,)
         From `kinds`.
 
     Returns
     -------
     float64, shape (n_freqs, n_channels)
-        Ratios, averaged over the `NEAREST` usual frequencies; 1 if there is none.
+        Ratios, averaged over the `NEAREST` usual frequencies; 1 without any.
     """
     within = np.eye(noise_psd.shape[1]) - alike(kind)  # mean over like channels
     known = np.flatnonzero(usual & np.isfinite(noise_psd).all(axis=1))
@@ -94,12 +94,12 @@ def maximise_expecting(
     n_effective: float,
     spread: float = NOISE_SPREAD,
 ) -> Maximum:
-    """Maximise the likelihood times the expectation.
+    """Maximise the product of likelihood and prior.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
-        In units in which `expected` holds.
+        In the units of `expected`.
     n_factors : int
     expected : float64, shape (n_freqs, n_channels)
         Positive, up to a factor common to like channels.

@@ -1,17 +1,17 @@
-"""Score tests for noise that two channels share: which pair, and how much of the noise.
+"""Score tests for noise shared by two channels: pairs and amounts.
 
-In channels whitened by their own noise, noise shared by channels i and j adds ``a D`` to the
-covariance, ``D = e_i e_j' + e_j e_i'``, with the coherency a of the two noises. With P the
-projector on what the motion leaves free, and E the residual of the averages there, the derivative
-of the log likelihood by a is, per average,
+In channels whitened by their noise, noise shared by channels i and j adds ``a D`` to the
+covariance, ``D = e_i e_j' + e_j e_i'``, with the coherency a of the two noises. P is the projector
+on the directions without motion, and E the residual of the averages in these directions. The
+derivative of the log likelihood by a is, per average,
 
     s_ij = tr(D E) = 2 Re E_ij
 
-with the information ``tr(P D P D)``, of which the part that the noise PSDs take (they are estimated
-at each frequency) is lost. The coherency is the same at all frequencies of a band, so scores and
-information are summed over it: that finds 3 % of shared noise where the likelihood ratio against
-any covariance finds none. Scores of all pairs together are normal with covariance information over
-averages, so pairs are told apart by regression.
+with the information ``tr(P D P D)``, minus the part lost to the noise PSDs, which are estimated at
+each frequency. The coherency is constant over a band, so scores and information are summed: this
+detects 3 % of shared noise that the likelihood ratio against any covariance does not detect. The
+scores of all pairs are jointly normal, with covariance information over averages, so regression
+separates the pairs.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from estimator.likelihood.factor_analysis import Maximum
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-MOST_BINS = 4
-"""Frequencies of a band whose information is computed; it changes little from one to the next."""
+MAX_BINS = 4
+"""Number of frequencies of a band for the information, which changes little between them."""
 RESOLVED = 0.05
-"""Most scatter of the directions of the motion at which scores are normal."""
+"""Maximum scatter of the directions of the motion for normal scores."""
 TESTABLE = 2e-3
-"""Least information on a pair, as a part of that on the best, at which the pair is tested."""
+"""Minimum information on a tested pair, as a fraction of that on the best pair."""
 _SMALLEST = 1e-9
-_KEPT = 0.03  # of the largest eigenvalue: directions of the statistic that are more than scatter
+_KEPT = 0.03  # fraction of the largest eigenvalue: smaller directions of the statistic are scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +45,13 @@ class Scores:
     Attributes
     ----------
     pairs : int64, shape (n_pairs, 2)
-        Channels, from 0, the lower one first.
+        Channels from 0, in ascending order.
     score : float64, shape (n_pairs,)
         ``2 Re E_ij``, per average.
     information : float64, shape (n_pairs, n_pairs)
-        Per average; the noise PSDs are unknown.
+        Per average, with unknown noise PSDs.
     averages : float
-        Independent averages of the sum: what `score` and `information` are multiplied by.
+        Number of independent averages of the sum: the factor of `score` and `information`.
     n_frequencies : int
     """
 
@@ -62,7 +62,7 @@ class Scores:
     n_frequencies: int
 
     def __add__(self, other: Scores) -> Scores:
-        """Return the scores of both bands together."""
+        """Return the combined scores of two bands."""
         return Scores(
             self.pairs,
             self.score + other.score,
@@ -72,13 +72,13 @@ class Scores:
         )
 
     def deflated(self, inflation: float) -> Scores:
-        """Return the same where scores scatter by `inflation` more, as a variance."""
+        """Return the scores for `inflation` times the variance."""
         return Scores(
             self.pairs, self.score, self.information, self.averages / inflation, self.n_frequencies
         )
 
     def without(self, chosen: IntArray) -> Scores:
-        """Return the scores that are left once some pairs share as much noise as fits best."""
+        """Return the scores after fitting the shared noise of some pairs."""
         if not len(chosen):
             return self
         seen = self.information[:, chosen]
@@ -93,7 +93,7 @@ class Scores:
 
     @property
     def z(self) -> FloatArray:
-        """Scores over their standard deviations, shape (n_pairs,); 0 where nothing is known."""
+        """Return scores over their standard deviations, shape (n_pairs,); 0 without information."""
         power = np.diag(self.information)
         known = power > TESTABLE * self.n_frequencies
         return np.where(
@@ -101,14 +101,14 @@ class Scores:
         )
 
     def amounts(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the coherency of the noise of some pairs and its standard error."""
+        """Return the coherency of the noise of some pairs, and its standard error."""
         part = self.information[np.ix_(chosen, chosen)]
         inverse = np.linalg.pinv(part, rcond=_SMALLEST, hermitian=True)
         error = np.sqrt(np.clip(np.diag(inverse), 0.0, None) / self.averages)
         return inverse @ self.score[chosen], error
 
     def statistic(self, chosen: IntArray | None = None) -> tuple[float, int]:
-        """Return the chi-square of some pairs together, of all by default, and its degrees."""
+        """Return the joint chi-square of some pairs (default: all), and its degrees of freedom."""
         some = np.arange(len(self.pairs)) if chosen is None else chosen
         w, u = np.linalg.eigh(self.information[np.ix_(some, some)])
         kept = w > _KEPT * max(float(w.max(initial=0.0)), _SMALLEST)
@@ -116,16 +116,16 @@ class Scores:
         return float(self.averages * np.sum(projected**2 / w[kept])), int(kept.sum())
 
     def explained(self, chosen: IntArray, amounts: FloatArray) -> float:
-        """Return by how much given amounts lower the likelihood ratio statistic of this band."""
+        """Return the decrease of the band's likelihood ratio statistic by given amounts."""
         quadratic = amounts @ self.information[np.ix_(chosen, chosen)] @ amounts
         return float(self.averages * (2 * amounts @ self.score[chosen] - quadratic))
 
 
 def usable(maximum: Maximum, n_effective: float) -> BoolArray:
-    """Return the frequencies whose residuals can be tested, shape (n_freqs,).
+    """Return whether the residuals of each frequency can be tested, shape (n_freqs,).
 
-    Those where averages tell the directions of the motion well enough: a factor of strength s, in
-    units of the noise, is off by ``(1 + s) / (n s**2)`` in every direction that is free.
+    The averages must determine the directions of the motion: a factor of strength s, in units of
+    the noise, has the error ``(1 + s) / (n s**2)`` in every direction without motion.
     """
     good = maximum.converged & ~maximum.singular & ~maximum.boundary.any(axis=1)
     p, q = maximum.psi.shape[1], maximum.n_factors
@@ -143,18 +143,18 @@ def pair_scores(
     Parameters
     ----------
     maximum : Maximum
-        Of the likelihood, from `estimator.likelihood.factor_analysis.maximise`.
+        Maximum of the likelihood, from `estimator.likelihood.factor_analysis.maximise`.
     band : bool, shape (n_freqs,)
         Frequencies to sum.
     n_effective : float
-        Independent averages at one frequency, more than factors.
+        Number of independent averages at one frequency, more than the number of factors.
     neighbours : float64, shape (n_lags,)
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
 
     Returns
     -------
     Scores or None
-        None where no frequency can be tested.
+        None if no frequency can be tested.
     """
     p, q = maximum.psi.shape[1], maximum.n_factors
     rows = np.flatnonzero(band & usable(maximum, n_effective))
@@ -166,7 +166,7 @@ def pair_scores(
     w = maximum.eigenvalues[rows][:, None, q:]
     residual = (u * (w - 1)) @ u.conj().swapaxes(1, 2)
     score = 2 * residual.real.sum(axis=0)[i, j]
-    some = slice(None, None, -(-len(rows) // MOST_BINS))
+    some = slice(None, None, -(-len(rows) // MAX_BINS))
     free = u[some]
     projector = free @ free.conj().swapaxes(1, 2)
     information = _information(projector, i, j)
@@ -202,7 +202,7 @@ def shift(maximum: Maximum, rows: IntArray, scores: Scores, amounts: FloatArray)
 
 
 def _information(projector: ComplexArray, i: IntArray, j: IntArray) -> FloatArray:
-    """Information on the coherencies of pairs (i, j), shape (n_freqs, n_pairs, n_pairs)."""
+    """Return the information on coherencies of pairs (i, j), (n_freqs, n_pairs, n_pairs)."""
     ji, ij = projector[:, j[:, None], i], projector[:, i[:, None], j]
     jj, ii = projector[:, j[:, None], j], projector[:, i[:, None], i]
     own = 2 * (ji * ij.conj() + jj * ii.conj()).real

@@ -1,4 +1,4 @@
-"""Noise as a few numbers: white, flicker, random walk and f² terms, and the Allan deviation.
+"""Noise parameters: white, flicker, random walk and f² terms, and the Allan deviation.
 
-Works on any self-noise estimate; nothing here knows how it was made.
+Applies to self-noise estimates of any method.
 """

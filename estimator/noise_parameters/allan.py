@@ -1,9 +1,9 @@
-"""Allan deviation from a noise PSD: that of the sensor's own noise, the motion taken out.
+"""Allan deviation of a sensor's own noise, from its PSD.
 
     ``sigma**2(tau) = integral of 2 S(f) sin(pi f tau)**4 / (pi f tau)**2 df``  (IEEE Std 1139)
 
-The integral runs to the highest frequency of the estimate. Below the lowest one the fitted terms
-take its place.
+The integral extends to the highest frequency of the estimate. Below the lowest frequency the fitted
+terms replace the estimate.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray
 
 LONGEST = 0.3
-"""Averaging time times the lowest frequency: up to it most of the variance is in the estimate."""
+"""Maximum averaging time times the lowest frequency, for which the estimate has most of the
+variance."""
 STEPS = (1.0, 2.0, 5.0)
 BELOW = 400
-"""Frequencies, a thousandth of the lowest and up, at which the terms are integrated."""
+"""Number of frequencies, from a thousandth of the lowest on, for the integral of the terms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,10 +35,9 @@ class AllanDeviation:
     Attributes
     ----------
     tau : float64, shape (n,)
-        Averaging times in seconds.
+        Averaging times, s.
     deviation, low, high : float64, shape (n,)
-        From the estimate, in its unit, with the 95 % interval; zero where the variance came out
-        below zero.
+        From the estimate, in its unit, with the 95 % interval; zero if the variance is negative.
     fitted : float64, shape (n,)
         From the fitted terms alone.
     """
@@ -50,7 +50,7 @@ class AllanDeviation:
 
 
 def averaging_times(low: float, high: float) -> FloatArray:
-    """Return 1, 2, 5, 10 … seconds for an estimate between two frequencies in Hz."""
+    """Return averaging times 1, 2, 5, 10 … s for an estimate between two frequencies in Hz."""
     shortest, longest = 1 / high, LONGEST / low
     decades = range(int(np.floor(np.log10(shortest))), int(np.ceil(np.log10(longest))) + 1)
     tau = np.array([step * 10.0**decade for decade in decades for step in STEPS])
@@ -69,9 +69,9 @@ def allan_deviation(
     Parameters
     ----------
     frequency, noise_psd, cov, correlation
-        As `estimator.noise_parameters.fit.fit` takes them.
+        As for `estimator.noise_parameters.fit.fit`.
     parameters : NoiseParameters
-        What it made of them.
+        The fit of this estimate.
     """
     used = usable(frequency, noise_psd, cov, (parameters.low, parameters.high))
     f, y, number = frequency[used], noise_psd[used], np.flatnonzero(used)
@@ -87,7 +87,7 @@ def allan_deviation(
     by_term = np.trapezoid(_kernel(below, tau)[:, :, None] * terms_at(below), below, axis=1)
     missing = by_term @ parameters.values
     variance, fitted = kernel @ (y * sharp) + missing, kernel @ model + missing
-    # what is missing follows from the terms, and these from the same estimate
+    # the part below the lowest frequency depends on the terms, and so on the same estimate
     whitened = terms / sigma[:, None]
     scale = np.linalg.norm(whitened, axis=0)
     regression = np.linalg.pinv(whitened / scale) / scale[:, None]  # of the terms on y / sigma

@@ -4,10 +4,10 @@ The PSD is modelled as a sum of powers of the frequency,
 
     ``S(f) = r / f**2 + k / f + w + v f**2``,
 
-random walk, flicker, white and f² noise. The scatter of an estimate goes with the noise itself,
-so the weights follow from the model that is being fitted, and the fit is repeated until they no
-longer change (iteratively reweighted). Weights from the estimate itself would prefer frequencies
-where it came out low. The estimate is taken as it is: negative values count as the others do.
+random walk, flicker, white and f² noise. The scatter of an estimate is proportional to the noise,
+so the weights follow from the fitted model, and the fit is repeated until they no longer change
+(iteratively reweighted least squares). Weights from the estimate would favour frequencies with low
+estimates. The estimate is not clipped: negative values count like the others.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray, IntArray
 
 LEAST_BINS = 24
-"""Frequencies, below which four terms are not fitted."""
+"""Minimum number of frequencies for a fit of four terms."""
 BAND_BINS = 32
-"""Frequencies of a band over which the relative scatter is taken as constant."""
+"""Number of frequencies of a band with constant relative scatter."""
 ROUNDS = 60
 CONVERGED = 1e-5
 OUTLIER = 3.0
-"""Standard deviations up to which a frequency counts in full until lines have been found."""
+"""Standard deviations beyond which a frequency has a reduced weight, until lines are found."""
 LINE = 6.0
-"""Standard deviations from which a frequency is taken for a line, and left out."""
+"""Standard deviations from which a frequency is a line, and excluded."""
 BESIDE = 2
-"""Frequencies left out with it on either side, where the window spreads it."""
+"""Number of frequencies excluded on either side of a line, because the window spreads it."""
 LOWEST = 4
-"""Times the resolution, from where the factor of the window describes all terms."""
+"""Lowest fitted frequency over the resolution: the factor of the window then fits all terms."""
 FLOOR = 0.02
-"""Of the noise in a band: the least that the model is taken to be for the weights."""
+"""Minimum of the model for the weights, as a fraction of the noise in a band."""
 
 
 class Term(enum.StrEnum):
@@ -65,19 +65,19 @@ class NoiseParameters:
     Attributes
     ----------
     values, errors : float64, shape (4,)
-        In the order of `Term`, and their standard errors; negative where a term came out so.
+        In the order of `Term`, and their standard errors. Terms may be negative.
     covariance : float64, shape (4, 4)
     low, high : float
-        Hz; where they were fitted.
+        Fitted band, Hz.
     n_frequencies, n_lines : int
-        Frequencies used, and those left out as lines.
+        Numbers of frequencies used, and excluded as lines.
     chi_square : float
-        Mean squared deviation from the model in standard errors: 1 where the model holds. Errors
-        are larger by its root where it is above 1.
+        Mean squared deviation from the model in standard errors: 1 if the model holds. If it is
+        above 1, `errors` include the factor of its root.
     worst_low, worst_high : float
-        Hz; the band in which the model is worst.
+        Band with the largest misfit, Hz.
     worst_ratio, worst_score : float
-        The estimate over the model there, and by how many standard errors they differ.
+        Estimate over model in this band, and their difference in standard errors.
     """
 
     values: FloatArray
@@ -94,7 +94,7 @@ class NoiseParameters:
     worst_score: float
 
     def value(self, term: Term) -> float:
-        """Return a term."""
+        """Return the value of a term."""
         return float(self.values[list(Term).index(term)])
 
     def error(self, term: Term) -> float:
@@ -114,7 +114,7 @@ def terms_at(frequency: FloatArray, width: FloatArray | float = 0.0) -> FloatArr
     frequency : float64, shape (n_freqs,)
         Hz, above zero.
     width : float64, shape (n_freqs,)
-        Hz; resolution of the spectra in which the terms are seen. Zero for the terms themselves.
+        Resolution of the spectra, Hz; zero for the terms without smoothing.
     """
     blur = (width / frequency) ** 2 / 6
     powers = [float(EXPONENTS[term]) for term in Term]
@@ -122,7 +122,7 @@ def terms_at(frequency: FloatArray, width: FloatArray | float = 0.0) -> FloatArr
 
 
 def resolution(frequency: FloatArray) -> FloatArray:
-    """Return 1 / T of the segments behind each frequency: the spacing of frequencies."""
+    """Return the resolution 1 / T at each frequency in Hz: the spacing of frequencies."""
     return np.asarray(np.gradient(frequency))
 
 
@@ -139,15 +139,16 @@ def fit(
     Parameters
     ----------
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     noise_psd, cov : float64, shape (n_freqs,)
         Estimate, not clipped, and its standard deviation over its magnitude
-        (`estimator.self_noise.result.SelfNoise`); NaN where nothing can be said.
+        (`estimator.self_noise.result.SelfNoise`); NaN if unknown.
     correlation : float64, shape (n_lags,)
-        Of neighbouring frequencies, `estimator.self_noise.band_means.bin_correlation`.
+        Correlation of neighbouring frequencies, from
+        `estimator.self_noise.band_means.bin_correlation`.
     band : tuple of float, optional
-        Hz. By default from four times the resolution, below which the window spreads too much, to
-        all but the highest.
+        Hz. Default: from four times the resolution, below which the window smears the terms, up to
+        the highest frequency, excluded.
 
     Raises
     ------
@@ -213,7 +214,7 @@ def usable(
     """
     if len(frequency) < LEAST_BINS:
         raise InsufficientDataError(
-            f"{len(frequency)} frequencies: at least {LEAST_BINS} are needed for noise parameters"
+            f"{len(frequency)} frequencies; expected at least {LEAST_BINS} for noise parameters"
         )
     low, high = (0.0, frequency[-1]) if band is None else band
     low = max(low, LOWEST * frequency[1] * (1 - 1e-9))
@@ -222,19 +223,19 @@ def usable(
     n_known = int((inside & np.isfinite(cov)).sum())
     if n_known < LEAST_BINS:
         raise InsufficientDataError(
-            f"{n_known} frequencies with an estimate between {low:g} and {high:g} Hz: at least "
-            f"{LEAST_BINS} are needed for noise parameters; use longer segments or a wider band"
+            f"{n_known} frequencies with an estimate between {low:g} and {high:g} Hz; expected at "
+            f"least {LEAST_BINS} for noise parameters: use longer segments or a wider band"
         )
     return np.asarray(inside)
 
 
 def scatter(y: FloatArray, sd: FloatArray, model: FloatArray) -> FloatArray:
-    """Return the standard deviation of an estimate as the model, not the estimate, has it.
+    """Return the standard deviation of an estimate according to the model.
 
     Parameters
     ----------
     y, sd : float64, shape (n,)
-        Estimate and its own deviation, NaN where unknown.
+        Estimate and its own standard deviation; NaN if unknown.
     model : float64, shape (n,)
     """
     return _scatter(y, sd, model, _groups(len(y)))
@@ -256,7 +257,7 @@ def _scatter(y: FloatArray, sd: FloatArray, model: FloatArray, groups: IntArray)
 
 
 def _groups(n: int) -> IntArray:
-    """Return edges of bands of `BAND_BINS` frequencies at least."""
+    """Return edges of bands with at least `BAND_BINS` frequencies."""
     return np.linspace(0, n, max(1, n // BAND_BINS) + 1).astype(np.int64)
 
 
@@ -269,9 +270,9 @@ def _converged(
     keep: BoolArray,
     most: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return terms and deviations that belong to one another.
+    """Return consistent terms and standard deviations, by iteration.
 
-    What is more than `most` deviations away counts as much as if it were just that far (Huber).
+    Deviations of more than `most` standard deviations have a reduced weight (Huber).
     """
     level = np.repeat(
         [np.median(y[a:b]) for a, b in pairwise(groups)],
@@ -301,7 +302,7 @@ def _beside(lines: BoolArray) -> BoolArray:
 
 
 def _correlated(weights: FloatArray, number: IntArray, correlation: FloatArray) -> FloatArray:
-    """Sum ``rho_ij w_i w_j^T`` over frequencies of these numbers."""
+    """Return the sum of ``rho_ij w_i w_j^T`` over frequencies with these indices."""
     total = weights.T @ weights
     place = np.full(number[-1] + 1, -1)
     place[number] = np.arange(len(number))
@@ -314,7 +315,7 @@ def _correlated(weights: FloatArray, number: IntArray, correlation: FloatArray) 
 
 
 def _mismatch(y: FloatArray, model: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Return the estimate over the model in a band, and the deviation in standard errors."""
+    """Return estimate over model in a band, and their difference in standard errors."""
     share = model / sigma**2
     expected = float(share @ model)
     score = (float(share @ y) - expected) / float(np.linalg.norm(share * sigma))

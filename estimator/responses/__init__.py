@@ -1,1 +1,1 @@
-"""How sensors answer the same motion: leakage, equalisation, calibration."""
+"""Responses of sensors to the same motion: leakage, equalisation, calibration."""

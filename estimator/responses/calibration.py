@@ -1,14 +1,15 @@
-"""Relative calibration of sensors by their common motion, with the covariance of every number.
+"""Relative calibration of sensors by their common motion, with covariances.
 
 Theory of operation
 -------------------
 ``G = S_jk S_rk^-1`` is the response of sensor j relative to the reference r at each frequency, with
 all other sensors k as instruments: the noise of none of the sensors biases it. Its error has the
 covariance ``Sigma (x) P^-1 / n``, with Sigma the cross-spectra of ``x_j - G x_r`` and
-``P = S_rk S_kk^-1 S_kr`` the motion in the reference as the others tell it. Over a band G is taken
-as a constant real matrix M with one delay for each channel. Gains, angles and cross-axis
+``P = S_rk S_kk^-1 S_kr`` the motion in the reference predicted by the others. Over a band G is
+modelled as a constant real matrix M with one delay per channel. Gains, angles and cross-axis
 sensitivities follow from M, and their errors from its covariance. Scatter over the frequencies of
-the band beyond these errors is kept apart: the response varies, or not all motion is common.
+the band beyond these errors is reported separately: the response varies, or not all motion is
+common.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
-_STEPS = 3  # of delays and matrix in turn
-_STEP = 1e-6  # of numerical derivatives, relative to the largest element
+_STEPS = 3  # alternating estimates of delays and matrix
+_STEP = 1e-6  # step of numerical derivatives, relative to the largest element
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +37,7 @@ class Value:
 
     Attributes
     ----------
-    value, error : float64, of one shape
+    value, error : float64, equal shapes
     """
 
     value: FloatArray
@@ -45,7 +46,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorCalibration:
-    """One sensor as seen by the reference, over a band.
+    """Response of one sensor relative to the reference, over a band.
 
     Attributes
     ----------
@@ -56,22 +57,22 @@ class SensorCalibration:
     matrix : Value, shape (d, d)
         Channels of the sensor in terms of those of the reference, without delay.
     gain : Value, shape (d,)
-        Length of its rows: relative sensitivity.
+        Norms of the rows of `matrix`: relative sensitivities.
     cross_axis : Value, shape (d, d)
-        Rows over their elements on the diagonal: 1 there.
+        Rows of `matrix` over their diagonal elements, with ones on the diagonal.
     rotation_deg : Value, shape (3,) or (1,)
-        Rotation vector of a triaxial sensor, about its three axes; of two channels the angle from
+        Rotation vector of a triaxial sensor, about its three axes; for two channels, the angle from
         the first channel of the reference towards the second. Empty for one channel.
     angle_deg : Value, shape (d,)
-        Between each channel and that of the reference; not below 0.
+        Angle between each channel and that of the reference, non-negative.
     orthogonality_deg : Value, shape (d (d - 1) / 2,)
-        Angle between channels 12, 13, 23, less 90°.
+        Angles between channels 12, 13, 23, minus 90°.
     delay : Value, shape (d,)
-        Seconds by which each channel lags the reference.
+        Lag of each channel behind the reference, s.
     skew : Value, shape (d,)
-        Delay of each channel less that of the first.
+        Delay of each channel minus that of the first.
     excess : float
-        Scatter over frequencies, over what errors explain: 1 if the model holds.
+        Scatter over frequencies relative to the errors: 1 if the model holds.
     dof : float
         Degrees of freedom of the errors.
     n_frequencies : int
@@ -96,7 +97,7 @@ class SensorCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResponseCurve:
-    """One sensor as seen by the reference, as a function of frequency.
+    """Response of one sensor relative to the reference, as a function of frequency.
 
     Attributes
     ----------
@@ -104,7 +105,7 @@ class ResponseCurve:
     frequency : float64, shape (n_bands,)
         Mean frequency of each band, Hz.
     matrix : complex128, shape (n_bands, d, d)
-        Channels of the sensor in terms of those of the reference; NaN where it is not known.
+        Channels of the sensor in terms of those of the reference; NaN if unknown.
     error : float64, shape (n_bands, d, d)
         Standard error of the real, and of the imaginary part.
     """
@@ -164,8 +165,8 @@ def _pair(
     usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
     if usable.sum() < 4:
         raise InsufficientDataError(
-            f"sensors {reference} and {sensor}: {usable.sum()} frequencies from {band[0]:g} to "
-            f"{band[1]:g} Hz at which they can be compared; expected 4 or more"
+            f"sensors {reference} and {sensor}: {usable.sum()} comparable frequencies from "
+            f"{band[0]:g} to {band[1]:g} Hz; expected 4 or more"
         )
     scale = level[usable, None, None]
     return _Pair(
@@ -196,21 +197,22 @@ def calibrate_sensor(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor; three sensors or more.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     dims : tuple of int
     sensor, reference : int
-        From 0, with as many channels.
+        Indices from 0, of sensors with equal numbers of channels.
     n_effective : float
-        Independent averages.
+        Number of independent averages.
     band : (float, float)
         Hz.
     correlation : float64, shape (n_lags,)
-        Of neighbouring frequencies, as of `estimator.self_noise.band_means.bin_correlation`.
+        Correlation of neighbouring frequencies, from
+        `estimator.self_noise.band_means.bin_correlation`.
 
     Raises
     ------
     InsufficientDataError
-        As of `estimator.diagnostics.relative_response.relative_response`.
+        As `estimator.diagnostics.relative_response.relative_response`.
     """
     pair = _pair(
         csm,
@@ -261,7 +263,7 @@ def calibrate_sensor(
 
 
 def derived(matrix: FloatArray) -> dict[str, FloatArray]:
-    """Return what follows from a relative response, by field of `SensorCalibration`.
+    """Return the fields of `SensorCalibration` that follow from a relative response.
 
     Parameters
     ----------
@@ -271,7 +273,7 @@ def derived(matrix: FloatArray) -> dict[str, FloatArray]:
 
 
 def _delay_covariance(pair: _Pair, matrix: FloatArray, omega: FloatArray) -> FloatArray:
-    """Return the covariance of delays, shape (d, d), but for half the correlation of bins."""
+    """Return the covariance of delays, (d, d), without the factor for the correlation of bins."""
     crossed = np.einsum("ca,fab,gb->fcg", matrix, pair.weight, matrix)
     energy = omega**2 @ np.einsum("fcc->fc", crossed).real
     total = np.einsum("f,fcg,fcg->cg", omega**2, pair.noise, crossed).real
@@ -301,8 +303,8 @@ def _directions(matrix: FloatArray) -> FloatArray:
 def _rotation_vector(matrix: FloatArray) -> FloatArray:
     """Return the rotation from the reference to the sensor about each axis, degrees.
 
-    Of the orthogonal matrix nearest to the directions of the channels. It is not a rotation where
-    the polarity of a channel is reversed: NaN.
+    This is the rotation vector of the orthogonal matrix nearest to the directions of the channels.
+    NaN with a reversed channel, for which this matrix is no rotation.
     """
     d = len(matrix)
     if d == 1:
@@ -363,9 +365,9 @@ def response_curve(
     Parameters
     ----------
     csm, frequency, dims, sensor, reference, n_effective, correlation
-        As `calibrate_sensor` takes them.
+        As for `calibrate_sensor`.
     edges : float64, shape (n_bands + 1,)
-        Hz, rising.
+        Hz, ascending.
     """
     pair = _pair(
         csm,

@@ -1,16 +1,16 @@
-"""What unequal transfer functions leak at the edges of segments, and by which responses.
+"""Leakage at the edges of segments by unequal transfer functions, and measured responses.
 
 Theory of operation
 -------------------
-A window w sees of a channel with response D to the motion m not ``D M`` alone, but to first order
+Let a channel have the response D to the motion m. Its windowed spectrum is to first order
 ``D M + D' M'``, with D' the slope of D per Hz and M' the transform of m under the slope of the
 window. M' is independent of M, and its PSD is `slope_factor` times that of M: 1 / (3 T²) for a Hann
-window of length T. What all channels have in common of it is common motion; the rest counts as
-noise of the channels that differ.
+window of length T. The part of ``D' M'`` that is equal in all channels is common motion; the rest
+is noise of the channels that differ.
 
-The responses come from the averages themselves. A constant real combination of the channels of
-sensor j predicts channel c but for one complex factor, ``D_cj = S_cz / S_yz``: y the prediction by
-j, z that by the sensors that are neither j nor of c. The noise of no channel biases it.
+The responses follow from the averages. A constant real combination of the channels of sensor j
+predicts channel c up to one complex factor, ``D_cj = S_cz / S_yz``, where y is the prediction by j,
+and z that by the sensors other than j and the sensor of c. No channel's noise biases it.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from estimator.self_noise.coherency import check_dims
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
-LEAST_COHERENCE = 0.3
-"""Between a channel and its prediction, for a frequency to count."""
+MIN_COHERENCE = 0.3
+"""Minimum coherence between a channel and its prediction at a used frequency."""
 _TWO_FREQUENCIES = 1.67  # 2 (1 - 1/6): variance of a difference two bins apart under Hann
 _CORRELATED = 2.0  # variance of a sum over that of independent frequencies
-_MOST_FREQUENCIES = 256  # that the directions are found from
-_RIDGE = 1e-9  # of the mean power: keeps a dead direction from stopping everything
+_MAX_FREQUENCIES = 256  # maximum number of frequencies for the directions
+_RIDGE = 1e-9  # fraction of the mean power: keeps matrices regular with a dead direction
 
 
 def slope_factor(window: FloatArray, sampling_rate: float) -> float:
-    """Return the PSD of motion under the slope of a window, over that of the motion, in Hz².
+    """Return the PSD of motion under the slope of a window over that of the motion, in Hz².
 
-    ``sum (dw/dt)² / (4 pi² sum w²)``, the jumps at both ends included.
+    ``sum (dw/dt)² / (4 pi² sum w²)``, including the jumps at both ends.
 
     Parameters
     ----------
@@ -53,18 +53,17 @@ def slope_factor(window: FloatArray, sampling_rate: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelResponses:
-    """Every channel as seen by each other sensor.
+    """Responses of every channel relative to each other sensor.
 
     Attributes
     ----------
     frequency : float64, shape (n_freqs,)
         Hz.
     ratio : complex128, shape (n_freqs, n_channels, n_sensors)
-        D: what the channel makes of the motion over what the sensor's channels make of it, one
-        factor where 1 is their mean size in direction only. NaN for the channel's own sensor and
-        for sensors by which it cannot be predicted.
+        D: response of the channel over that of the sensor's channels in its direction, up to a
+        constant factor. NaN for the channel's own sensor and for sensors that cannot predict it.
     coherence : float64, shape (n_freqs, n_channels, n_sensors)
-        Magnitude squared, of the channel with its prediction.
+        Magnitude squared coherence of the channel and its prediction.
     """
 
     frequency: FloatArray
@@ -72,7 +71,7 @@ class ChannelResponses:
     coherence: FloatArray
 
     def slopes(self) -> ComplexArray:
-        """Return ``D' / D`` per Hz, by central differences, shape as `ratio`."""
+        """Return ``D' / D`` per Hz, by central differences, with the shape of `ratio`."""
         f, ratio = self.frequency, self.ratio
         slopes = np.full_like(ratio, np.nan)
         width = (f[2:] - f[:-2])[:, None, None]
@@ -83,7 +82,7 @@ class ChannelResponses:
     def leakage(
         self, motion_psd: FloatArray, factor: float, *, n_effective: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what leaks into the noise of every channel, and its standard deviation.
+        """Return the leakage into the noise of every channel, and its standard deviation.
 
         Parameters
         ----------
@@ -96,21 +95,21 @@ class ChannelResponses:
         Returns
         -------
         leakage, deviation : float64, shape (n_freqs, n_channels)
-            PSD that estimates by triads of sensors have too much; 0 where it is not known.
+            Excess PSD of estimates by triads of sensors; 0 if unknown.
 
         Notes
         -----
         ``factor Re[(D_cj'/D_cj) conj(D_ck'/D_ck)] P_c``, averaged over the pairs of sensors j, k:
-        the same product of errors by which a triad predicts channel c twice. Their common noise
-        is that of the channel, a share 0.14 / n of it; the variance of ``D'/D`` is that of a
-        ratio of averages, ``(1 / g - 1) / n`` at coherence g, at two frequencies.
+        the product of the errors of the two predictions of channel c in a triad. Their common noise
+        is a share 0.14 / n of the channel's noise; the variance of ``D'/D`` is that of a ratio of
+        averages, ``(1 / g - 1) / n`` at coherence g, at two frequencies.
         """
         slopes, f = self.slopes(), self.frequency
         variance = np.full(slopes.shape, np.inf)
         width = (f[2:] - f[:-2])[:, None, None]
         with np.errstate(divide="ignore"):
             own = (1 / self.coherence[1:-1] - 1) / max(n_effective, 1.0)
-        own[self.coherence[1:-1] < LEAST_COHERENCE] = np.inf
+        own[self.coherence[1:-1] < MIN_COHERENCE] = np.inf
         variance[1:-1] = _TWO_FREQUENCIES * own / width**2
         pairs = list(combinations(range(slopes.shape[2]), 2))
         products = np.array([(slopes[:, :, j] * slopes[:, :, k].conj()).real for j, k in pairs])
@@ -127,19 +126,19 @@ class ChannelResponses:
 def band_shares(
     leakage: FloatArray, deviation: FloatArray, noise_psd: FloatArray, frequency: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return leakage over noise in bands of third octaves, given at each of their frequencies.
+    """Return leakage over noise in third-octave bands, at each frequency of the bands.
 
     Parameters
     ----------
     leakage, deviation, noise_psd : float64, shape (n_freqs, n_channels)
-        As of `ChannelResponses.leakage`.
+        As from `ChannelResponses.leakage`.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
 
     Returns
     -------
     share, deviation : float64, shape (n_freqs, n_channels)
-        0 where no noise is known.
+        0 if the noise is unknown.
     """
     number = bands(frequency)
     known = np.isfinite(leakage) & np.isfinite(noise_psd)
@@ -154,7 +153,7 @@ def band_shares(
 def channel_responses(
     csm: ComplexArray, frequency: FloatArray, *, dims: tuple[int, ...]
 ) -> ChannelResponses:
-    """Return every channel as seen by each other sensor.
+    """Return the responses of every channel relative to each other sensor.
 
     Parameters
     ----------
@@ -162,7 +161,7 @@ def channel_responses(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor.
     frequency : float64, shape (n_freqs,)
-        Hz, rising.
+        Hz, ascending.
     dims : tuple of int
         Channels of each sensor.
 
@@ -204,15 +203,15 @@ def channel_responses(
 def _directions(
     csm: ComplexArray, dims: tuple[int, ...], own: list[np.ndarray]
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return the real combination of a sensor's channels that predicts a channel, up to a factor.
+    """Return the real combinations of a sensor's channels that predict a channel, up to a factor.
 
-    It is the direction in which the rows ``S_ck S_jk^-1`` of the relative response lie at most
-    frequencies, weighted by their signal-to-noise ratio: a complex factor at each does not turn it.
+    This is the main direction of the rows ``S_ck S_jk^-1`` of the relative response over all
+    frequencies, weighted by signal-to-noise ratio; complex factors do not change it.
     """
     power = np.einsum("fpp->fp", csm).real
     alive = (power > 0).all(axis=1)
     some = np.flatnonzero(alive)
-    some = some[:: max(1, len(some) // _MOST_FREQUENCIES)]
+    some = some[:: max(1, len(some) // _MAX_FREQUENCIES)]
     found: dict[tuple[int, int], FloatArray] = {}
     if not len(some):
         return found
@@ -239,7 +238,7 @@ def _directions(
                     "fcj,fcj->fc", rows, part[:, own[j][:, None], own[i]].swapaxes(1, 2)
                 )
                 g = np.clip(np.abs(cross) ** 2 / predicted, 0.0, 1 - 1e-9)
-            g = np.where(np.isfinite(g) & (g > LEAST_COHERENCE), g, 0.0)
+            g = np.where(np.isfinite(g) & (g > MIN_COHERENCE), g, 0.0)
             rows = rows * scale[:, own[i]][:, :, None] / scale[:, None, own[j]]
             size = np.einsum("fcj,fcj->fc", rows, rows.conj()).real
             weight = g / (1 - g) / np.where(size > 0, size, np.inf)

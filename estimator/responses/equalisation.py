@@ -1,8 +1,8 @@
-"""Which filters make sensors answer alike, by their measured responses.
+"""Filters that equalise the measured responses of sensors.
 
-One sensor stays as it is, and channels of the others are filtered towards it. Any will do in
-theory; one whose filters are short is chosen: to undo a resonance takes a few samples, to imitate
-it many.
+One sensor is the reference, and the channels of the others are filtered towards it. In theory any
+sensor can be the reference; one with short filters is chosen: removing a resonance takes a few
+samples, imitating it takes many.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
 MATTERS = 0.01
-"""Leakage, as a share of the noise in a third of an octave, from which on channels are filtered."""
+"""Leakage from which channels are filtered, as a share of the noise in a third of an octave."""
 PER_AVERAGE = 1.0
-"""Added to it over the averages: the prediction has noise of its own."""
+"""Addition to `MATTERS`, divided by the number of averages, for the noise of the prediction."""
 LARGE = 0.3
-"""Share of the noise estimate from which on it is wrong."""
+"""Leakage from which an estimate is wrong, as a share of the noise."""
 WITH_MOST = 0.1
-"""Of the largest share, from which on a sensor is named with the one that leaks most."""
+"""Share of the largest leakage from which a sensor is reported with the one that leaks most."""
 SURE = 3.0
-"""Standard deviations by which leakage must exceed it."""
-_EQUAL_ENOUGH = 0.5  # of it, below which a channel is left as it is beside one that is not
+"""Standard deviations by which leakage must exceed the threshold."""
+_EQUAL_ENOUGH = 0.5  # fraction of the threshold below which a channel is not filtered
 _STIFFNESS = 1.0
-_MORE_CHANNELS = 0.02  # in terms of `tail_leakage`: the price of a channel that is filtered
+_MORE_CHANNELS = 0.02  # cost of each filtered channel, in units of `tail_leakage`
 
 
 def matters(n_effective: float) -> float:
-    """Return the share of the noise from which on leakage matters."""
+    """Return the share of the noise from which leakage matters."""
     return MATTERS + PER_AVERAGE / max(n_effective, 1.0)
 
 
 def surely(share: FloatArray, deviation: FloatArray, frequency: FloatArray) -> FloatArray:
-    """Return what a share is at least, for all its deviation.
+    """Return the significant minimum of a share, given its standard deviation.
 
-    0 near half the sampling rate, above `estimator.spectra.equaliser.USABLE` of the largest
-    frequency (Hz, shape (n_freqs,)), where nothing can be equalised.
+    The minimum is 0 above `estimator.spectra.equaliser.USABLE` of the largest frequency (Hz, shape
+    (n_freqs,)), where responses are not equalised.
     """
     least = np.maximum(share - SURE * deviation, 0.0)
     return np.where((frequency <= USABLE * frequency[-1])[:, None], least, 0.0)
@@ -68,14 +68,14 @@ def leakage_advice(
     n_effective: float,
     equalised_by: tuple[str, ...],
 ) -> Iterator[UnequalResponses]:
-    """Say what leaks at the edges of segments, or would without equalisation.
+    """Yield advice on leakage at the edges of segments, with or without equalisation.
 
     Parameters
     ----------
     frequency : float64, shape (n_freqs,)
         Hz.
     share, share_without : float64, shape (n_freqs, n_channels)
-        As of `surely`; with and without equalisation.
+        As from `surely`, with and without equalisation.
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
@@ -119,25 +119,25 @@ def correction(
     factor: float,
     reference: int | None = None,
 ) -> tuple[ComplexArray, int]:
-    """Return the responses of filters that make channels answer like those of one sensor.
+    """Return the responses of filters that equalise channels to those of one sensor.
 
     Parameters
     ----------
     responses : ChannelResponses
     grid : float64, shape (n_grid,)
-        Frequencies wanted, evenly from 0 Hz to half the sampling rate.
+        Output frequencies, evenly spaced from 0 Hz to half the sampling rate.
     dims : tuple of int
     motion_psd, noise_psd : float64, shape (n_freqs, n_channels)
     n_effective : float
     factor : float
         `estimator.responses.edge_leakage.slope_factor`.
     reference : int, optional
-        The sensor that stays as it is; the one with the shortest filters by default.
+        The unfiltered sensor; default: the one with the shortest filters.
 
     Returns
     -------
     wanted : complex128, shape (n_grid, n_channels)
-        1 throughout for channels that are left as they are.
+        1 at all frequencies for unfiltered channels.
     reference : int
     """
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,1 +1,1 @@
-"""The self-noise methods in closed form, their bias and uncertainty."""
+"""Closed-form self-noise methods, their bias and uncertainty."""

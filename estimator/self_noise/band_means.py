@@ -1,13 +1,13 @@
 """Averages of a noise spectrum over bands, with the uncertainty of the average.
 
-Neighbouring frequencies are correlated under a taper, so the average over M bins is not 1/√M as
-uncertain as one. For segments of white noise under a window w, a hop apart,
+A window correlates neighbouring frequencies, so the standard deviation of an average over M bins is
+more than 1/√M of that of one bin. For segments of white noise with window w, a hop apart,
 
     E[X_a(f) conj X_b(f + k)] ∝ r(k, a − b) = Σ_n w(n) w(n + (a − b) hop) exp(2πikn / N),
 
 and periodogram ordinates averaged over many segments have the correlation
-Σ_h |r(k, h)|² / Σ_h |r(0, h)|². An estimate that is linear in the cross-spectra to first order
-inherits it.
+Σ_h |r(k, h)|² / Σ_h |r(0, h)|². To first order, an estimate that is linear in the cross-spectra has
+the same correlation.
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 N_LAGS = 8
-"""Bins further apart than this are taken as independent."""
+"""Bins this far apart or more are independent."""
 NORMAL_95 = 1.959963984540054
 CERTAIN = 4.0
 """Standard deviations above zero from which a mean has a log-normal interval."""
 LEAKY = 0.4
-"""C.o.v. above which a mean scatters by motion that leaks in, and not like a PSD."""
+"""c.o.v. above which leaking motion dominates the scatter of a mean, which is then not that of a
+PSD."""
 
 
 @dataclass(frozen=True, slots=True)
 class BandMeans:
     """Means of a spectrum over bands, shape (n_bands,), in the unit of the spectrum.
 
-    ``spread`` is the standard deviation of the mean, ``low`` and ``high`` bound its 95 % interval;
-    NaN where a band holds no number.
+    ``spread`` is the standard deviation of the mean, ``low`` and ``high`` its 95 % interval; NaN
+    for a band without estimates.
     """
 
     mean: FloatArray
@@ -48,7 +49,7 @@ class BandMeans:
 
 
 def bin_correlation(window: FloatArray, hop: int) -> FloatArray:
-    """Correlation of averaged periodogram ordinates k bins apart.
+    """Return the correlation of averaged periodogram ordinates k bins apart.
 
     Parameters
     ----------
@@ -85,24 +86,24 @@ def band_means(
     Parameters
     ----------
     noise_psd, cov : float64, shape (n_freqs,)
-        Estimate, and its standard deviation over its magnitude; NaN where nothing can be said.
+        Estimate, and its standard deviation over its magnitude; NaN if unknown.
     edges : int64, shape (n_bands + 1,)
-        Band b holds bins ``edges[b]`` to ``edges[b + 1]``; increasing.
+        Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
     correlation : float64, shape (N_LAGS,)
         From :func:`bin_correlation`.
     weights : float64, shape (n_freqs,), optional
-        Of the bins in the average: their widths, where these differ.
+        Weights of the bins in the average, such as their widths.
     quantile : float
-        Standard deviations to either end of the interval: 95 % unless given.
+        Standard deviations to either end of the interval; default: those of a 95 % interval.
     deviation : float64, shape (n_freqs,), optional
-        Standard deviation where `cov` is NaN: of estimates of zero. NaN where nothing can be said.
+        Standard deviation of estimates of zero, for which `cov` is NaN; NaN if unknown.
     added : float64, shape (n_freqs,), optional
-        What else may be in the estimate at most, and is no noise: lowers the lower end.
+        Maximum contribution to the estimate that is no noise: lowers the lower end.
 
     Returns
     -------
     BandMeans
-        The interval is log-normal where the mean is clearly positive, and symmetric elsewhere.
+        The interval is log-normal if the mean is clearly positive, otherwise symmetric.
     """
     first, last = int(edges[0]), int(edges[-1])
     starts = edges[:-1] - first
@@ -136,7 +137,7 @@ def band_means(
 def decision_interval(
     means: BandMeans, quantile: float, averages: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return an interval that holds far into the tails, for decisions on many bands at once.
+    """Return an interval that is valid far into the tails, for joint decisions on many bands.
 
     Parameters
     ----------
@@ -144,12 +145,12 @@ def decision_interval(
     quantile : float
         Standard deviations to either end.
     averages : float64, shape (n_bands,)
-        Independent averages behind each band.
+        Number of independent averages of each band.
 
     Returns
     -------
     low, high : float64, shape (n_bands,)
-        The ends of `interval_of_cov` where the mean is positive; symmetric elsewhere.
+        The ends of `interval_of_cov` if the mean is positive, otherwise symmetric.
     """
     mean, spread = means.mean, means.spread
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -166,20 +167,20 @@ def interval_of_cov(
     Parameters
     ----------
     cov : float64, shape (n,)
-        Of the mean.
+        c.o.v. of the mean.
     quantile : float
         Standard deviations to either end, z.
     averages : float64, shape (n,)
-        Independent averages behind each mean.
+        Number of independent averages of each mean.
 
     Returns
     -------
     low, high : float64, shape (n,)
         The lower end is log-normal for a small c.o.v. and symmetric for a large one, with the
-        quantile of Student's t for n averages, ``z + (z**3 + z) / (4 n)``: the c.o.v. is itself
-        estimated. The upper end is at least that of a chi-square with the same c.o.v. c,
-        ``1 / (1 - c**2 / 9 - z c / 3)**3`` (Wilson and Hilferty): a mean of few averages is below
-        the truth more often than a log-normal one.
+        quantile of Student's t for n averages, ``z + (z**3 + z) / (4 n)``, because the c.o.v. is an
+        estimate. The upper end is at least that of a chi-square variable with the same c.o.v. c,
+        ``1 / (1 - c**2 / 9 - z c / 3)**3`` (Wilson and Hilferty): a mean of few averages is too low
+        more often than a log-normal variable.
     """
     student = quantile + (quantile**3 + quantile) / (4 * np.maximum(averages, 1.0))
     like_psd = np.minimum(cov, LEAKY)
@@ -191,9 +192,9 @@ def interval_of_cov(
 
 
 def median_of_columns(values: FloatArray) -> FloatArray:
-    """Return the median of the numbers of each column, along the first axis; NaN where none is.
+    """Return the median of the finite numbers of each column (first axis); NaN without any.
 
-    As ``np.nanmedian`` does, which goes column by column.
+    A faster ``np.nanmedian``, which loops over the columns.
     """
     if not len(values):
         return np.full(values.shape[1:], np.nan)
@@ -205,12 +206,12 @@ def median_of_columns(values: FloatArray) -> FloatArray:
 
 
 def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.int64]:
-    """Return first and last + 1 bin of a band, zero frequency and Nyquist left out.
+    """Return first and last + 1 bin of a band, without zero frequency and Nyquist.
 
     Raises
     ------
     BandError
-        The band holds no bin.
+        If the band has no bin.
     """
     inner = frequency[1:-1] if frequency.size > 2 else frequency
     first, last = np.searchsorted(inner, band[0]), np.searchsorted(inner, band[1], side="right")
@@ -225,7 +226,7 @@ def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.i
 def log_edges(frequency: FloatArray, n_bands: int) -> NDArray[np.int64]:
     """Return edges of at most ``n_bands`` bands, of equal width on a logarithmic axis.
 
-    Zero frequency and Nyquist are left out; every band holds a bin at least.
+    Zero frequency and Nyquist are excluded; every band has at least one bin.
     """
     targets = np.geomspace(frequency[1], frequency[-1], n_bands + 1)
     edges = np.searchsorted(frequency, targets[:-1])

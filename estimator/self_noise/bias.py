@@ -1,8 +1,8 @@
 """Bias of the estimates by misalignment and spatial incoherence: the theory of the paper.
 
-Everything follows from the motion's part of the cross-spectral matrix, ``c[p, q]``: the cross-PSD
-of the motion in channels p and q. `motion_csm` makes it from the channels' directions
-and the motion; `incoherent_motion` from one motion felt less than perfectly alike.
+The bias follows from the motion's part of the cross-spectral matrix, ``c[p, q]``: the cross-PSD
+of the motion in channels p and q. `motion_csm` computes it from the channels' directions and the
+motion; `incoherent_motion` models motion that is not perfectly coherent.
 
 References
 ----------
@@ -22,13 +22,13 @@ from estimator.self_noise.coherency import check_dims
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
-SINGULAR = 1e-12  # of the largest singular value: what rounding leaves of zero
+SINGULAR = 1e-12  # fraction of the largest singular value that is zero within rounding
 
 
 def motion_csm(
     response: ComplexArray | FloatArray, motion: ComplexArray | FloatArray
 ) -> ComplexArray:
-    """Cross-spectral matrix of what the sensors have of the motion.
+    """Return the cross-spectral matrix of the motion in the channels.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def motion_csm(
 def incoherent_motion(
     motion: ComplexArray | FloatArray, coherency: ComplexArray | FloatArray
 ) -> ComplexArray:
-    """Cross-PSD matrices of motions that are alike but not the same.
+    """Return the cross-PSD matrices of partially coherent motions with equal PSDs.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def incoherent_motion(
 
 
 def snr(motion: ComplexArray, noise_psd: FloatArray) -> FloatArray:
-    """Signal-to-noise ratio of each channel.
+    """Return the signal-to-noise ratio of each channel.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def snr(motion: ComplexArray, noise_psd: FloatArray) -> FloatArray:
 def three_channel_bias(
     motion: ComplexArray, noise_psd: FloatArray, *, dims: tuple[int, ...]
 ) -> FloatArray:
-    """Fractional bias of the three-channel estimate; 0 where it is unbiased.
+    """Return the fractional bias of the three-channel estimate.
 
     Parameters
     ----------
@@ -105,13 +105,13 @@ def three_channel_bias(
     noise_psd : float64, shape (..., p)
         True noise.
     dims : tuple of int
-        Channels of each sensor, all the same; channel r is compared with channels r.
+        Number of channels of each sensor, all equal; channel r is compared with channels r.
 
     Returns
     -------
     float64, shape (..., p)
-        Real part of Eq. (13), the mean over all pairs of other sensors; (27) where the motion
-        is incoherent. Not finite where two others share none of the motion that the channel feels.
+        Real part of Eq. (13), mean over all pairs of other sensors; (27) for incoherent motion. Not
+        finite if two others share none of the channel's motion.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def three_channel_bias(
 def three_sensor_bias(
     motion: ComplexArray, noise_psd: FloatArray, *, dims: tuple[int, ...]
 ) -> FloatArray:
-    """Fractional bias of the three-sensor estimate; 0 while the sensors feel one motion.
+    """Return the fractional bias of the three-sensor estimate; 0 for one common motion.
 
     Parameters
     ----------
@@ -145,14 +145,14 @@ def three_sensor_bias(
     noise_psd : float64, shape (..., p)
         True noise.
     dims : tuple of int
-        Channels of each sensor, all the same.
+        Number of channels of each sensor, all equal.
 
     Returns
     -------
     float64, shape (..., p)
-        Diagonal of Eq. (30), real part (the mean with j and k swapped), and plain mean over all
-        pairs of other sensors. `estimator.self_noise.three_sensor` weighs pairs that scatter
-        more, as incoherent ones do, less.
+        Diagonal of Eq. (30), real part (the mean with j and k swapped), and unweighted mean over
+        all pairs of other sensors. `estimator.self_noise.three_sensor` gives less weight to pairs
+        with more scatter, such as incoherent ones.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def three_sensor_bias(
     Notes
     -----
     Evaluated as Eq. (29) over the noise; in terms of ``c``, ``H_i S_ZiZk S_ZjZk^-1 S_ZjZi H_i^*``
-    is ``c_ik inv(c_jk) c_ji``; the generalised inverse where the motion lacks a dimension.
+    is ``c_ik inv(c_jk) c_ji``, with the generalised inverse if the motion lacks a dimension.
     """
     d = _equal_dims(motion, noise_psd, dims)
     n = len(dims)
@@ -179,10 +179,10 @@ def three_sensor_bias(
 
 
 def _equal_dims(motion: ComplexArray, noise_psd: FloatArray, dims: tuple[int, ...]) -> int:
-    """Return the channels of each sensor; raise unless motion and noise are of such sensors."""
+    """Return the number of channels per sensor; raise an error if shapes or values are invalid."""
     check_dims(dims)
     if len(set(dims)) != 1:
-        raise EstimatorError(f"sensors of {dims} channels: the theory takes equal sensors")
+        raise EstimatorError(f"sensors of {dims} channels; expected equal numbers")
     p = sum(dims)
     if motion.shape[-2:] != (p, p) or noise_psd.shape[-1:] != (p,):
         raise EstimatorError(

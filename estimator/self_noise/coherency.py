@@ -1,7 +1,7 @@
-"""What every method checks and normalises first.
+"""Checks and normalisation of cross-spectral matrices, common to all methods.
 
-Methods work on the coherency matrix, ``csm`` divided by the root of its two channels' PSDs, so
-that units and gains neither over- nor underflow nor hide a singular matrix.
+Methods use the coherency matrix, ``csm`` divided by the root of its two channels' PSDs, so that
+units and gains cause neither overflow nor underflow and do not hide a singular matrix.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from estimator.self_noise.result import Flag, SelfNoise
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-TOLERANCE = 1e-8  # of a coherency matrix that is not quite Hermitian, and of coherence above 1
-DEAD = 1e-28  # of a channel's largest PSD: what rounding leaves of a constant
-DUPLICATE = 1e-13  # one less the coherence of a channel and its copy
-SINGULAR = 1e12  # elements of an inverse coherency from which on they are rounding only
+TOLERANCE = 1e-8  # of Hermitian symmetry, and of coherence above 1
+DEAD = 1e-28  # fraction of a channel's largest PSD that is rounding of a constant
+DUPLICATE = 1e-13  # one minus the coherence of a channel and its copy
+SINGULAR = 1e12  # magnitude from which elements of an inverse coherency are only rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +30,14 @@ class Coherency:
     Attributes
     ----------
     matrix : complex128, shape (n_freqs, n_channels, n_channels)
-        Ones on its diagonal; zero for a dead channel, a unit matrix at frequencies that are not
+        Ones on its diagonal; zero for a dead channel; a unit matrix at frequencies that are not
         `valid`.
     psd : float64, shape (n_freqs, n_channels)
         PSD of every channel in unit**2/Hz; 1 where it is zero or the frequency is not valid.
     flags : int64, shape (n_freqs, n_channels)
         DEAD_CHANNEL, DUPLICATE, NOT_FINITE and INVALID of `estimator.self_noise.result.Flag`.
     duplicates : bool, shape (n_freqs, n_channels, n_channels)
-        True where two different channels are the same.
+        True for two equal channels.
     """
 
     matrix: ComplexArray
@@ -47,22 +47,22 @@ class Coherency:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the cross-spectral matrix is finite, and one, shape (n_freqs,)."""
+        """Whether the cross-spectral matrix is finite and valid, shape (n_freqs,)."""
         return np.asarray((self.flags & (Flag.NOT_FINITE | Flag.INVALID) == 0).all(axis=1))
 
     @property
     def absent(self) -> BoolArray:
-        """Channels that are dead or repeat an earlier one, shape (n_freqs, n_channels)."""
+        """Whether a channel is dead or repeats an earlier one, shape (n_freqs, n_channels)."""
         p = self.psd.shape[1]
         copies = self.duplicates & np.tri(p, k=-1, dtype=np.bool_)
         return np.asarray(((self.flags & Flag.DEAD_CHANNEL) != 0) | copies.any(axis=2))
 
     def block(self, some: slice | IntArray) -> Coherency:
-        """Return the same for some frequencies only."""
+        """Return a copy with only some frequencies."""
         return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])
 
     def part(self, channels: list[int]) -> Coherency:
-        """Return the same for some channels only."""
+        """Return a copy with only some channels."""
         square = np.ix_(range(len(self.psd)), channels, channels)
         return Coherency(
             self.matrix[square],
@@ -73,35 +73,35 @@ class Coherency:
 
 
 def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
-    """Raise unless `dims` describes at least `n_sensors` sensors of one channel or more."""
+    """Raise an error unless `dims` describes at least `n_sensors` sensors with channels."""
     if any(d < 1 for d in dims) or (dims and np.asarray(dims).dtype.kind not in "iu"):
         raise InvalidMatrixError(
             f"dims {dims}: expected a whole number of channels for every sensor, at least one"
         )
     if len(dims) < n_sensors:
-        raise InsufficientDataError(f"{len(dims)} sensors: at least {n_sensors} are needed")
+        raise InsufficientDataError(f"{len(dims)} sensors; expected at least {n_sensors}")
 
 
 def check_averages(n_effective: float, d: int = 0) -> None:
-    """Raise unless averages are a number, and more than the motion has dimensions."""
+    """Raise an error unless the averages are finite and exceed the dimension of the motion."""
     if not (np.isfinite(n_effective) and n_effective > 0):
         raise InsufficientDataError(
             f"{n_effective:g} effective averages: expected a finite number above zero"
         )
     if n_effective <= d:
         raise InsufficientDataError(
-            f"{n_effective:g} effective averages: more than {d} are needed to tell the noise from "
-            f"a motion of {d} dimensions; record longer or use shorter segments"
+            f"{n_effective:g} effective averages; expected more than {d}, to separate noise from "
+            f"a motion of {d} dimensions: record longer or use shorter segments"
         )
 
 
 def check_frequency(frequency: FloatArray, n_freqs: int) -> FloatArray:
-    """Return frequencies as an array; raise unless they are one a matrix, finite and rising."""
+    """Return frequencies as an array; raise an error unless one per matrix, finite, ascending."""
     frequency = np.asarray(frequency, dtype=np.float64)
     if frequency.shape != (n_freqs,):
         raise InvalidMatrixError(f"frequency of shape {frequency.shape}, expected ({n_freqs},)")
     if not (np.isfinite(frequency).all() and np.all(np.diff(frequency) > 0)):
-        raise InvalidMatrixError("frequency: expected finite numbers of Hz, rising")
+        raise InvalidMatrixError("frequency: expected finite numbers in Hz, ascending")
     return frequency
 
 
@@ -118,8 +118,8 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     Raises
     ------
     InvalidMatrixError
-        If `csm` is mis-shaped, or at no frequency finite, Hermitian, and free of negative PSDs
-        and of coherence above 1. Single such frequencies, and dead or duplicated channels, are
+        If `csm` has a wrong shape, or is valid at no frequency: finite, Hermitian, without negative
+        PSDs and coherence above 1. Single invalid frequencies, and dead or duplicated channels, are
         flagged instead.
     """
     csm = np.asarray(csm, dtype=np.complex128)
@@ -138,7 +138,7 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     dead &= usable[:, None]
     psd = np.where(dead | ~usable[:, None], 1.0, psd)
     scale = np.where(dead, 0.0, 1 / np.sqrt(psd))
-    with np.errstate(over="ignore", invalid="ignore"):  # what comes of this is no coherency
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid results are flagged below
         matrix: ComplexArray = csm * scale[:, :, None]
         matrix *= scale[:, None, :]
         matrix[~usable] = np.eye(n_channels)
@@ -157,7 +157,7 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
         }
         counts = [f"{fault} at {where.sum()}" for fault, where in faults.items() if where.any()]
         raise InvalidMatrixError(
-            f"cross-spectral matrix: none of {len(csm)} frequencies can be used "
+            f"cross-spectral matrix: none of {len(csm)} frequencies is usable "
             f"({', '.join(counts)}); expected csm[f, p, q] = E[X_p conj(X_q)]"
         )
     matrix[invalid] = np.eye(n_channels)
@@ -173,7 +173,7 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
 
 
 def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
-    """Return the coherency matrix, NaN where it is no complex Wishart: at zero, or not valid."""
+    """Return the coherency matrix; NaN at 0 Hz, where it is not complex, and if not valid."""
     known = given.valid & (frequency > 0)
     return np.where(known[:, None, None], given.matrix, np.nan)
 
@@ -181,44 +181,44 @@ def testable(given: Coherency, frequency: FloatArray) -> ComplexArray:
 def from_parts(
     method: str, given: Coherency, parts: tuple[FloatArray, ...], flags: IntArray
 ) -> SelfNoise:
-    """Return to units what a method found for the coherency matrix.
+    """Return a method's result for the coherency matrix in physical units.
 
     Parameters
     ----------
     method : str
     given : Coherency
     parts : tuple of float64, shape (n_freqs, n_channels)
-        Noise, its standard deviation, and both ends of its interval, as parts of the PSD.
+        Noise, its standard deviation, and both ends of its interval, as fractions of the PSD.
     flags : int64, shape (n_freqs, n_channels)
-        All but NEGATIVE. What is flagged becomes NaN.
+        All flags except NEGATIVE. Flagged values become NaN.
     """
     unknown = flags != 0
     noise, deviation, low, high = (np.where(unknown, np.nan, given.psd * part) for part in parts)
-    with np.errstate(divide="ignore", invalid="ignore"):  # noise of zero, even known exactly
+    with np.errstate(divide="ignore", invalid="ignore"):  # noise may be zero
         cov = deviation / np.abs(noise)
     negative = np.where(noise <= 0, int(Flag.NEGATIVE), 0)
     return SelfNoise(method, noise, cov, low, high, flags | negative)
 
 
 def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
-    """Invert what can be inverted.
+    """Invert matrices, except singular ones.
 
     Parameters
     ----------
     matrices : complex128, shape (n, d, d)
-        Coherencies, so that their rounding is that of one.
+        Coherencies, with rounding errors relative to one.
 
     Returns
     -------
     inverses : complex128, shape (n, d, d)
-        Zero where the matrix is singular.
+        Zero if the matrix is singular.
     regular : bool, shape (n,)
     """
     regular = np.ones(len(matrices), dtype=bool)
     inverses: ComplexArray
     try:
         inverses = np.asarray(np.linalg.inv(matrices), dtype=np.complex128)
-    except np.linalg.LinAlgError:  # raised for the whole batch when one of it is singular
+    except np.linalg.LinAlgError:  # one singular matrix fails the whole batch
         regular = np.linalg.det(matrices) != 0
         identity = np.eye(matrices.shape[1], dtype=np.complex128)
         invertible = np.where(regular[:, None, None], matrices, identity)

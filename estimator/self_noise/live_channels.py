@@ -1,6 +1,6 @@
-"""Channels and sensors that take part in a test: not dead ones, and not copies of others.
+"""Live channels and sensors of a test: neither dead nor copies of others.
 
-The other channels are estimated as if those did not exist.
+Live channels are estimated as if the other channels did not exist.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Presence:
-    """The part of a bench that takes part.
+    """The live channels and sensors of a bench.
 
     Attributes
     ----------
     channels : tuple of int
-        Those that are alive, and no copies of earlier ones.
+        Channels that are neither dead nor copies of earlier ones.
     sensors : tuple of int
-        Those with any such channel.
+        Sensors with a live channel.
     dims : tuple of int
-        How many of them each of `sensors` has.
+        Number of live channels of each of `sensors`.
     whole : tuple of int
-        Sensors of which every channel takes part.
+        Sensors with only live channels.
     """
 
     channels: tuple[int, ...]
@@ -37,20 +37,20 @@ class Presence:
     whole: tuple[int, ...]
 
     def spread(self, values: FloatArray, n_channels: int) -> FloatArray:
-        """Return values of these channels, shape (n_freqs, …), with NaN for all others."""
+        """Return values of live channels, shape (n_freqs, …), extended by NaN for all others."""
         found = np.full((len(values), n_channels), np.nan)
         found[:, list(self.channels)] = values
         return found
 
 
 def presence(given: Coherency, dims: tuple[int, ...]) -> Presence:
-    """Say which channels take part, at most frequencies.
+    """Return the channels that are live at most frequencies.
 
     Parameters
     ----------
     given : Coherency
     dims : tuple of int
-        Channels of each sensor.
+        Number of channels of each sensor.
     """
     absent = given.absent[given.valid].mean(axis=0) > 0.5
     sensor_of = np.repeat(np.arange(len(dims)), dims)

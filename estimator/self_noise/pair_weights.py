@@ -1,20 +1,20 @@
-"""Weights of the pairs of other sensors, where a channel can be compared with more than one pair.
+"""Weights of the pairs of other sensors, for channels comparable with more than one pair.
 
 A pair (j, k) estimates the noise of channel r with the variance
 
     ``v = (G_jj G_kk + Re G_jk**2) / (2 n)``,
 
-G the spectra of the two residuals ``u`` and ``v`` of `estimator.self_noise.three_sensor`. One poor
-sensor spoils every pair it belongs to, and the plain mean over the pairs with it. So pairs are
+with G the spectra of the two residuals ``u`` and ``v`` of `estimator.self_noise.three_sensor`. A
+poor sensor increases the variance of all its pairs, and so of their unweighted mean. So pairs are
 weighted by ``1 / v``.
 
-Weights taken from a frequency's own averages would favour pairs whose residuals came out small,
-and bias the estimate. The weights at a frequency are therefore those of its neighbours, itself and
-the two beside it (correlated with it under a taper) left out. ``ln v`` is averaged, so that neither
-resonances nor the level of the noise weigh one neighbour more than another.
+Weights from a frequency's own averages would favour pairs with small residuals, and bias the
+estimate. The weights at a frequency therefore follow from its neighbours, without the frequency
+itself and the two next to it (correlated by the window). ``ln v`` is averaged, so that neither
+resonances nor the level of the noise favour single neighbours.
 
-Variances that differ by no more than `EQUAL` count as the same: then the scatter of the variances
-leaves equal sensors with equal weights.
+Variances with a ratio up to `EQUAL` count as equal, so that equal sensors have equal weights in
+spite of scatter.
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NEIGHBOURS = 16
-"""Sampled frequencies to either side whose variances are averaged."""
+"""Number of sampled frequencies on either side whose variances are averaged."""
 DENSE = 32
-"""Below this bin all are sampled, above it one in bin / 32: 22 an octave."""
+"""Below this bin all are sampled, above it one in bin / 32: 22 per octave."""
 BESIDE = 1
-"""Bins next to a frequency that share its scatter, and are left out with it."""
+"""Number of excluded bins on either side of a frequency: they share its scatter."""
 FEWEST = 8
-"""With fewer neighbours than this the pairs weigh the same."""
+"""Minimum number of neighbours; with fewer, pairs have equal weights."""
 EQUAL = 1.5
-"""Ratio of variances up to which pairs weigh the same."""
+"""Ratio of variances up to which pairs have equal weights."""
 UNEQUAL = 3.0
-"""Ratio of variances from which on weights are 1 / variance; gradual in between."""
+"""Ratio of variances from which weights are 1 / variance; gradual between both ratios."""
 
 
 def predictors(towards: ComplexArray, inverses: ComplexArray, m: int) -> ComplexArray:
-    """Return ``P = S_ik inv(S_jk)``: what takes the motion of row r off by sensor j.
+    """Return ``P = S_ik inv(S_jk)``, which predicts the motion of row r from sensor j.
 
     Parameters
     ----------
     towards : complex128, shape (n_freqs, n_rows, m * d)
         Cross-spectra of the rows with the channels of m other sensors.
     inverses : complex128, shape (n_freqs, m * d, m * d)
-        ``inv(S_jk)`` in the rows of k and the columns of j; zero where j and k cannot be paired.
+        ``inv(S_jk)`` in the rows of k and the columns of j; zero if j and k cannot be paired.
     m : int
 
     Returns
     -------
     complex128, shape (n_freqs, m, n_rows, m, d)
-        By k, row and j.
+        Indexed by k, row and j.
     """
     n_freqs, n_rows, n_columns = towards.shape
     d = n_columns // m
@@ -72,9 +72,9 @@ def log_variance(
     power: FloatArray,
     usable: BoolArray,
 ) -> FloatArray:
-    """Return ``ln(n v)`` of the pairs' estimates, NaN where a pair cannot be used.
+    """Return ``ln(n v)`` of the pairs' estimates; NaN for unusable pairs.
 
-    Pairs j < k come as `numpy.triu_indices` lists them.
+    Pairs j < k are in the order of `numpy.triu_indices`.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def log_variance(
 
 
 def sampled(n_freqs: int) -> IntArray:
-    """Return the frequencies at which variances are looked at: all low ones, fewer above."""
+    """Return the frequencies at which variances are computed: all low ones, fewer above."""
     bins, at = [], 0
     while at < n_freqs:
         bins.append(at)
@@ -122,9 +122,9 @@ class PairWeights:
     ----------
     n_freqs : int
     variances : callable
-        Takes frequencies, int64 of shape (n,), and returns their `log_variance`.
+        Maps frequencies, int64 of shape (n,), to their `log_variance`.
     chunk : int
-        Frequencies to ask for at a time.
+        Number of frequencies per call.
     """
 
     def __init__(
@@ -141,9 +141,9 @@ class PairWeights:
         self._counts = np.concatenate([zero, known.cumsum(axis=0)])
 
     def at(self, first: int, usable: BoolArray) -> FloatArray | None:
-        """Return weights of consecutive frequencies, zero where a pair cannot be used.
+        """Return weights of consecutive frequencies, zero for unusable pairs.
 
-        None where all pairs weigh the same.
+        Return None if all weights are equal.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class PairWeights:
         Returns
         -------
         float64, shape (n_freqs, n_rows, m, m)
-            Symmetric; they add up to one, or to zero where no pair can be used.
+            Symmetric; their sum is one, or zero if no pair is usable.
         """
         at = first + np.arange(len(usable))
         near = [np.searchsorted(self._bins, at + step) for step in (-BESIDE, BESIDE + 1)]

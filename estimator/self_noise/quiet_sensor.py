@@ -1,22 +1,22 @@
 """Noise of a quiet sensor among noisy ones, constant over a band, from its partners' residuals.
 
-Where the other sensors are far noisier than the target, single frequencies show no noise of the
-target at all, and the mean of estimates that are kept above zero is too high. Together the
-frequencies of a band show it. Sensor j, regressed on the target q,
+If the other sensors are far noisier than the target, the target's noise is not significant at
+single frequencies, and the mean of estimates limited to positive values is too high. All
+frequencies of a band together determine the noise. Sensor j, regressed on the target q,
 
     ``X_j = B_j X_q + e_j``,   ``B_j = S_jq inv(S_qq)``,
 
-leaves residuals in which the noise of q, psi, is what sensors j and k have in common:
+leaves residuals in which the noise psi of q is common to sensors j and k:
 
     ``E[e_j e_k^*] = (1 - d / n) B_j psi B_k^*``
 
-but for a factor ``1 + psi / motion in q``, which is taken off at the end. B and the residuals are
-independent, so the weighted least squares of psi on the residuals of all pairs and frequencies have
-no bias once the scatter of B, ``d_j inv(S_qq) / n``, is taken off the normal matrix: also where the
-partners' motion is far below their noise. The result is a sum over many frequencies: normal, and
-negative where it comes out so.
+up to a factor ``1 + psi / motion in q``, which is removed at the end. B and the residuals are
+independent, so the weighted least squares of psi on the residuals of all pairs and frequencies are
+unbiased after subtraction of the scatter of B, ``d_j inv(S_qq) / n``, from the normal matrix, also
+if the partners' motion is far below their noise. The result is a sum over many frequencies:
+normally distributed, and possibly negative.
 
-For targets far quieter than their partners only: the scatter of psi itself is not in the interval.
+Only for targets far quieter than their partners: the interval does not include the scatter of psi.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
 LEAST = 0.9
-"""Of the power: the most that an estimate can be below zero."""
+"""Largest magnitude of a negative estimate, as a fraction of the power."""
 QUIETER = 0.2
-"""Share of the second-best partner's residuals that the target's noise may be, at most."""
+"""Maximum noise of the target, as a fraction of the second-best partner's residuals."""
 SMALLEST = 1e-12
-"""Of the largest eigenvalue of the normal matrix: below it nothing can be said."""
+"""Smallest usable eigenvalue of the normal matrix, as a fraction of the largest."""
 
 
 def quiet_sensor_noise(
@@ -49,34 +49,35 @@ def quiet_sensor_noise(
     correlation: FloatArray,
     quantile: float = NORMAL_95,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean noise of a sensor's channels over a band, and its interval.
+    """Return the mean noise of a sensor's channels over a band, and its interval.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         One-sided cross-spectral matrix of the band in unit**2/Hz; frequencies that are not finite
-        are left out.
+        are ignored.
     dims : tuple of int
-        Channels of each sensor. The target must have as many as the motion has dimensions.
+        Number of channels of each sensor; that of the target must be the dimension of the motion.
     sensor : int
         The target.
     n_effective : float64, shape (n_freqs,) or float
-        Independent averages.
+        Number of independent averages.
     correlation : float64, shape (n_lags,)
-        Of neighbouring frequencies, `estimator.self_noise.band_means.bin_correlation`.
+        Correlation of neighbouring frequencies, from
+        `estimator.self_noise.band_means.bin_correlation`.
     quantile : float
-        Standard deviations to either end of the interval: 95 % unless given.
+        Standard deviations to either end of the interval; default: those of a 95 % interval.
 
     Returns
     -------
     noise, low, high : float64, shape (dims[sensor],)
-        Estimate and ends of its interval in unit**2/Hz; NaN where nothing can be said, or where
-        the target is not far quieter than its partners.
+        Estimate and ends of its interval in unit**2/Hz; NaN if unknown, or if the target is not far
+        quieter than its partners.
 
     Raises
     ------
     InsufficientDataError
-        If the averages are no more than the target's channels.
+        If the averages do not exceed the target's number of channels.
     """
     first = np.cumsum([0, *dims])
     own = np.arange(first[sensor], first[sensor + 1])
@@ -91,7 +92,7 @@ def quiet_sensor_noise(
     S = csm[good]
     scale = np.sqrt(np.einsum("fpp->fp", S[:, own][:, :, own]).real.mean(axis=0))
     motion = S[:, own[:, None], own] / np.outer(scale, scale)
-    left = n / (n - d)  # what the regression takes from the residuals
+    left = n / (n - d)  # the regression reduces the residuals by the inverse
     inverse = np.linalg.pinv(motion, hermitian=True)
     transfer, power, seen, free = [], [], [], []
     for other in others:
@@ -127,7 +128,7 @@ def quiet_sensor_noise(
     share = [float((each.real.diagonal(axis1=1, axis2=2) @ largest).mean()) for each in seen]
     if sorted(s / len(other) for s, other in zip(share, others, strict=True))[1] > QUIETER:
         return unknown, unknown, unknown
-    # psi (1 + psi / motion) was found; the motion is what is left of the power
+    # the solution is psi (1 + psi / motion), where the motion is the power minus psi
     level = 1 / np.einsum("fii->fi", inverse).real.mean(axis=0)
     ends = (np.maximum(noise + z * error, -LEAST * level) for z in (0.0, -quantile, quantile))
     middle, low, high = (scale**2 * end * level / (level + end) for end in ends)

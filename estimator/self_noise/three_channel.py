@@ -1,4 +1,4 @@
-"""The three-channel method of Sleeman and co-workers: the baseline of the field."""
+"""The three-channel method of Sleeman and co-workers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 def three_channel(
     csm: ComplexArray, *, dims: tuple[int, ...], n_effective: float, correct: bool = True
 ) -> SelfNoise:
-    """Self-noise PSD from three or more channels that point the same way.
+    """Return the self-noise PSD from three or more parallel channels.
 
-    Channel r of a sensor is compared with channels r of all other sensors, and nothing else.
+    Channel r of a sensor is compared only with channels r of all other sensors.
 
     Parameters
     ----------
@@ -28,10 +28,10 @@ def three_channel(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor.
     dims : tuple of int
-        Channels of each sensor. Where fewer than two other sensors have a channel r, channel r
-        is flagged NO_COUNTERPART.
+        Number of channels of each sensor. If fewer than two other sensors have a channel r,
+        channel r is flagged NO_COUNTERPART.
     n_effective : float
-        Independent averages in `csm`.
+        Number of independent averages in `csm`.
     correct : bool
         Divide by ``1 - 1 / n_effective``, which removes the small-sample bias.
 
@@ -48,9 +48,9 @@ def three_channel(
 
     Notes
     -----
-    The real part of Eq. (6) of Zhu, Au and Wang; the plain mean over all pairs of other
-    channels, also where some sensors are poor, as the method is published.
-    Biased when the channels do not point the same way: see `estimator.self_noise.bias`.
+    The real part of Eq. (6) of Zhu, Au and Wang; the unweighted mean over all pairs of other
+    channels, also with poor sensors, as published.
+    Biased if the channels are not parallel: see `estimator.self_noise.bias`.
     """
     check_dims(dims)
     given = coherency(csm, dims)

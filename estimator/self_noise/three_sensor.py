@@ -6,10 +6,10 @@ the real part of ``E[u conj(v)]`` of two residuals,
     ``u = X_ir - P_r X_j``,   ``P = S_ik inv(S_jk)``,
     ``v = X_ir - Q_r X_k``,   ``Q = S_ij inv(S_kj)``,
 
-what is left of the channel when the motion is taken off by sensor j, and by sensor k. The same two
-rows, ``u = a X`` and ``v = b X``, are its differential: ``M = (b^H a + a^H b) / 2``.
-With more than three sensors the estimate is a weighted mean over all pairs (j, k), and so is M:
-pairs of poor sensors weigh less (`estimator.self_noise.pair_weights`).
+the channel minus its predictions by sensor j and by sensor k. The same two rows, ``u = a X`` and
+``v = b X``, give its differential: ``M = (b^H a + a^H b) / 2``. With more than three sensors the
+estimate is a weighted mean over all pairs (j, k), and so is M: pairs of poor sensors have less
+weight (`estimator.self_noise.pair_weights`).
 
 Only j and k need as many channels as the motion has dimensions; the target may have fewer.
 """
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 
-FREQUENCIES = 128  # worked on at a time: what the processor's cache holds
-ELEMENTS = 150_000  # of predictors, where more than one pair of sensors is weighted
+FREQUENCIES = 128  # number of frequencies per step: fits into the processor's cache
+ELEMENTS = 150_000  # maximum number of elements of predictors per step, for weighted pairs
 
 
 def three_sensor(
     csm: ComplexArray, *, dims: tuple[int, ...], n_effective: float, correct: bool = True
 ) -> SelfNoise:
-    """Self-noise PSD of every channel of three or more collocated sensors, however oriented.
+    """Return the self-noise PSD of every channel of three or more sensors of any orientation.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def three_sensor(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor.
     dims : tuple of int
-        Channels of each sensor. A target is compared with the two or more other sensors that
-        have most channels, ``d`` of them: the motion must have no more than d dimensions, or the
-        leading d channels must span the same space in all. Channels of the target beyond these
-        d are flagged NO_COUNTERPART.
+        Number of channels of each sensor. A target is compared with the two or more other sensors
+        with most channels, ``d`` each: the motion must have at most d dimensions, or the first d
+        channels of all sensors must span the same space. Further channels of the target are flagged
+        NO_COUNTERPART.
     n_effective : float
-        Independent averages in `csm`.
+        Number of independent averages in `csm`.
     correct : bool
         Divide by ``1 - d / n_effective``, which removes the small-sample bias.
 
@@ -79,7 +79,7 @@ def three_sensor(
     Notes
     -----
     Eq. (26) of [1]_; the mean over all pairs of other sensors, weighted by the inverse of their
-    variance at neighbouring frequencies. With fewer than eight neighbours pairs weigh the same.
+    variance at neighbouring frequencies. With fewer than eight neighbours all weights are equal.
 
     References
     ----------
@@ -93,7 +93,7 @@ def three_sensor(
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """Channels whose motion is inferred from sensors of d channels.
+    """Channels whose motion is predicted by sensors of d channels.
 
     Attributes
     ----------
@@ -103,9 +103,9 @@ class _Group:
     target : int64, shape (n_rows,)
         Sensor of each row.
     columns : int64, shape (m, d)
-        Channels of the sensors they are compared with.
+        Channels of the m sensors for comparison.
     others : bool, shape (n_rows, m)
-        Whether that is another sensor.
+        Whether the sensor for comparison differs from the row's own sensor.
     """
 
     d: int
@@ -116,16 +116,16 @@ class _Group:
 
     @property
     def several_pairs(self) -> bool:
-        """Whether any channel can be compared with more than one pair."""
+        """Whether any channel is comparable with more than one pair."""
         return bool(self.others.sum(axis=1).max() > 2)
 
 
 def estimate(
     given: Coherency, *, dims: tuple[int, ...], n_effective: float, correct: bool, weighted: bool
 ) -> SelfNoise:
-    """Do what `three_sensor` does, from a matrix that has been checked and normalised.
+    """Return the result of `three_sensor` for a checked and normalised matrix.
 
-    Without `weighted` all pairs of other sensors weigh the same.
+    Without `weighted` all pairs of other sensors have equal weights.
     """
     groups = _groups(dims)
     for group in groups:
@@ -144,7 +144,7 @@ def estimate(
 
     if len(blocks) == 1:
         found = [of_block(0)]
-    else:  # each thread its share at once: one by one they would wait for one another
+    else:  # one contiguous share per thread: single blocks would make threads wait
         share = -(-len(blocks) // THREADS)
         shares = [blocks[first : first + share] for first in range(0, len(blocks), share)]
         with ThreadPoolExecutor(THREADS) as pool:
@@ -171,7 +171,7 @@ def _groups(dims: tuple[int, ...]) -> list[_Group]:
 
 
 def _weights(given: Coherency, group: _Group) -> PairWeights | None:
-    """Return the weights of pairs; None where no channel has more than one pair."""
+    """Return the weights of pairs; None if no channel has more than one pair."""
     if not group.several_pairs:
         return None
 
@@ -184,7 +184,7 @@ def _weights(given: Coherency, group: _Group) -> PairWeights | None:
 
 
 def _at_a_time(group: _Group) -> int:
-    """Return how many frequencies are worked on at a time."""
+    """Return the number of frequencies per step."""
     if not group.several_pairs:
         return FREQUENCIES
     m, d = group.columns.shape
@@ -200,7 +200,7 @@ def _estimate(
     n_effective: float,
     correct: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
-    """Noise, its deviation and interval, all in parts of the channel's PSD; flags."""
+    """Return noise, deviation and interval as fractions of the channel's PSD, and flags."""
     noise, deviation, low, high = (np.full(given.psd.shape, np.nan) for _ in range(4))
     flags = given.flags.copy()
     covered = np.zeros(sum(dims), dtype=np.bool_)
@@ -222,28 +222,28 @@ def _estimate(
 
 
 def _shared(dims: tuple[int, ...], i: int) -> int:
-    """Return how many channels two or more sensors besides sensor i have."""
+    """Return the largest number of channels that two or more sensors other than i have."""
     return sorted((n for j, n in enumerate(dims) if j != i), reverse=True)[1]
 
 
 @dataclass(frozen=True, slots=True)
 class _Spectra:
-    """What the estimates of a group's channels are made of.
+    """Inputs for the estimates of a group's channels.
 
     Attributes
     ----------
     power : float64, shape (n_freqs, n_rows)
         PSD of every row.
     between : complex128, shape (n_freqs, m * d, m * d)
-        Cross-spectra among the sensors that rows are compared with.
+        Cross-spectra among the sensors for comparison.
     towards : complex128, shape (n_freqs, n_rows, m * d)
-        Cross-spectra of the rows with these.
+        Cross-spectra of the rows with these sensors.
     inverses : complex128, shape (n_freqs, m * d, m * d)
-        ``inv(S_jk)`` in the rows of k and the columns of j; zero for pairs that cannot be used.
+        ``inv(S_jk)`` in the rows of k and the columns of j; zero for unusable pairs.
     paired : float64, shape (n_freqs, m, m)
-        One where a pair can be used.
+        One for usable pairs, else zero.
     usable : bool, shape (n_freqs or 1, n_rows, m)
-        Whether a sensor can be used for a row.
+        Whether a sensor is usable for a row.
     """
 
     power: FloatArray
@@ -255,7 +255,7 @@ class _Spectra:
 
     @property
     def pairs(self) -> BoolArray:
-        """Pairs j < k that can be used for a row, shape (n_freqs, n_rows, n_pairs)."""
+        """Return whether pair j < k is usable for a row, shape (n_freqs, n_rows, n_pairs)."""
         j, k = np.triu_indices(self.paired.shape[1], 1)
         both = self.usable[:, :, j] & self.usable[:, :, k]
         return np.asarray(both & (self.paired[:, None, j, k] > 0))
@@ -263,12 +263,12 @@ class _Spectra:
 
 def _spectra(given: Coherency, group: _Group) -> _Spectra:
     S, (m, d), columns, rows = given.matrix, group.columns.shape, group.columns.ravel(), group.rows
-    between, towards = (  # as fancy indices leave them, frequencies would run fastest
+    between, towards = (  # fancy indexing would make the frequency axis the fastest
         np.ascontiguousarray(S[:, channels[:, None], columns]) for channels in (columns, rows)
     )
     inverses, paired = _inverses(given, between, columns, m)
     usable = group.others[None]
-    if given.duplicates.any():  # a copy of one of the target's channels spoils that sensor for it
+    if given.duplicates.any():  # a sensor with a copy of a target's channel is unusable for it
         copies = given.duplicates[:, rows[:, None], columns].reshape(len(S), len(rows), m, d)
         usable = usable & ~((group.target[:, None] == group.target) @ copies.any(axis=3))
     power = np.einsum("fpp->fp", S).real[:, rows]
@@ -278,16 +278,16 @@ def _spectra(given: Coherency, group: _Group) -> _Spectra:
 def _mean_of_pairs(
     given: Coherency, group: _Group, weights: PairWeights | None, first: int
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Mean of (26) over all pairs of other sensors, the moments of that mean, and where it is one.
+    """Return the mean of (26) over all pairs of other sensors, its moments, and its validity.
 
     Parameters
     ----------
     given : Coherency
     group : _Group
     weights : PairWeights, optional
-        All pairs weigh the same without.
+        Without weights all pairs count equally.
     first : int
-        Number of the first frequency of `given` in the matrix that `weights` are of.
+        Index of the first frequency of `given` in the matrix of `weights`.
 
     Returns
     -------
@@ -295,7 +295,7 @@ def _mean_of_pairs(
     traces : float64, shape (3, n_freqs, n_rows)
         `estimator.self_noise.uncertainty.moments` of the noise.
     possible : bool, shape (n_freqs, n_rows)
-        False where no pair can be used, and nothing can be said.
+        False if no pair is usable.
     """
     of = _spectra(given, group)
     (m, d), (n_freqs, n_rows) = group.columns.shape, of.power.shape
@@ -317,9 +317,9 @@ def _mean_of_pairs(
         ).reshape(of.towards.shape)
     own = np.einsum("frkc->frk", (motion * of.towards.conj()).reshape(n_freqs, n_rows, m, d))
     noise = of.power - np.einsum("frj,frj->fr", share, own.real)
-    # One residual a sensor: those of sensor j paired with different k differ by their sampling
-    # error only, and their mean is taken. M = W^H omega W, with W the rows of these residuals and
-    # omega half of each pair's weight; so tr((M S)^k) = tr((omega G)^k), G = W S W^H.
+    # One residual per sensor: those of sensor j paired with different k differ only by sampling
+    # error, and are averaged. M = W^H omega W, with W the rows of these residuals and omega half of
+    # each pair's weight; so tr((M S)^k) = tr((omega G)^k), G = W S W^H.
     traces = moments(_residuals(of.between, motion, own, of.power), omega)
     return noise, traces, np.asarray(share.any(axis=2))
 
@@ -327,14 +327,14 @@ def _mean_of_pairs(
 def _inverses(
     given: Coherency, between: ComplexArray, columns: IntArray, m: int
 ) -> tuple[ComplexArray, FloatArray]:
-    """Invert S_jk of all pairs of m sensors; zero for a pair that cannot be used.
+    """Invert S_jk of all pairs of m sensors; zero for unusable pairs.
 
     Returns
     -------
     inverses : complex128, shape (n_freqs, m * d, m * d)
         ``inv(S_jk)`` in the rows of k and the columns of j.
     paired : float64, shape (n_freqs, m, m)
-        One where a pair can be used.
+        One for usable pairs, else zero.
     """
     n_freqs, d = len(between), len(columns) // m
     j, k = np.array(list(itertools.combinations(range(m), 2))).T
@@ -360,7 +360,7 @@ def _inverses(
 def _residuals(
     between: ComplexArray, motion: ComplexArray, own: ComplexArray, power: FloatArray
 ) -> ComplexArray:
-    """Spectra ``G[f, r, j, k] = E[u_j conj(u_k)]`` of what is left of row r without j, and k."""
+    """Return the spectra ``G[f, r, j, k] = E[u_j conj(u_k)]`` of the residuals of row r."""
     n_freqs, n_rows, m = own.shape
     n_columns = motion.shape[2]
     by_sensor = motion.reshape(n_freqs, n_rows, m, -1).swapaxes(1, 2)

@@ -1,4 +1,4 @@
-"""The two-channel method: the baseline users know, when the channels' responses are known."""
+"""The two-channel method, for channels with known responses."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def two_channel(
     *,
     dims: tuple[int, ...],
     n_effective: float,
-    correct: bool = True,  # noqa: ARG001 - linear in the matrix: there is no bias to remove
+    correct: bool = True,  # noqa: ARG001 - linear in the matrix, so without bias
     response: ComplexArray | None = None,
 ) -> SelfNoise:
-    """Self-noise PSD from two or more parallel channels with known gains.
+    """Return the self-noise PSD from two or more parallel channels with known gains.
 
-    Channel r of a sensor is compared with channels r of all other sensors, and nothing else.
+    Channel r of a sensor is compared only with channels r of all other sensors.
 
     Parameters
     ----------
@@ -34,16 +34,15 @@ def two_channel(
         One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
         channels grouped by sensor.
     dims : tuple of int
-        Channels of each sensor. Where no other sensor has a channel r, channel r is flagged
+        Number of channels of each sensor. If no other sensor has a channel r, channel r is flagged
         NO_COUNTERPART.
     n_effective : float
-        Independent averages in `csm`.
+        Number of independent averages in `csm`.
     correct : bool
-        As for the other methods; this one has no small-sample bias.
+        No effect: this method has no small-sample bias.
     response : complex128, shape (n_channels,) or (n_freqs, n_channels), optional
-        What each channel makes of one unit of motion, relative to any reference they share; by
-        default all are the same. An error of one part in a hundred of it leaves one part in a
-        hundred of the *motion* in the noise.
+        Response of each channel to one unit of motion, relative to a common reference; default:
+        equal responses. An error of 1 % leaves 1 % of the *motion* in the noise.
 
     Returns
     -------
@@ -56,12 +55,12 @@ def two_channel(
     InsufficientDataError
         With fewer than two sensors, or ``n_effective <= 1``.
     EstimatorError
-        If `response` has another shape, is not finite or is zero somewhere.
+        If `response` has another shape, is not finite, or has zeros.
 
     Notes
     -----
-    ``S_ii - Re(S_ij conj(h_i / h_j))`` [1]_, the mean over all j: the spectrum between the channel
-    and what is left of it when the mean of the others is taken off.
+    ``S_ii - Re(S_ij conj(h_i / h_j))`` [1]_, mean over all j: the cross-spectrum between the
+    channel and its residual after subtraction of the others' mean.
 
     References
     ----------
@@ -102,5 +101,5 @@ def _gain(response: ComplexArray | None, shape: tuple[int, ...]) -> ComplexArray
     if gain.shape not in {shape, shape[1:]}:
         raise EstimatorError(f"response of shape {gain.shape}, expected {shape} or {shape[1:]}")
     if not np.isfinite(gain).all() or not gain.all():
-        raise EstimatorError("response: must be finite, and zero nowhere")
+        raise EstimatorError("response: expected finite numbers without zeros")
     return np.broadcast_to(gain, shape)

@@ -5,10 +5,11 @@ An estimate that scales with the cross-spectral matrix S is, to first order, a l
 cumulants are those of ``tr(M S)`` with M fixed: variance ``t2 / n`` and third cumulant
 ``2 t3 / n**2``, where ``t_k = tr((M S)**k)``.
 
-An interval needs the variance at *other* values of the noise than the one found. Along the least
-favourable direction, ``S + delta S M S / t2``, in which the noise changes by delta and the data can
-tell least, the variance is ``(t2 + 2 (t3 / t2) delta + (t4 / t2**2) delta**2) / n``: the square of
-the noise for a PSD, and constant where leaking motion dominates.
+An interval needs the variance at *other* values of the noise than the estimate. Along the least
+favourable direction, ``S + delta S M S / t2``, in which the noise changes by delta with the
+smallest effect on the data, the variance is
+``(t2 + 2 (t3 / t2) delta + (t4 / t2**2) delta**2) / n``: proportional to the square of the noise
+for a PSD, and constant if leaking motion dominates.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ if TYPE_CHECKING:
 
 Z95 = 1.959963984540054  # standard normal quantile of 97.5 %
 
-BOUNDLESS = 300.0  # in ln noise: as far as an interval is widened, short of overflow
+BOUNDLESS = 300.0  # maximum widening of an interval in ln noise, below overflow
 
 
 def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> FloatArray:
-    """Traces from which the scatter of an estimate follows.
+    """Return the traces that determine the scatter of an estimate.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ def moments(csm: ComplexArray, differential: ComplexArray | FloatArray) -> Float
 
 
 def _product(a: ComplexArray | FloatArray, b: ComplexArray) -> ComplexArray:
-    """Multiply many small matrices in real arithmetic, which takes half the time."""
+    """Multiply many small matrices in real arithmetic, in half the time."""
     b = np.ascontiguousarray(b)
     if np.iscomplexobj(a):  # column by column, real part times b and imaginary part times i b
         a = np.ascontiguousarray(a).view(np.float64)
@@ -66,32 +67,32 @@ def _product(a: ComplexArray | FloatArray, b: ComplexArray) -> ComplexArray:
 def score_interval(
     noise: FloatArray, traces: FloatArray, *, averages: float
 ) -> tuple[FloatArray, FloatArray]:
-    """95 % interval of an estimate whose variance depends on the value sought.
+    """Return the 95 % interval of an estimate whose variance depends on the true value.
 
     Parameters
     ----------
     noise : float64, shape (...)
         The estimate.
     traces : float64, shape (3, ...)
-        What `moments` returns, in the square, cube and fourth power of the unit of `noise`.
+        From `moments`, in the square, cube and fourth power of the unit of `noise`.
     averages : float
-        Effective averages less those that the estimate has used up.
+        Effective averages minus those used up by the estimate.
 
     Returns
     -------
     low, high : float64, shape (...)
-        The values that lie within 1.96 of *their own* standard deviations of the estimate
-        (Wilson's construction), 1.96 being corrected for skewness (Cornish and Fisher) and for
-        the scatter of the deviation itself: not symmetric, the chi-squared interval where the
-        estimate is a mere PSD, and just as good where it is negative. `high` is infinite where
-        averages are too few to bound it.
+        The values within 1.96 of *their own* standard deviations of the estimate (Wilson's
+        construction), where 1.96 is corrected for skewness (Cornish and Fisher) and for the scatter
+        of the deviation. The interval is asymmetric: the chi-squared interval if the estimate is a
+        single PSD, and also valid for negative estimates. `high` is infinite if the averages are
+        too few to bound it.
 
     Notes
     -----
-    ``t2`` has the variance ``4 t4 / n``, of which its dependence on the value sought, above,
-    explains ``4 t3**2 / (t2 n)``. The rest is that of a chi-square of
+    ``t2`` has the variance ``4 t4 / n``, of which its dependence on the true value, above, explains
+    ``4 t3**2 / (t2 n)``. The rest is that of a chi-square variable with
     ``nu = n / (2 (t4 / t2**2 - t3**2 / t2**3))`` degrees of freedom, so that 1.96 becomes the
-    quantile of Student's t, ``z + (z**3 + z) / (4 nu)``. For a mere PSD nu is infinite.
+    quantile of Student's t, ``z + (z**3 + z) / (4 nu)``. For a single PSD nu is infinite.
     """
     t2, t3, t4 = traces
     certain = t2 <= 0
@@ -108,7 +109,7 @@ def score_interval(
         square = 1 - kappa * curvature
         root = np.sqrt(np.maximum((kappa * slope) ** 2 + square * kappa * t2, 0.0))
         reach = root - side * kappa * slope
-        # with one average or less the expansion for skewness has lost its meaning
+        # with one average or less the expansion for skewness is invalid
         bounded = (reach > 0) & ((side < 0) | ((square > 0) & (averages > 1)))
         distance = np.full_like(t2, np.inf)
         np.divide(kappa * t2, reach, out=distance, where=bounded)
@@ -117,20 +118,20 @@ def score_interval(
 
 
 def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
-    """Allow for half as many degrees of freedom where the spectra are real-valued.
+    """Correct the uncertainty for half the degrees of freedom of real-valued spectra.
 
     Parameters
     ----------
     found : SelfNoise
-        With c.o.v. and intervals for complex spectra of as many averages.
+        With c.o.v. and intervals for complex spectra.
     real : bool, shape (n_freqs,)
-        At 0 Hz and the Nyquist frequency.
+        True at 0 Hz and the Nyquist frequency.
 
     Returns
     -------
     SelfNoise
-        There with the c.o.v. times the root of two and the interval for half as many averages:
-        in the logarithm where it is more symmetric there, as that of a chi-square.
+        At these frequencies, with the c.o.v. times the root of two and the interval for half the
+        averages: in the logarithm if it is more symmetric there, like that of a chi-square.
 
     Notes
     -----
@@ -140,7 +141,7 @@ def widened(found: SelfNoise, real: BoolArray) -> SelfNoise:
     noise, cov, low, high = (
         part[real] for part in (found.noise_psd, found.cov, found.low, found.high)
     )
-    above = (low > 0) & (noise > 0) & np.isfinite(high)  # else there is no logarithm
+    above = (low > 0) & (noise > 0) & np.isfinite(high)  # the logarithm exists
     unit, least, most = (np.where(above, part, 1.0) for part in (noise, low, high))
     ends, logs = (noise - low, high - noise), (np.log(unit / least), np.log(most / unit))
     in_log = above & (_skew(*logs) < _skew(*ends))
@@ -162,9 +163,9 @@ def _skew(down: FloatArray, up: FloatArray) -> FloatArray:
 def _doubled(
     down: FloatArray, up: FloatArray, deviation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Reach of an interval both ways for half the averages.
+    """Return the widths of an interval to both sides for half the averages.
 
-    In 1.96 deviations grow with the root of two; what is added to them, and skewness, with two.
+    The 1.96 deviations increase by the root of two; their correction, and skewness, by two.
     """
     known = np.isfinite(up) & np.isfinite(deviation) & (deviation > 0)
     reach = np.where(known, up, 0.0)

@@ -1,1 +1,1 @@
-"""Cross-spectral matrices by Welch averages: windows, octaves, rejected segments."""
+"""Cross-spectral matrices by Welch's method: windows, octaves, rejection of segments."""

@@ -1,11 +1,11 @@
-"""Filters that make channels with different responses answer alike, before they are windowed.
+"""Filters that equalise channels with different responses, before windowing.
 
 Theory of operation
 -------------------
 Each channel has a symmetric span of taps around zero delay: ``y[n] = sum_k taps[M + k] x[n - k]``.
-The taps are the inverse transform of the wanted response, cut off where only noise, or nothing that
-matters, is left. `Equaliser.response` is what the taps do, not what was wanted: spectra are divided
-by it, so that what was cut off biases nothing.
+The taps are the inverse transform of the target response, truncated where only noise or negligible
+values remain. `Equaliser.response` is the actual response of the taps, not the target: spectra are
+divided by it, so that the truncation causes no bias.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from estimator.errors import EstimatorError
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
-MOST_AMPLIFIED = 100.0
-"""Over the median amplification: what is weaker is not made up for, lest noise is amplified."""
+MAX_AMPLIFICATION = 100.0
+"""Maximum amplification over the median amplification: limits the amplification of noise."""
 USABLE = 0.9
-"""Of half the sampling rate: above it responses are not equalised in phase."""
-_FLAT = 0.8  # of the half length, beyond which taps fade
-_BLOCKS = 24  # of either side, for the search of the last one that matters
+"""Fraction of half the sampling rate above which phases are not equalised."""
+_FLAT = 0.8  # fraction of the half length from which taps fade
+_BLOCKS = 24  # number of blocks on either side, for the search of the last relevant one
 _ABOVE_NOISE = 3.0
-_ROUNDING = 1e-14  # of the largest tap's energy, below which none matters
-_FAR = 0.3  # of the taps on both sides: those farther off have faded
-_FFT_LENGTHS = 4  # times the taps, at least
+_ROUNDING = 1e-14  # fraction of the largest tap's energy below which taps are negligible
+_FAR = 0.3  # share of the taps, at both ends, that have faded
+_FFT_LENGTHS = 4  # minimum length of transforms, over the number of taps
 _ON_GRID = 1e-6
 _FREQUENCIES_AT_ONCE = 256
 
@@ -43,8 +43,7 @@ class Equaliser:
     sampling_rate : float
         Hz.
     taps : float64, shape (n_channels, 2 * reach + 1)
-        From the earliest output to the latest; a single 1 in the middle where nothing is to be
-        filtered.
+        From the earliest output to the latest; a single 1 in the middle for unfiltered channels.
     """
 
     sampling_rate: float
@@ -52,18 +51,18 @@ class Equaliser:
 
     @property
     def reach(self) -> int:
-        """Samples needed before and after each output."""
+        """Number of samples needed before and after each output."""
         return int(self.taps.shape[1]) // 2
 
     @property
     def filtered(self) -> tuple[int, ...]:
-        """Channels that are filtered at all."""
+        """The filtered channels."""
         plain = np.zeros(self.taps.shape[1])
         plain[self.reach] = 1.0
         return tuple(np.flatnonzero((self.taps != plain).any(axis=1)).tolist())
 
     def apply(self, samples: FloatArray) -> FloatArray:
-        """Return the filtered samples, without `reach` at either end.
+        """Return the filtered samples, without `reach` samples at either end.
 
         Parameters
         ----------
@@ -100,7 +99,7 @@ class Equaliser:
         return out
 
     def response(self, frequency: FloatArray) -> ComplexArray:
-        """Return what the filters do, shape (n_freqs, n_channels)."""
+        """Return the actual response of the filters, shape (n_freqs, n_channels)."""
         response = np.ones((len(frequency), len(self.taps)), dtype=np.complex128)
         columns = list(self.filtered)
         if not columns or not len(frequency):
@@ -109,7 +108,7 @@ class Equaliser:
         n = round(self.sampling_rate / step) if step > 0 else 0
         place = frequency * n / self.sampling_rate
         lags = np.arange(-self.reach, self.reach + 1)
-        if n and np.abs(place - np.rint(place)).max() < _ON_GRID:  # delays repeat there after n
+        if n and np.abs(place - np.rint(place)).max() < _ON_GRID:  # delays are periodic in n
             folded = np.zeros((n, len(columns)))
             np.add.at(folded, lags % n, self.taps[columns].T)
             at = np.rint(place).astype(np.int64)
@@ -122,7 +121,7 @@ class Equaliser:
         return response
 
     def then(self, other: Equaliser) -> Equaliser:
-        """Return the filters of both, one after the other."""
+        """Return the cascade of both filters."""
         reach = self.reach + other.reach
         taps = np.zeros((len(self.taps), 2 * reach + 1))
         for channel, (own, added) in enumerate(zip(self.taps, other.taps, strict=True)):
@@ -131,17 +130,17 @@ class Equaliser:
 
 
 def design(wanted: ComplexArray, sampling_rate: float, *, longest: int) -> Equaliser:
-    """Return filters of wanted responses.
+    """Return filters for target responses.
 
     Parameters
     ----------
     wanted : complex128, shape (n_freqs, n_channels)
-        At even distances from 0 Hz to half the sampling rate; exactly 1 throughout for channels
-        that are not to be filtered.
+        Evenly spaced from 0 Hz to half the sampling rate; exactly 1 at all frequencies for
+        unfiltered channels.
     sampling_rate : float
         Hz.
     longest : int
-        Samples that the filters may reach to either side.
+        Maximum reach of the filters to either side, in samples.
     """
     n = 2 * (len(wanted) - 1)
     longest = min(longest, n // 2 - 1)
@@ -158,9 +157,9 @@ def design(wanted: ComplexArray, sampling_rate: float, *, longest: int) -> Equal
 def with_short_tails(wanted: ComplexArray) -> ComplexArray:
     """Return responses of shorter filters, changed at 0 Hz and near half the sampling rate.
 
-    Averages tell little at 0 Hz: what is wrong with the value there is a constant in all taps, and
-    is seen where others have faded. Near half the rate phases turn to 0 or a half turn, as those of
-    real samples do; a jump would ring in all taps.
+    Averages have little information at 0 Hz: an error of that value is a constant in all taps, and
+    appears where the others have faded. Near half the rate, phases are brought to 0 or π, as for
+    real samples; a jump would ring in all taps.
     """
     n = 2 * (len(wanted) - 1)
     found = wanted.copy()
@@ -180,21 +179,21 @@ def with_short_tails(wanted: ComplexArray) -> ComplexArray:
 def tail_leakage(
     wanted: ComplexArray, sampling_rate: float, *, snr: FloatArray, factor: float
 ) -> FloatArray:
-    """Return how much the far half of the taps of responses matters, shape (n_channels,).
+    """Return the leakage by the outer half of the taps, shape (n_channels,).
 
-    A response that no short filter has leaks as before. This is the mean over frequencies of
-    ``ln(1 + leakage / noise)`` by the slopes of these taps alone.
+    A response that needs long filters is not equalised by short ones. The result is the mean over
+    frequencies of ``ln(1 + leakage / noise)``, by the slopes of these taps alone.
 
     Parameters
     ----------
     wanted : complex128, shape (n_freqs, n_channels)
-        As `design` takes it.
+        As for `design`.
     sampling_rate : float
         Hz.
     snr : float64, shape (n_freqs, n_channels)
-        Motion over noise in each channel.
+        PSD of the motion over PSD of the noise in each channel.
     factor : float
-        As of `estimator.responses.edge_leakage.slope_factor`, Hz².
+        From `estimator.responses.edge_leakage.slope_factor`, Hz².
     """
     n = 2 * (len(wanted) - 1)
     full = np.fft.irfft(wanted, n, axis=0)
@@ -208,7 +207,7 @@ def tail_leakage(
 
 
 def _needed(taps: FloatArray) -> int:
-    """Return how many samples to either side are more than the noise of those farthest off."""
+    """Return the number of taps to either side that exceed the noise of the outermost taps."""
     reach = len(taps) // 2
     if reach < _BLOCKS:
         return reach
@@ -223,31 +222,31 @@ def _needed(taps: FloatArray) -> int:
 
 
 def _fade(reach: int) -> FloatArray:
-    """Return weights of taps: 1 up to a share of the reach, and then falling to zero."""
+    """Return weights of taps: 1 up to a fraction of the reach, then decreasing to zero."""
     lag = np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
     turn = np.clip((lag - _FLAT) / (1 - _FLAT), 0.0, 1.0)
     return np.asarray(np.cos(np.pi / 2 * turn) ** 2)
 
 
 def bounded(response: ComplexArray) -> ComplexArray:
-    """Return a response in units of its median size, no larger than `MOST_AMPLIFIED`."""
+    """Return a response in units of its median size, no larger than `MAX_AMPLIFICATION`."""
     size = np.abs(response)
     scale = float(np.median(size)) or 1.0
-    limit = np.minimum(1.0, MOST_AMPLIFIED * scale / np.maximum(size, 1e-300))
+    limit = np.minimum(1.0, MAX_AMPLIFICATION * scale / np.maximum(size, 1e-300))
     return np.asarray(response / scale * limit)
 
 
 def smoothed(values: ComplexArray, weight: FloatArray, *, stiffness: float) -> ComplexArray:
-    """Return values without the noise of those that weigh little.
+    """Return smoothed values: values of small weight are smoothed most.
 
-    Least ``sum w |s - v|² + stiffness sum |third difference of s|²`` (Whittaker 1923).
+    Minimises ``sum w |s - v|² + stiffness sum |third difference of s|²`` (Whittaker 1923).
 
     Parameters
     ----------
     values : complex128, shape (n,)
-        Not finite only where the weight is zero.
+        May be not finite only for zero weights.
     weight : float64, shape (n,)
-        One over their variance.
+        Inverse variances.
     stiffness : float
     """
     from scipy.linalg import solveh_banded  # noqa: PLC0415 - only where something is equalised

@@ -1,10 +1,10 @@
-"""Segments with short gaps: a window that is zero in them, the same for all sensors.
+"""Segments with short gaps: a common window that is zero in the gaps.
 
 All channels of all sensors are multiplied by one function of time: 0 in every gap of any sensor, 1
-elsewhere, with cosine ramps between. Motion that all sensors measure alike remains common to them,
-whatever the window, so it leaves the noise as before. The noise keeps its PSD, divided by the
-energy of the window, where its spectrum is even. Where the noise is much lower than at other
-frequencies, the side lobes of such a window bring in noise from there: `Leakage` says how much.
+elsewhere, with cosine ramps between. Common motion remains common with any window, and so is
+removed as before. After division by the energy of the window, the noise keeps its PSD if its
+spectrum is smooth. At frequencies with much lower noise than elsewhere, the side lobes of the
+window add noise from other frequencies: `Leakage` computes this bias.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray
 
 RAMPS = 200
-"""Ramps are the segment's length over this."""
+"""Length of a segment over the length of a ramp."""
 SHORTEST_RAMP = 4
 ITERATIONS = 8
-"""Of the PSD without what is brought in."""
+"""Number of iterations for the PSD without leakage."""
 LEAST = 0.02
-"""Share of the PSD that is taken for the noise of that frequency at least."""
+"""Minimum share of the PSD that is attributed to its own frequency."""
 
 
 def gap_window(usable: BoolArray, segment_length: int) -> FloatArray:
@@ -53,7 +53,7 @@ def without_trend(segment: FloatArray, weight: FloatArray, detrend: str) -> Floa
     Parameters
     ----------
     segment : float64, shape (n_samples, n_channels)
-        What has no weight is not looked at.
+        Samples of zero weight have no effect.
     weight : float64, shape (n_samples,)
     detrend : {"none", "constant", "linear"}
     """
@@ -68,12 +68,12 @@ def without_trend(segment: FloatArray, weight: FloatArray, detrend: str) -> Floa
 
 
 class Leakage:
-    """What the windows of segments with gaps bring in from other frequencies.
+    """Leakage of noise from other frequencies by the windows of segments with gaps.
 
     Parameters
     ----------
     window : float64, shape (length,)
-        Of whole segments.
+        Window of complete segments.
     """
 
     def __init__(self, window: FloatArray) -> None:
@@ -84,7 +84,7 @@ class Leakage:
         self._lost = 0.0
 
     def add(self, weight: FloatArray) -> float:
-        """Add the window of one segment; return its energy as a part of a whole segment's."""
+        """Add the window of one segment; return its energy as a fraction of a complete one's."""
         window = self._window * weight
         self._sum += self._kernel(window)
         self.n_segments += 1
@@ -94,22 +94,22 @@ class Leakage:
 
     @property
     def lost(self) -> float:
-        """Mean part of the windows' energy that gaps take."""
+        """Mean fraction of the windows' energy lost to gaps."""
         return self._lost / max(1, self.n_segments)
 
     def bias(self, noise_psd: FloatArray) -> FloatArray:
-        """Return what is brought in, as a fraction of the noise.
+        """Return the leakage as a fraction of the noise.
 
         Parameters
         ----------
         noise_psd : float64, shape (n_freqs, n_channels)
-            At all frequencies of a segment; what is not known is taken from its neighbours.
+            At all frequencies of a segment; unknown values are taken from their neighbours.
 
         Returns
         -------
         float64, shape (n_freqs, n_channels)
-            Of the PSD as it was estimated. Negative where noise is lost to other frequencies; 0
-            without segments.
+            Fraction of the estimated PSD. Negative if noise leaks to other frequencies; 0 without
+            segments.
         """
         if not self.n_segments:
             return np.zeros_like(noise_psd)
@@ -133,6 +133,6 @@ class Leakage:
         return found
 
     def _kernel(self, window: FloatArray) -> FloatArray:
-        """Power of the window by frequency, whose autocorrelation is 1 at lag 0."""
+        """Return the power of the window by frequency, normalised to autocorrelation 1 at lag 0."""
         power = np.abs(np.fft.rfft(window, 2 * len(window))) ** 2
         return np.asarray(power / np.fft.irfft(power, 2 * len(window))[0])

@@ -1,13 +1,13 @@
 """Long segments for low frequencies, short ones for high frequencies, in one pass.
 
-The samples pass down a ladder of stages, each at half the sampling rate of the one above. All
-stages cut segments of the same number of samples, so that each is twice as long in time, and has
-half as many averages, as the one above. Of its spectrum a stage contributes the octave from 0.2 to
-0.4 of its rate; the top stage goes up to half, the bottom one down to 0. The filter between stages
-prevents aliasing into the octave that is used; its response in that octave is divided out.
+The samples pass through a cascade of stages, each at half the sampling rate of the one above. All
+stages use segments of the same number of samples, so that those of each stage are twice as long in
+time, and half as many, as those of the stage above. Each stage contributes the octave from 0.2 to
+0.4 of its rate; the top stage extends up to half its rate, the bottom one down to 0. The filter
+between stages prevents aliasing into the used octave; its response in that octave is divided out.
 
-Disturbed segments are excluded stage by stage, each compared with earlier segments of its length: a
-knock may disturb the highest octave and not the lowest.
+Disturbed segments are excluded separately at each stage, by comparison with earlier segments of
+equal length: a knock may disturb the highest octave and not the lowest.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from estimator.spectra.welch import CrossSpectra, WelchSettings
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
-LOW, HIGH = 0.2, 0.4  # of its own rate: the octave that a stage contributes
+LOW, HIGH = 0.2, 0.4  # octave of a stage, as fractions of its rate
 TAPS = 89  # odd; stop-band from 0.3 of the rate above, 120 dB down
 KAISER_BETA = 12.3
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """What one stage contributes.
+    """Contribution of one stage.
 
     Attributes
     ----------
     settings : WelchSettings
-        Those of the stage, with its own sampling rate.
+        Settings of the stage, with its own sampling rate.
     frequencies : float64, shape (n_freqs,)
         In Hz, ascending.
     csm : complex128, shape (n_freqs, n_channels, n_channels)
@@ -45,7 +45,7 @@ class Band:
     n_segments : int
     n_effective : float
     left_out : Counter of Reason
-        Segments of this stage that are not among them: incomplete (GAP), or disturbed.
+        Excluded segments of this stage: incomplete (GAP) or disturbed.
     """
 
     settings: WelchSettings
@@ -62,12 +62,13 @@ class MultiResolution:
     Parameters
     ----------
     settings : WelchSettings
-        Those of the top stage: the shortest segments.
+        Settings of the top stage, with the shortest segments.
     n_channels : int
     n_stages : int
-        How many; the longest segments are ``2**(n_stages - 1)`` times as long as the shortest.
+        Number of stages; the longest segments are ``2**(n_stages - 1)`` times as long as the
+        shortest.
     rejection : RejectionSettings, optional
-        When to leave a segment out; only those that are incomplete by default.
+        Criteria for disturbed segments; default: only incomplete segments are excluded.
     """
 
     def __init__(
@@ -99,9 +100,9 @@ class MultiResolution:
         Parameters
         ----------
         samples : float64, shape (n_samples, n_channels)
-            Those that follow the ones before, gaps included.
+            Contiguous with the previous samples, including gaps.
         complete : bool, shape (n_samples,), optional
-            False where any sensor has a gap; what stands there is not used.
+            False if any sensor has a gap; these samples are not used.
         """
         samples = np.array(samples, dtype=np.float64)
         if complete is None:
@@ -119,22 +120,22 @@ class MultiResolution:
 
     @property
     def n_segments(self) -> int:
-        """Segments of the top stage that count."""
+        """Number of accepted segments of the top stage."""
         return self._stages[0].total().n_segments
 
     @classmethod
     def like(cls, other: MultiResolution) -> MultiResolution:
-        """Return an empty one of the same settings, channels and stages, to merge into."""
+        """Return an empty accumulator with the same settings and channels, to merge into."""
         top = other._stages[0]
         return cls(top.settings, top.n_channels, n_stages=len(other._stages))
 
     def merge(self, other: MultiResolution) -> None:
-        """Add the segments of another recording that count.
+        """Add the accepted segments of another recording.
 
         Raises
         ------
         EstimatorError
-            If settings, stages or channels differ, or this one judges segments itself.
+            If settings, stages or channels differ, or this accumulator rejects segments itself.
         """
         if len(other._stages) != len(self._stages):
             raise EstimatorError(f"{len(other._stages)} stages, expected {len(self._stages)}")
@@ -142,18 +143,18 @@ class MultiResolution:
             own.merge(added)
 
     def bands(self, least_effective: float = 1.0) -> tuple[Band, ...]:
-        """Return what the stages contribute, from the lowest frequencies up.
+        """Return the contributions of the stages, in ascending order of frequency.
 
         Parameters
         ----------
         least_effective : float
-            Stages with fewer effective averages than this are left out; the lowest of the
-            others then goes down to 0 in their stead.
+            Minimum number of effective averages of a stage. Stages with fewer are excluded, and the
+            lowest remaining stage extends down to 0.
 
         Raises
         ------
         InsufficientDataError
-            If no stage has as many.
+            If no stage has this number of averages.
         """
         least = max(least_effective, 1.0)
         used = [stage for stage in self._stages if stage.total().n_effective >= least]
@@ -195,7 +196,7 @@ class MultiResolution:
 
 
 class _Stage:
-    """Cuts segments at one rate, and makes the samples of the next."""
+    """Adds segments at one rate, and computes the samples of the next stage."""
 
     def __init__(
         self, settings: WelchSettings, n_channels: int, rejection: RejectionSettings | None
@@ -210,17 +211,17 @@ class _Stage:
         if rejection is not None:
             self._undisturbed = SelectedSpectra(settings, n_channels, rejection=rejection)
         self._total: CrossSpectra | None = None
-        self._samples = np.zeros((0, n_channels))  # those that the next segment begins with
+        self._samples = np.zeros((0, n_channels))  # start of the next segment
         self._complete = np.zeros(0, dtype=bool)
-        # before the first sample there is nothing: the filter begins inside a gap
+        # before the first sample, the filter treats the input as a gap
         self._tail = np.zeros((TAPS - 1, n_channels)), np.zeros(TAPS - 1, dtype=bool)
 
     def check(self, samples: FloatArray) -> None:
-        """Raise what `take` would raise."""
+        """Raise the errors of `take`."""
         self._spectra.check(samples, np.zeros(0, dtype=np.int64))
 
     def total(self) -> CrossSpectra:
-        """Return the spectra of the segments that count."""
+        """Return the spectra of the accepted segments."""
         if self._undisturbed is None:
             return self._spectra
         if self._total is None:
@@ -236,7 +237,7 @@ class _Stage:
         self.judged += other.judged
 
     def take(self, samples: FloatArray, complete: BoolArray) -> None:
-        """Judge and add the segments that these samples finish."""
+        """Test and add the segments completed by these samples."""
         self._samples = np.concatenate([self._samples, samples])
         self._complete = np.concatenate([self._complete, complete])
         n = (len(self._samples) - self.settings.segment_length) // self.settings.hop + 1
@@ -245,7 +246,7 @@ class _Stage:
         starts = np.arange(n) * self.settings.hop
         missing = np.concatenate([[0], np.cumsum(~self._complete)])
         whole = missing[starts + self.settings.segment_length] == missing[starts]
-        if not self._begun:  # what begins before there is anything has lost nothing
+        if not self._begun:  # segments before the first sample are not lost
             first = int(np.argmax(self._complete)) if self._complete.any() else len(self._complete)
             self.incomplete -= int(np.sum(starts < first))
             self._begun = first <= starts[-1]
@@ -260,7 +261,7 @@ class _Stage:
         self._complete = self._complete[n * self.settings.hop :]
 
     def halve(self, samples: FloatArray, complete: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Return what these samples add at half the rate."""
+        """Return the new samples at half the rate."""
         from scipy.signal import upfirdn  # noqa: PLC0415 - takes a second to import
 
         samples = np.concatenate([self._tail[0], samples])
@@ -276,14 +277,14 @@ class _Stage:
 
 
 def _taps() -> FloatArray:
-    """Half-band low-pass filter, of unit gain at 0 Hz."""
+    """Return the half-band low-pass filter, with unit gain at 0 Hz."""
     n = np.arange(TAPS) - TAPS // 2
     taps = np.sinc(n / 2) * np.kaiser(TAPS, KAISER_BETA)
     return np.asarray(taps / taps.sum())
 
 
 def _response(frequencies: FloatArray, settings: WelchSettings) -> FloatArray:
-    """Gain of the filter below a stage; real, as the filter is symmetric."""
+    """Return the gain of the filter after a stage; real, because the filter is symmetric."""
     n = np.arange(TAPS) - TAPS // 2
     phase = 2 * np.pi * frequencies[:, None] / settings.sampling_rate * n
     return np.asarray(np.cos(phase) @ _taps())

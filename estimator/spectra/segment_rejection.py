@@ -3,17 +3,17 @@
 A segment is excluded if
 
 - samples are missing, or it is clipped;
-- the power of a channel in an octave differs much from that of the segments accepted before;
-- its largest step between samples does (a spike that the window attenuates can still exceed noise
-  that is far below the motion);
-- a channel is constant in part of it for much longer than before (a channel that is briefly dead
-  loses little power).
+- the power of a channel in an octave differs much from that of the earlier accepted segments;
+- its largest step between samples differs much (a spike attenuated by the window can still exceed
+  noise far below the motion);
+- a channel is constant for a much longer time than before (a briefly dead channel loses little
+  power).
 
-The decision on a segment uses earlier segments only, so it is the same live and offline.
+The decision on a segment uses only earlier segments, so it is the same live and offline.
 
 The first segments have no predecessors: a start-up set is held back and compared with its own
-median. If a whole start-up set in a row is excluded, the level has changed, and a new start-up set
-begins.
+median. If a complete start-up set of consecutive segments is excluded, the level has changed, and a
+new start-up set begins.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
-STILL = 32  # samples alike in a row: a channel that was dead
-LONGER = 2.0  # than usual: how long a channel that often stands still must do so, at threshold 6
-FEWEST = 5  # segments that have a median worth the name
+STILL = 32  # consecutive equal samples of a dead channel
+LONGER = 2.0  # ratio to the usual time for channels that are often constant, at threshold 6
+FEWEST = 5  # minimum number of segments for a median
 SEGMENTS_PER_BLOCK = 32
-REPORTED = 1000  # segments left out that are remembered one by one
+REPORTED = 1000  # maximum number of excluded segments kept individually
 
 
 class Reason(enum.StrEnum):
-    """Why a segment was left out."""
+    """Reason for the exclusion of a segment."""
 
     GAP = "gap"
     CLIPPED = "clipped"
@@ -52,23 +52,23 @@ class Reason(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RejectionSettings:
-    """When to exclude a segment.
+    """Criteria for the exclusion of a segment.
 
     Attributes
     ----------
     threshold : float
-        Deviations of the logarithmic power of a band, or of the largest squared step from sample to
-        sample, above its running median, in standard deviations (1.4826 times the median absolute
-        deviation, or the scatter of stationary noise where that is more). Twice as many below:
-        logarithms of powers have a long lower tail. So many also of the logarithm of the longest
-        time that a channel stands still, above its running median. Infinite: transients, and
-        channels that stand still, stay in.
+        Maximum deviation above the running median, in standard deviations (1.4826 times the median
+        absolute deviation, or the scatter of stationary noise if larger), of three quantities: the
+        logarithmic power of a band, the logarithm of the largest squared step between samples, and
+        the logarithm of the longest time for which a channel is constant. Twice this deviation is
+        allowed below the median for the first two, because logarithms of powers have a long lower
+        tail. Infinity disables these criteria.
     start_up : int
-        Segments that are judged by each other before there are earlier ones.
+        Number of first segments that are compared with each other.
     memory : int
-        Accepted segments that the running median reaches back.
+        Number of accepted segments in the running median.
     renewal : int
-        Accepted segments after which the median is taken anew.
+        Number of accepted segments after which the median is updated.
     """
 
     threshold: float = 6.0
@@ -88,15 +88,15 @@ class RejectionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """One segment that was left out.
+    """One excluded segment.
 
     Attributes
     ----------
     segment : int
-        Its number, from 0, in the order of adding.
+        Index of the segment, from 0, in the order of addition.
     reason : Reason
     channel : int or None
-        The channel that shows it most; None for a gap.
+        The channel with the largest deviation; None for a gap.
     deviation : float
         Standard deviations from the median, for a transient; NaN otherwise.
     """
@@ -108,7 +108,7 @@ class Rejected:
 
 
 class SelectedSpectra:
-    """A `CrossSpectra` of undisturbed segments.
+    """Accumulates the `CrossSpectra` of undisturbed segments.
 
     Parameters
     ----------
@@ -116,16 +116,16 @@ class SelectedSpectra:
     n_channels : int
     rejection : RejectionSettings, optional
     full_scale : float64, shape (n_channels,), optional
-        A segment with a sample as far from zero as this is clipped.
+        A segment with a sample of this magnitude or more is clipped.
 
     Attributes
     ----------
     n_segments : int
-        Segments judged, those still held back included.
+        Number of tested segments, including those held back.
     counts : Counter of Reason
-        How many were left out, and why.
+        Number of excluded segments by reason.
     rejected : deque of Rejected
-        The latest of them, one by one.
+        The latest excluded segments.
     """
 
     def __init__(
@@ -164,21 +164,21 @@ class SelectedSpectra:
         self._in_a_row = 0
 
     def add(self, samples: FloatArray, starts: IntArray, complete: BoolArray | None = None) -> None:
-        """Judge the segments of `samples` that begin at `starts`, and add those that pass.
+        """Test the segments of `samples` that begin at `starts`, and add the accepted ones.
 
         Parameters
         ----------
         samples : float64, shape (n_samples, n_channels)
             NaN counts as a gap.
         starts : int64, shape (n_segments,)
-            In the order of time.
+            In order of time.
         complete : bool, shape (n_samples,), optional
-            False where any sensor has a gap.
+            False if any sensor has a gap.
 
         Raises
         ------
         EstimatorError
-            As `CrossSpectra.add`; nothing has been judged then.
+            As `CrossSpectra.add`; then no segment has been added.
         """
         starts = np.asarray(starts, dtype=np.int64)
         self._accepted.check(samples, starts)
@@ -196,7 +196,7 @@ class SelectedSpectra:
     def spectra(self) -> CrossSpectra:
         """Return the spectra of all segments accepted so far.
 
-        Those still held back count as far as they agree with each other.
+        Includes the segments held back that agree with each other.
         """
         total = CrossSpectra(self.settings, self._accepted.n_channels)
         total.merge(self._accepted)
@@ -205,16 +205,16 @@ class SelectedSpectra:
         return total
 
     def drain(self) -> CrossSpectra:
-        """Return the spectra of segments accepted since the last call; the judgement goes on.
+        """Return the spectra of segments accepted since the last call, and keep all criteria.
 
-        Those held back are among the next ones.
+        Segments held back are returned by a later call.
         """
         accepted = self._accepted
         self._accepted = CrossSpectra(self.settings, accepted.n_channels)
         return accepted
 
     def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
-        """Logarithm of the power in each band, of the largest squared step, and of the time still.
+        """Return logarithms of the power in each band, the largest squared step, the constant time.
 
         Returns
         -------
@@ -271,7 +271,7 @@ class SelectedSpectra:
         self._renew()
 
     def _agreeing(self, held: list[_Held]) -> tuple[list[_Held], list[Rejected]]:
-        """Those that lie near the median of all, and the others."""
+        """Return the segments near the median of all, and the others."""
         if len(held) < FEWEST:
             return held, []
         normal = self._median([segment.levels for segment in held])
@@ -311,12 +311,12 @@ class _Held:
 
 
 def _longest_still(segment: FloatArray) -> FloatArray:
-    """Return for how many samples each channel hardly moves, half of `STILL` at least.
+    """Return the longest time for which each channel is nearly constant, at least half of `STILL`.
 
     Returns
     -------
     float64, shape (n_channels,)
-        A segment's length for a channel that does not move in it; NaN for one with a NaN.
+        In samples; the length of the segment for a constant channel; NaN for a channel with NaN.
     """
     steps = np.abs(np.diff(segment, axis=0))
     limit = 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
@@ -327,14 +327,17 @@ def _longest_still(segment: FloatArray) -> FloatArray:
 
 
 def _deviation(levels: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:
-    """Largest deviation of each channel, shape (n_channels,); nothing is wrong with moving more."""
+    """Return the largest deviation of each channel, shape (n_channels,).
+
+    Constant times below the median do not count.
+    """
     above = (levels - median) / scatter
     below = -above[:-1] / 2
     return np.asarray(np.maximum(above.max(axis=0), below.max(axis=0)))
 
 
 def _stationary_scatter(window: FloatArray, widths: IntArray) -> FloatArray:
-    """Return the scatter of the logarithmic power of bands that are so many frequencies wide."""
+    """Return the scatter of the logarithmic power of bands with these numbers of frequencies."""
     correlation = np.abs(np.fft.fft(window**2)) ** 2
     correlation /= correlation[0]
     lags = [np.arange(1, min(width, len(window) // 2)) for width in widths]
@@ -347,9 +350,9 @@ def _stationary_scatter(window: FloatArray, widths: IntArray) -> FloatArray:
 
 
 def _scatter_of_largest(n_samples: int) -> float:
-    """Return the scatter of the logarithm of the largest square of normal, independent samples.
+    """Return the scatter of the logarithm of the largest square of independent normal samples.
 
-    That square is near 2 ln n, with Gumbel's distribution of scale 2 about it.
+    The largest square is near 2 ln n, with a Gumbel distribution of scale 2.
     """
     return float(np.pi / np.sqrt(6) / np.log(max(n_samples, 3)))
 

@@ -1,4 +1,4 @@
-"""Spectra of single segments at a few frequencies: what averages do not show of their course."""
+"""Spectra of single segments at a few frequencies, which show changes with time."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ if TYPE_CHECKING:
 
 KEPT_FREQUENCIES = 48
 MOST_SEGMENTS, MOST_VALUES = 4096, 1 << 21
-"""Beyond these every second segment is kept, then every fourth, and so on."""
+"""Maximum numbers of kept segments and values; beyond, every second segment is kept, then every
+fourth, and so on."""
 
 
 def kept_bins(n_freqs: int) -> IntArray:
-    """Return bins that are kept: spaced by ratio, as far as they are distinct.
+    """Return the kept bins, with a constant ratio where they are distinct.
 
     Parameters
     ----------
     n_freqs : int
-        Frequencies of a spectrum, from 0 to half the sampling rate.
+        Number of frequencies of a spectrum, from 0 to half the sampling rate.
 
     Returns
     -------
@@ -36,7 +37,7 @@ def kept_bins(n_freqs: int) -> IntArray:
 
 
 class SegmentSpectra:
-    """Spectra of the segments one by one, at `bins` only.
+    """Spectra of single segments at `bins`.
 
     Parameters
     ----------
@@ -46,9 +47,9 @@ class SegmentSpectra:
     Attributes
     ----------
     every : int
-        Every how many-th segment is kept.
+        Every `every`-th segment is kept.
     most : int
-        Segments that are kept at most.
+        Maximum number of kept segments.
     """
 
     def __init__(self, bins: IntArray, n_channels: int) -> None:
@@ -61,7 +62,7 @@ class SegmentSpectra:
         self._n_kept = 0
 
     def add(self, spectra: ComplexArray) -> None:
-        """Add the spectra of segments, in the order of time.
+        """Add the spectra of segments, in order of time.
 
         Parameters
         ----------
@@ -76,18 +77,18 @@ class SegmentSpectra:
             self.thin(2 * self.every)
 
     def __len__(self) -> int:
-        """Return how many segments are kept."""
+        """Return the number of kept segments."""
         return self._n_kept
 
     def thin(self, every: int) -> None:
-        """Keep every `every`-th segment from now on: a multiple of what it is."""
+        """Keep every `every`-th segment from now on, a multiple of the current value."""
         if every != self.every:
             self._parts = [self.values()[:: every // self.every].copy()]
             self._n_kept = len(self._parts[0])
             self.every = every
 
     def values(self) -> NDArray[np.complex64]:
-        """Return what is kept, shape (n_segments, n_kept, n_channels); not scaled to a density."""
+        """Return the kept spectra, (n_segments, n_kept, n_channels), not scaled to a density."""
         if not self._parts:
             return np.empty((0, len(self.bins), self._n_channels), np.complex64)
         if len(self._parts) > 1:

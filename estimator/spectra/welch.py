@@ -3,9 +3,8 @@
 Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
 in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
 
-Segments are taken a block at a time, so that the work stays in the cache. Several threads take
-equal shares of them; their sums are added in order, so that the result does not depend on their
-timing.
+Segments are processed in groups that fit into the cache. Several threads process equal shares;
+their sums are added in order, so that the result does not depend on timing.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
-BLOCK_VALUES = 2**21  # samples of all channels in a block, at most: 16 MB
+BLOCK_VALUES = 2**21  # maximum number of values per group: 16 MB
 FREQUENCIES_PER_BLOCK = 512
 THREADS = 2
 
 
 @dataclass(frozen=True, slots=True)
 class WelchSettings:
-    """How samples become spectra.
+    """Settings of Welch's method.
 
     Attributes
     ----------
@@ -44,11 +43,11 @@ class WelchSettings:
     segment_length : int
         Samples per segment.
     overlap : float
-        Fraction of a segment that the next one repeats, from 0 to below 1.
+        Overlap between consecutive segments as a fraction of their length, from 0 to below 1.
     window : str or tuple
-        As `estimator.spectra.windows.get_window` takes it.
+        As for `estimator.spectra.windows.get_window`.
     detrend : {"none", "constant", "linear"}
-        What is removed from every segment of every channel before the window.
+        Trend that is removed from every segment of every channel before the window.
     """
 
     sampling_rate: float
@@ -62,7 +61,7 @@ class WelchSettings:
             raise EstimatorError(f"sampling rate {self.sampling_rate}: expected Hz above 0")
         if self.segment_length < 2 or np.asarray(self.segment_length).dtype.kind not in "iu":
             raise EstimatorError(
-                f"segment length {self.segment_length}: expected 2 samples or more, a whole number"
+                f"segment length {self.segment_length}: expected an integer of 2 samples or more"
             )
         if not 0 <= self.overlap < 1:
             raise EstimatorError(f"overlap {self.overlap}: expected a fraction from 0 to below 1")
@@ -74,7 +73,7 @@ class WelchSettings:
 
     @property
     def hop(self) -> int:
-        """Samples from the start of one segment to the start of the next."""
+        """Number of samples between the starts of consecutive segments."""
         return max(1, self.segment_length - round(self.overlap * self.segment_length))
 
     @property
@@ -83,7 +82,7 @@ class WelchSettings:
         return np.arange(self.segment_length // 2 + 1) * self.sampling_rate / self.segment_length
 
     def real(self, frequencies: FloatArray) -> BoolArray:
-        """Where spectra are real-valued: at 0 Hz and half the sampling rate."""
+        """Return whether spectra are real-valued: at 0 Hz and half the sampling rate."""
         highest = np.isclose(frequencies, self.sampling_rate / 2, rtol=1e-9, atol=0)
         return np.asarray((frequencies == 0) | highest)
 
@@ -96,7 +95,7 @@ class CrossSpectra:
     settings : WelchSettings
     n_channels : int
     threads : int
-        How many `add` may use: 1 where other threads of the caller's have the processors already.
+        Maximum number of threads of `add`; use 1 if the caller already uses all processors.
     segments : SegmentSpectra, optional
         Receives the spectra of the single segments.
     """
@@ -110,7 +109,7 @@ class CrossSpectra:
         segments: SegmentSpectra | None = None,
     ) -> None:
         if n_channels < 1:
-            raise EstimatorError(f"{n_channels} channels: at least one is needed")
+            raise EstimatorError(f"{n_channels} channels; expected at least one")
         self.settings = settings
         self.n_channels = n_channels
         self._threads = threads
@@ -121,10 +120,11 @@ class CrossSpectra:
         n_freqs = settings.segment_length // 2 + 1
         self._sum = np.zeros((n_freqs, n_channels, n_channels), dtype=np.complex128)
         self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
-        # One value a sample and channel: numpy multiplies contiguous arrays several times faster.
+        # One value per sample and channel: contiguous products are several times faster in numpy.
         self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
         self._tapers = bool(np.any(self._window != 1))
-        # Trends are fitted to the samples and taken off their spectra, where they fill few bins.
+        # Trends are fitted to the samples and subtracted from their spectra, where they fill few
+        # bins.
         trends = _trends(settings.detrend, length)
         self._fit = trends / np.sum(trends**2, axis=1, keepdims=True)
         spectra = np.fft.rfft(trends * self._window, axis=1).T
@@ -137,14 +137,14 @@ class CrossSpectra:
         Parameters
         ----------
         samples : float64, shape (n_samples, n_channels)
-            In physical units. What no segment covers is not looked at.
+            In physical units. Samples outside all segments have no effect.
         starts : int64, shape (n_segments,)
             Row of `samples` at which each segment begins.
 
         Raises
         ------
         EstimatorError
-            If a segment does not lie within `samples`, or the number of channels differs.
+            If a segment is not within `samples`, or the number of channels differs.
         """
         samples = np.asarray(samples, dtype=np.float64)
         starts = np.asarray(starts, dtype=np.int64)
@@ -169,14 +169,14 @@ class CrossSpectra:
                 self._single.add(spectra)
 
     def check(self, samples: FloatArray, starts: IntArray) -> None:
-        """Raise what `add` would raise, and add nothing."""
+        """Raise the errors of `add` without adding segments."""
         if samples.ndim != 2 or samples.shape[1] != self.n_channels:
             raise EstimatorError(
                 f"samples of shape {samples.shape}, expected (n_samples, {self.n_channels})"
             )
         last = len(samples) - self.settings.segment_length
         if starts.ndim != 1:
-            raise EstimatorError(f"starts of shape {starts.shape}, expected one row a segment")
+            raise EstimatorError(f"starts of shape {starts.shape}, expected one row per segment")
         if starts.size and (starts.min() < 0 or starts.max() > last):
             raise EstimatorError(
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
@@ -185,9 +185,9 @@ class CrossSpectra:
     def _total(
         self, samples: FloatArray, starts: IntArray
     ) -> tuple[ComplexArray, list[ComplexArray]]:
-        """Sum of ``X conj(X).T`` over the segments, shape (n_freqs, n_channels, n_channels).
+        """Return the sum of ``X conj(X).T`` over the segments, (n_freqs, n_channels, n_channels).
 
-        And the spectra of the segments at the frequencies that are kept, if any are.
+        Also return the spectra of the segments at the kept frequencies, if there are any.
         """
         length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
         block = min(self._block, len(starts))
@@ -209,7 +209,7 @@ class CrossSpectra:
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
             if self._single is not None:
                 single.append(spectra[:n, self._single.bins])
-            if len(starts) == 1:  # to sum it and take it apart again would cost more
+            if len(starts) == 1:  # cheaper than the sum over real and imaginary parts
                 return spectra[0, :, :, None] * spectra[0, :, None, :].conj(), single
             parts = spectra[:n].view(np.float64)
             for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
@@ -224,7 +224,7 @@ class CrossSpectra:
 
     @property
     def n_effective(self) -> float:
-        """Independent averages the segments are worth, were they one run without gaps."""
+        """Number of independent averages equivalent to these segments, if contiguous."""
         return effective_averages(self._window, self.settings.hop, self.n_segments)
 
     def csm(self) -> ComplexArray:
@@ -241,7 +241,7 @@ class CrossSpectra:
             If no segment has been added.
         """
         if self.n_segments == 0:
-            raise InsufficientDataError("no segment yet: a spectrum needs at least one")
+            raise InsufficientDataError("no segment yet; expected at least one")
         energy = self.settings.sampling_rate * float(self._window @ self._window)
         density = np.full(len(self._sum), 2 / (energy * self.n_segments))
         density[0] /= 2
@@ -267,7 +267,7 @@ class CrossSpectra:
         return total
 
     def to_bytes(self) -> bytes:
-        """Return everything as a NumPy ``.npz`` archive, for another process or machine."""
+        """Return the accumulator as a NumPy ``.npz`` archive, for another process or machine."""
         content = io.BytesIO()
         np.savez(
             content,
@@ -279,12 +279,12 @@ class CrossSpectra:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
-        """Return the accumulator that `to_bytes` wrote.
+        """Return the accumulator from `to_bytes`.
 
         Raises
         ------
         EstimatorError
-            If `content` is something else.
+            If `content` is invalid.
         """
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -305,7 +305,7 @@ class CrossSpectra:
 
 
 def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
-    """Segments that begin at `rows`, shape (n, length, n_channels): no copy if evenly spaced."""
+    """Return the segments at `rows`, (n, length, n_channels), without copy if evenly spaced."""
     windows = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0).swapaxes(1, 2)
     steps = np.diff(rows)
     if len(steps) == 0 or (steps[0] > 0 and np.all(steps == steps[0])):
@@ -314,36 +314,36 @@ def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
 
 
 def _trends(detrend: str, length: int) -> FloatArray:
-    """Orthogonal trends that `detrend` removes, shape (n_trends, length)."""
+    """Return the orthogonal trends that `detrend` removes, shape (n_trends, length)."""
     line = np.arange(length) - (length - 1) / 2
     return np.stack([np.ones(length), line])[: {"none": 0, "constant": 1, "linear": 2}[detrend]]
 
 
 def _last_bin(spectra: ComplexArray) -> int:
-    """Bins, from 0, beyond which spectra of shape (n_freqs, n_trends) are rounding only."""
+    """Return the bin from which spectra (n_freqs, n_trends) are only rounding."""
     size = np.abs(spectra)
     above = np.any(size > len(size) * np.finfo(np.float64).eps * size.max(axis=0), axis=1)
     return int(np.max(np.nonzero(above), initial=-1)) + 1
 
 
 def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
-    """Divide by the response of every channel: from digitised to physical units.
+    """Divide by the response of every channel, to convert to physical units.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
     response : complex128, shape (n_freqs, n_channels)
-        What each channel makes of one unit, at each frequency.
+        Response of each channel to one unit, at each frequency.
 
     Returns
     -------
     complex128, shape (n_freqs, n_channels, n_channels)
-        ``csm[f, p, q] / (h[f, p] conj(h[f, q]))``; NaN where a response is zero, as at 0 Hz.
+        ``csm[f, p, q] / (h[f, p] conj(h[f, q]))``; NaN if a response is zero, such as at 0 Hz.
 
     Raises
     ------
     EstimatorError
-        If `response` is not one number a frequency and channel.
+        If `response` is not one number per frequency and channel.
     """
     response = np.asarray(response, dtype=np.complex128)
     if response.shape != csm.shape[:2]:

@@ -1,4 +1,4 @@
-"""Windows, and how many independent averages overlapping segments are worth."""
+"""Windows, and the number of independent averages of overlapping segments."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def get_window(window: Window, length: int) -> FloatArray:
         If the window is unknown, has another length, is not finite or has no energy.
     """
     if length < 1:
-        raise EstimatorError(f"window length {length}: at least one sample is needed")
+        raise EstimatorError(f"window length {length}: expected at least one sample")
     if isinstance(window, str) and window in {"rectangular", "boxcar"}:
         return np.ones(length)
     if isinstance(window, str) and window in {"hann", "hanning"}:
@@ -48,7 +48,7 @@ def get_window(window: Window, length: int) -> FloatArray:
             if isinstance(window, str) and "," in window:
                 name, *parameters = window.split(",")
                 known = (name, *map(float, parameters))
-            with np.errstate(all="ignore"):  # what is not finite is refused below
+            with np.errstate(all="ignore"):  # non-finite windows are refused below
                 taps = np.asarray(signal.get_window(known, length), dtype=np.float64)  # type: ignore[arg-type]  # any name; unknown ones raise below
         except (ValueError, TypeError) as error:
             raise EstimatorError(f"window {window!r}: {error}") from error
@@ -58,21 +58,21 @@ def get_window(window: Window, length: int) -> FloatArray:
         raise EstimatorError(f"window of shape {taps.shape}, expected ({length},)")
     if not np.all(np.isfinite(taps)) or not np.any(taps):
         name = f"window {window!r}" if isinstance(window, (str, tuple)) else "window"
-        raise EstimatorError(f"{name}: its samples must be finite and not all zero")
+        raise EstimatorError(f"{name}: expected finite samples that are not all zero")
     return taps
 
 
 def effective_averages(window: FloatArray, hop: int, n_segments: int) -> float:
-    """Count the independent segments that overlapping ones are worth.
+    """Return the number of independent averages equivalent to overlapping segments.
 
     Parameters
     ----------
     window : float64, shape (length,)
         The window that multiplies each segment.
     hop : int
-        Samples from the start of one segment to the start of the next.
+        Number of samples between the starts of consecutive segments.
     n_segments : int
-        Segments averaged, in one run without gaps.
+        Number of averaged segments, contiguous without gaps.
 
     Returns
     -------
@@ -91,9 +91,9 @@ def effective_averages(window: FloatArray, hop: int, n_segments: int) -> float:
        spectra", IEEE Trans. Audio Electroacoust. AU-15 (1967) 70-73.
     """
     if hop < 1:
-        raise EstimatorError(f"hop {hop}: segments must advance by at least one sample")
+        raise EstimatorError(f"hop {hop}: expected at least one sample")
     if n_segments < 0:
-        raise EstimatorError(f"{n_segments} segments: cannot be negative")
+        raise EstimatorError(f"{n_segments} segments: expected 0 or more")
     if n_segments == 0:
         return 0.0
     energy = float(window @ window)

@@ -484,7 +484,7 @@ def test_refusals() -> None:
         diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
     with pytest.raises(InsufficientDataError, match="2 sensors"):
         diagnose(csm[:, :6, :6], FREQUENCY, dims=(3, 3), n_effective=100)
-    with pytest.raises(InvalidMatrixError, match="rising"):
+    with pytest.raises(InvalidMatrixError, match="ascending"):
         diagnose(csm, FREQUENCY[::-1], dims=THREE, n_effective=100)
     for n in (np.nan, np.inf, -1):
         with pytest.raises(InsufficientDataError, match="finite number above zero"):

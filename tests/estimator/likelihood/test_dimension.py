@@ -264,5 +264,5 @@ def test_refusals() -> None:
             choose_dimension(averages, np.ones(1), dims=THREE, n_effective=n)
     twice = np.tile(averages, (2, 1, 1))
     for frequency in ([2.0, 1.0], [1.0, np.nan]):
-        with pytest.raises(InvalidMatrixError, match="rising"):
+        with pytest.raises(InvalidMatrixError, match="ascending"):
             choose_dimension(twice, np.array(frequency), dims=THREE, n_effective=50)

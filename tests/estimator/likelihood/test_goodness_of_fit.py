@@ -161,7 +161,7 @@ def test_pooling_allows_for_correlated_neighbours() -> None:
 
 def test_refuses_a_model_with_nothing_left_to_test() -> None:
     draws = wishart(bench((3, 3, 3)), 50, np.random.default_rng(7))
-    with pytest.raises(InsufficientDataError, match="nothing is left"):
+    with pytest.raises(InsufficientDataError, match="no freedom left"):
         model_test(maximise(draws, 6), n_effective=50)
     with pytest.raises(InsufficientDataError, match="averages"):
         model_test(maximise(draws, 3), n_effective=9)

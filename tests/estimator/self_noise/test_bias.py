@@ -111,7 +111,7 @@ def test_motion_that_lacks_a_dimension_biases_nobody_who_feels_it_alike() -> Non
 
 def test_what_the_theory_does_not_cover_is_refused() -> None:
     c = motion_csm(unit([0, 5, 10]), PLANE)
-    with pytest.raises(EstimatorError, match="equal sensors"):
+    with pytest.raises(EstimatorError, match="expected equal numbers"):
         three_sensor_bias(c, np.ones(4), dims=(1, 1, 2))
     with pytest.raises(EstimatorError, match="expected"):
         motion_csm(unit([0, 5, 10]), np.eye(3))

@@ -7,7 +7,7 @@ import pytest
 
 from estimator.errors import EstimatorError
 from estimator.spectra.equaliser import (
-    MOST_AMPLIFIED,
+    MAX_AMPLIFICATION,
     Equaliser,
     bounded,
     design,
@@ -109,7 +109,7 @@ def test_amplification_is_bounded() -> None:
     response = np.ones(11, dtype=np.complex128)
     response[0] = 1e6j
     found = bounded(2 * response)
-    assert found[0] == pytest.approx(1j * MOST_AMPLIFIED)
+    assert found[0] == pytest.approx(1j * MAX_AMPLIFICATION)
     np.testing.assert_allclose(found[1:], 1.0)
 
 
