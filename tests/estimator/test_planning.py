@@ -16,7 +16,7 @@ PAPER = WelchSettings(200.0, 2000, 0.0, "rectangular")
 DIMS = (2, 2, 2)
 
 
-def test_three_hours_are_what_the_paper_needed() -> None:
+def test_the_plan_gives_the_three_hours_of_the_paper() -> None:
     csm, noise_psd = planned_csm(planar_sensors(10), snr=1e4, motion=np.diag([1, 1.5]))
     plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.0481)}
     assert list(plans) == [*METHODS, BOUND]
@@ -32,7 +32,7 @@ def test_three_hours_are_what_the_paper_needed() -> None:
     np.testing.assert_allclose(plans[BOUND].n_effective, three_sensor.n_effective, rtol=0.01)
 
 
-def test_channels_at_30_degrees_cost_4_6_times_as_much_without_maximum_likelihood() -> None:
+def test_channels_at_30_degrees_take_4_6_times_as_long_without_maximum_likelihood() -> None:
     directions = planar_sensors(60, channel_angle_deg=30)
     csm, noise_psd = planned_csm(directions, snr=1e4, motion=np.diag([1, 1.5]))
     plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)}
@@ -45,7 +45,7 @@ def test_channels_at_30_degrees_cost_4_6_times_as_much_without_maximum_likelihoo
 
 
 @pytest.mark.parametrize("method", ["two-channel", "three-sensor", "maximum-likelihood"])
-def test_what_is_planned_is_what_comes_out(method: str) -> None:
+def test_estimates_have_the_planned_precision(method: str) -> None:
     rng = np.random.default_rng(0)
     directions = np.tile(rotation(rng, 3), (3, 1))
     csm, noise_psd = planned_csm(directions, snr=100, noise_psd=np.linspace(0.5, 2, 9))
@@ -61,7 +61,9 @@ def test_what_is_planned_is_what_comes_out(method: str) -> None:
 
 @pytest.mark.parametrize("method", ["three-channel", "three-sensor", "maximum-likelihood"])
 @pytest.mark.parametrize(("snr", "cov"), [(0.1, 0.05), (1, 0.2)])
-def test_what_is_planned_for_weak_motion_is_kept(method: str, snr: float, cov: float) -> None:
+def test_estimates_of_weak_motion_have_the_planned_precision(
+    method: str, snr: float, cov: float
+) -> None:
     # with the averages that the precision alone would need, c.o.v. of 0.06 to 0.15, and 0.22
     rng = np.random.default_rng(0)
     directions = np.tile(np.eye(3), (3, 1))
@@ -82,7 +84,7 @@ def test_what_is_planned_for_weak_motion_is_kept(method: str, snr: float, cov: f
     )
 
 
-def test_maximum_likelihood_needs_the_best_sensors_only_to_find_the_motion() -> None:
+def test_maximum_likelihood_resolves_the_motion_by_the_best_sensors() -> None:
     noise = np.repeat([1.0, 1.0, 1.0, 100.0, 100.0], 3)
     csm, noise_psd = planned_csm(np.tile(np.eye(3), (5, 1)), snr=0.1, noise_psd=noise)
     plans = {p.method: p for p in plan(csm, noise_psd, dims=(3,) * 5, settings=PAPER, cov=0.05)}
@@ -90,14 +92,14 @@ def test_maximum_likelihood_needs_the_best_sensors_only_to_find_the_motion() -> 
     assert plans["three-sensor"].n_effective.max() > 1e6
 
 
-def test_two_channel_is_not_measured_by_a_bound_that_knows_less() -> None:
+def test_two_channel_has_no_efficiency() -> None:
     csm, noise_psd = planned_csm(np.tile(np.eye(2), (3, 1)), snr=0.1)
     found = plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)
     assert (found[0].n_effective < found[-1].n_effective).all()
     assert np.isnan(found[0].efficiency).all()
 
 
-def test_methods_that_such_sensors_do_not_allow_say_nothing() -> None:
+def test_methods_that_do_not_apply_have_no_plan() -> None:
     directions = np.vstack([np.eye(3), np.eye(3)[:1], np.eye(3)[:1]])
     csm, noise_psd = planned_csm(directions, snr=10)
     plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 1, 1), settings=PAPER, cov=0.05)}
@@ -105,7 +107,7 @@ def test_methods_that_such_sensors_do_not_allow_say_nothing() -> None:
     assert np.isfinite(plans["three-channel"].n_effective[0, [0, 3, 4]]).all()
 
 
-def test_motion_that_lacks_a_dimension_is_not_found_however_long() -> None:
+def test_motion_that_lacks_a_dimension_is_never_resolved() -> None:
     csm, noise_psd = planned_csm(planar_sensors(10), snr=100, motion=np.diag([1.0, 0.0]))
     plans = {p.method: p for p in plan(csm, noise_psd, dims=DIMS, settings=PAPER, cov=0.05)}
     for method in ("three-sensor", "maximum-likelihood"):
@@ -114,7 +116,7 @@ def test_motion_that_lacks_a_dimension_is_not_found_however_long() -> None:
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.5, 0.75])
-def test_segments_needed_is_the_least_number_that_is_enough(overlap: float) -> None:
+def test_segments_needed_is_the_smallest_sufficient_number(overlap: float) -> None:
     window = get_window("hann", 200)
     hop = round(200 * (1 - overlap))
     for wanted in (0.5, 1.0, 7.3, 1080.0):
@@ -123,13 +125,13 @@ def test_segments_needed_is_the_least_number_that_is_enough(overlap: float) -> N
         assert n == 1 or effective_averages(window, hop, n - 1) < wanted
 
 
-def test_the_mean_snr_is_the_one_asked_for() -> None:
+def test_the_mean_snr_is_the_requested_one() -> None:
     csm, noise_psd = planned_csm(planar_sensors(10), snr=50, noise_psd=np.arange(1.0, 7.0))
     snr = (np.diag(csm[0]).real - noise_psd[0]) / noise_psd[0]
     assert snr.mean() == pytest.approx(50)
 
 
-def test_plans_that_make_no_sense_are_refused() -> None:
+def test_invalid_plans_are_refused() -> None:
     directions = planar_sensors(10)
     csm, noise_psd = planned_csm(directions, snr=10)
     with pytest.raises(EstimatorError, match=r"c\.o\.v\."):

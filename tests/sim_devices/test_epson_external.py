@@ -94,7 +94,7 @@ async def mismatch(sensor: Sensor, truth: Source) -> float:
 
 
 @pytest.mark.parametrize("edge", ["rising", "falling"])
-async def test_samples_are_in_step_with_the_seconds(running: Running, edge: str) -> None:
+async def test_samples_are_synchronised_with_the_seconds(running: Running, edge: str) -> None:
     sensor = connecting(running, "pps", settings={"external": f"pps-{edge}"})
     whole_seconds = -paced_clock().utc_of(running.spec["epoch_ns"]) % 10**9 / 1e9
     # The system's UTC at world time 0 is known to some µs, and is another one here and there.
@@ -123,7 +123,7 @@ async def test_without_a_trigger_there_is_no_sample(running: Running) -> None:
         await record(DRIVER, sensor, 1, speed=SPEED)
 
 
-async def test_a_model_without_pps_is_named(running: Running) -> None:
+async def test_a_model_without_pps_is_refused(running: Running) -> None:
     sensor = connecting(running, "A352", settings={"external": "pps-rising"})
     with pytest.raises(WrongDeviceError, match=r'"pps-rising": only an M-A370 follows 1PPS'):
         await record(DRIVER, sensor, 1, speed=SPEED)
@@ -140,7 +140,7 @@ async def test_a_model_without_pps_is_named(running: Running) -> None:
         ),
     ],
 )
-async def test_what_an_a370_lacks_is_named(
+async def test_settings_that_an_a370_lacks_are_refused(
     running: Running, settings: dict[str, Any], said: str
 ) -> None:
     """As soon as the model is known: in the bench file, or from the device."""
@@ -167,7 +167,7 @@ def checked(some: list[Sensor]) -> None:
         ("A352", commands.FILTER_CTRL, commands.FILTERS["K512_FC460"]),
     ],
 )
-async def test_a_model_is_set_to_what_it_has(
+async def test_a_model_is_configured_with_its_own_settings(
     running: Running, name: str, register: commands.Register, expected: int
 ) -> None:
     """At 1000 Hz, with nothing said of filter and stabilisation."""
@@ -184,7 +184,7 @@ async def test_a_model_is_set_to_what_it_has(
         ("pps-falling", 0b101),
     ],
 )
-async def test_the_register_says_so(running: Running, external: str, bits: int) -> None:
+async def test_the_register_has_the_ext_setting(running: Running, external: str, bits: int) -> None:
     """MSC_CTRL: bit 6 EXT_SEL, bit 5 EXT_POL; 1PPS is code 4 or 5 in bits 7:5."""
     sensor = connecting(running, "pps", settings={"external": external})
     assert await low_byte(sensor, commands.MSC_CTRL) == bits << 5 | 0x06

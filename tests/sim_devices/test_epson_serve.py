@@ -54,7 +54,7 @@ async def blocks(sensor: Sensor, n_samples: int) -> list[Block]:
     return found
 
 
-async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+async def test_the_devices_information_is_reported(running: tuple[RunningDevice, ...]) -> None:
     (sensor,) = sensors(running[2], TABLES[2], model="M-A352")
     async with DRIVER.open([sensor], host_clock(SPEED)) as session:
         (information,) = session.information
@@ -64,7 +64,7 @@ async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, .
     assert information.temperature == pytest.approx(25.0, abs=0.6)
 
 
-async def test_three_devices_at_once_without_a_gap_feel_one_motion(
+async def test_three_devices_record_one_motion_without_gaps(
     running: tuple[RunningDevice, ...],
 ) -> None:
     n = 1000
@@ -87,7 +87,7 @@ async def test_three_devices_at_once_without_a_gap_feel_one_motion(
         assert np.all(np.abs(counts[:, 3] - 2634) < 140)
 
 
-async def test_the_device_is_left_quiet_and_found_streaming(
+async def test_a_device_is_left_idle_and_found_if_streaming(
     running: tuple[RunningDevice, ...],
 ) -> None:
     (sensor,) = sensors(running[0], TABLES[0])
@@ -113,7 +113,7 @@ async def test_another_serial_number_is_refused(running: tuple[RunningDevice, ..
         await blocks(sensor, 1)
 
 
-async def test_a_serial_number_changed_on_the_way_is_not_believed(
+async def test_a_corrupted_serial_number_is_not_accepted(
     running: tuple[RunningDevice, ...],
 ) -> None:
     host, _, number = running[2].port.removeprefix("socket://").partition(":")
@@ -168,7 +168,7 @@ async def test_a_serial_number_changed_on_the_way_is_not_believed(
         ),
     ],
 )
-async def test_what_the_device_cannot_do(
+async def test_impossible_settings_are_refused(
     running: tuple[RunningDevice, ...], changes: dict[str, object], message: str
 ) -> None:
     (sensor,) = sensors(running[0], TABLES[0], **changes)
@@ -176,7 +176,7 @@ async def test_what_the_device_cannot_do(
         await blocks(sensor, 1)
 
 
-async def test_other_rates_and_fields(running: tuple[RunningDevice, ...]) -> None:
+async def test_other_rates_and_fields_are_recorded(running: tuple[RunningDevice, ...]) -> None:
     channels = TABLES[0]["channels"]["A"][:2]
     settings = {"fields": ["z", "x"], "filter": "K128_FC36", "flags": False}
     (sensor,) = sensors(
@@ -186,7 +186,7 @@ async def test_other_rates_and_fields(running: tuple[RunningDevice, ...]) -> Non
     assert all(block.counts.shape[1] == 2 for block in found)
 
 
-async def test_silence_and_strangers_are_told_apart() -> None:
+async def test_silence_and_other_devices_are_distinguished() -> None:
     tasks: list[asyncio.Task[None] | None] = []
 
     async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -223,7 +223,7 @@ async def test_a_device_that_vanishes_ends_the_session() -> None:
                     pass
 
 
-def test_a_spec_that_cannot_be_served_says_why() -> None:
+def test_a_spec_that_cannot_be_served_is_refused_with_its_cause() -> None:
     table = device("A")
     wrong = spec(table)
     wrong["scenario"]["motion"]["spectra"] = []

@@ -45,7 +45,7 @@ def strike(**fault: Any) -> list[bytes]:  # noqa: ANN401 -- a line of a script
     return faults.send([UNIT] * 4, 1.0)
 
 
-def test_what_strikes_units() -> None:
+def test_faults_change_units() -> None:
     assert strike(kind="drop", count=2) == [UNIT] * 2
     assert strike(kind="cut", count=4) == [UNIT[:8] + UNIT[12:], *[UNIT] * 3]
     assert strike(kind="duplicate", count=2) == [UNIT] * 6
@@ -93,7 +93,7 @@ def test_latencies_are_exponential_or_up_to_the_next_poll() -> None:
     assert late.mean() == pytest.approx(8e-3, rel=0.1)  # 37 ms meets 16 phases in turn
 
 
-def test_a_stalled_device_sends_nothing_and_comes_back() -> None:
+def test_a_stalled_device_sends_nothing_and_returns() -> None:
     faults = LineFaults(parse([{"kind": "stall", "at": 1.0, "duration": 0.5, "every": 2.0}]), "A")
     faults.act(1.0)
     assert faults.send([UNIT], 1.4) == []
@@ -101,12 +101,12 @@ def test_a_stalled_device_sends_nothing_and_comes_back() -> None:
     assert faults.next_due() == 3.0
 
 
-def test_what_was_due_before_the_device_was_there_is_left_out() -> None:
+def test_faults_before_the_start_of_the_device_are_skipped() -> None:
     script = parse([{"kind": "drop", "at": 1.0, "every": 2.0}, {"kind": "reset", "at": 4.0}])
     assert LineFaults(script, "A", begin=6.0).next_due() == 7.0
 
 
-def test_what_lasts_may_have_begun_before_the_device_was_there() -> None:
+def test_lasting_faults_may_begin_before_the_start_of_the_device() -> None:
     script = parse([{"kind": "stall", "at": 0.0, "duration": 5.0}])
     for begin, sent in ((4.0, []), (6.0, [UNIT])):
         faults = LineFaults(script, "A", begin=begin)
@@ -114,13 +114,13 @@ def test_what_lasts_may_have_begun_before_the_device_was_there() -> None:
         assert faults.send([UNIT], begin) == sent
 
 
-def test_the_same_script_does_the_same() -> None:
+def test_a_script_has_the_same_effect_in_every_run() -> None:
     script = {"kind": "corrupt", "count": 5}
     assert strike(**script) == strike(**script) != strike(**script, seed=1)
 
 
 @pytest.mark.parametrize("cut", [100, 33, 1])
-def test_what_strikes_samples(cut: int) -> None:
+def test_faults_change_samples(cut: int) -> None:
     script: list[dict[str, Any]] = [
         {"kind": "spike", "at": 0.205, "level": 1000.0, "channel": 0},
         {"kind": "spike", "at": 0.395, "every": 0.3, "level": -7.0, "channel": 1},
@@ -146,7 +146,7 @@ def test_what_strikes_samples(cut: int) -> None:
     np.testing.assert_array_equal(counts, wanted)
 
 
-def test_a_wrong_script_says_what_is_wrong() -> None:
+def test_errors_in_a_script_are_reported() -> None:
     with pytest.raises(ScenarioError, match="batching has level 0; expected seconds above 0"):
         parse([{"kind": "batching", "at": 1.0}])
     with pytest.raises(ScenarioError) as caught:
@@ -186,7 +186,7 @@ async def connected(sensor: Sensor, clock: SystemClock) -> AsyncIterator[Session
         yield session
 
 
-async def test_every_sample_that_came_has_its_place(
+async def test_every_received_sample_has_its_index(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each received sample is the world's at its index: so every gap is exact."""
@@ -238,7 +238,7 @@ async def test_every_sample_that_came_has_its_place(
         ("reset", "pty", NoAnswerError),
     ],
 )
-async def test_what_ends_a_session(kind: str, port: str, error: type[Exception]) -> None:
+async def test_faults_that_end_a_session(kind: str, port: str, error: type[Exception]) -> None:
     table = device("A", port=port)
     fault = {"kind": kind, "at": 8.0, "every": 12.0, "duration": 1.0}
     with serving(spec(table, speed=SPEED) | {"faults": [fault]}) as (one,):
@@ -285,7 +285,7 @@ def test_a_script_in_a_file_joins_the_bench(tmp_path: Path) -> None:
         (None, r"cannot be read"),
     ],
 )
-def test_a_script_that_would_strike_nothing_is_refused(
+def test_a_script_without_effect_is_refused(
     tmp_path: Path, script: bytes | None, said: str
 ) -> None:
     template = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")

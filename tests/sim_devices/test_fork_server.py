@@ -55,14 +55,14 @@ def test_a_killed_device_leaves_the_others_and_no_file() -> None:
     assert not folder.exists()
 
 
-def test_no_device_outlives_a_server_that_is_killed() -> None:
+def test_no_device_outlives_a_killed_server() -> None:
     with DeviceServer() as server, server.serve(spec(device("A"))) as running:
         descriptors = pid_descriptors(running)
         os.kill(server.pid, signal.SIGKILL)
         wait_for_end(descriptors)
 
 
-def test_the_server_serves_on_after_a_specification_that_it_cannot() -> None:
+def test_the_server_continues_after_an_invalid_specification() -> None:
     wrong = spec(device("A"))
     wrong["scenario"]["motion"]["spectra"] = []
     with pytest.raises(ServeError, match=r"did not start: .*spectra") as refused, serving(wrong):

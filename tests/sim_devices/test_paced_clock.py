@@ -53,14 +53,14 @@ def clock(file: Path, system: System) -> Iterator[PacedClock]:
     clock.close()
 
 
-def test_without_participants_it_is_the_systems_clock(clock: PacedClock, system: System) -> None:
+def test_without_participants_the_clock_is_the_systems(clock: PacedClock, system: System) -> None:
     assert clock.now_ns() == system.ns
     system.ns += NS
     assert clock.now_ns() == system.ns
     assert clock.left_out == 0
 
 
-def test_it_stands_still_while_a_participant_is_behind(clock: PacedClock, system: System) -> None:
+def test_the_clock_stops_while_a_participant_is_behind(clock: PacedClock, system: System) -> None:
     began = clock.now_ns()
     with clock.participate() as first, clock.participate() as second:
         first.let_run_until(began + 50 * MS)
@@ -80,7 +80,7 @@ def test_it_stands_still_while_a_participant_is_behind(clock: PacedClock, system
     assert clock.left_out == pytest.approx(2.0 - 0.05)
 
 
-def test_it_never_goes_back(clock: PacedClock, system: System) -> None:
+def test_the_clock_never_decreases(clock: PacedClock, system: System) -> None:
     began = clock.now_ns()
     with clock.participate() as participant:
         participant.let_run_until(began + 60 * MS)
@@ -91,7 +91,7 @@ def test_it_never_goes_back(clock: PacedClock, system: System) -> None:
 
 
 @pytest.mark.parametrize("is_held", [False, True])
-def test_it_never_goes_back_for_who_is_interrupted_while_looking(
+def test_the_clock_never_decreases_for_an_interrupted_reader(
     clock: PacedClock, file: Path, system: System, is_held: bool
 ) -> None:
     """Between any two steps another process may find that the clock is held, and run for long."""
@@ -119,7 +119,7 @@ def test_it_never_goes_back_for_who_is_interrupted_while_looking(
     interrupting.close()
 
 
-def test_what_two_leave_out_at_the_same_time_is_left_out_once(
+def test_time_left_out_by_two_processes_is_left_out_once(
     clock: PacedClock, file: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = PacedClock(file, system_ns=system)
@@ -148,7 +148,9 @@ def test_what_two_leave_out_at_the_same_time_is_left_out_once(
     other.close()
 
 
-def test_all_who_map_the_file_see_one_time(clock: PacedClock, file: Path, system: System) -> None:
+def test_all_processes_with_the_file_have_one_time(
+    clock: PacedClock, file: Path, system: System
+) -> None:
     other = PacedClock(file, system_ns=system)
     with other.participate() as participant:
         began = clock.now_ns()
@@ -159,7 +161,7 @@ def test_all_who_map_the_file_see_one_time(clock: PacedClock, file: Path, system
     other.close()
 
 
-def test_it_may_run_at_another_rate(tmp_path: Path, system: System) -> None:
+def test_the_clock_may_have_another_rate(tmp_path: Path, system: System) -> None:
     PacedClock.create(tmp_path / "clock", rate=2.5).close()
     clock = PacedClock(tmp_path / "clock", system_ns=system)
     began = clock.now_ns()
@@ -168,7 +170,7 @@ def test_it_may_run_at_another_rate(tmp_path: Path, system: System) -> None:
     clock.close()
 
 
-def test_who_leaves_is_waited_for_no_longer_and_the_slot_is_free(
+def test_the_clock_does_not_wait_for_a_participant_that_left(
     clock: PacedClock, system: System
 ) -> None:
     for _ in range(3):
@@ -180,7 +182,9 @@ def test_who_leaves_is_waited_for_no_longer_and_the_slot_is_free(
     assert len(list(clock.path.parent.glob("clock.*[0-9]"))) == 1
 
 
-def test_who_is_killed_is_waited_for_no_longer(clock: PacedClock, system: System) -> None:
+def test_the_clock_does_not_wait_for_a_killed_participant(
+    clock: PacedClock, system: System
+) -> None:
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -207,7 +211,7 @@ def test_who_is_killed_is_waited_for_no_longer(clock: PacedClock, system: System
     assert now >= behind + NS
 
 
-def test_an_event_loop_runs_by_it_and_holds_it(file: Path) -> None:
+def test_an_event_loop_uses_the_clock_and_stops_it(file: Path) -> None:
     clock = PacedClock(file)
 
     async def main() -> float:

@@ -20,7 +20,7 @@ def test_a_named_scenario_survives_its_table_and_can_be_sampled(name: str) -> No
     assert np.all(np.isfinite(samples))
 
 
-def test_an_unknown_name_is_told_with_the_known_ones() -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ScenarioError, match="no scenario 'fig6'; expected one of fig4, fig5"):
         paper_scenarios.named("fig6")
 

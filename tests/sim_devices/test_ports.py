@@ -25,7 +25,7 @@ class Deaf:
         """Nobody cares."""
 
 
-async def test_the_address_goes_before_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_address_is_removed_before_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of a closed terminal is given to the next one made, by whatever process."""
     line = PseudoTerminal(Deaf())
     await line.open()

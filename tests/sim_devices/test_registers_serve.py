@@ -82,7 +82,7 @@ async def read(
     return found
 
 
-async def test_two_slaves_on_one_bus_at_the_instants_they_tell(
+async def test_two_slaves_on_one_bus_are_recorded_at_their_instants(
     running: tuple[RunningDevice, ...],
 ) -> None:
     found = await read(on_bus(running[0]), 150, host_clock(SPEED))
@@ -100,7 +100,7 @@ async def test_two_slaves_on_one_bus_at_the_instants_they_tell(
     assert len({tuple(b[0].counts[0]) for b in found.values()}) == 2  # not the same slave twice
 
 
-async def test_floats_over_tcp(running: tuple[RunningDevice, ...]) -> None:
+async def test_floats_over_tcp_are_recorded(running: tuple[RunningDevice, ...]) -> None:
     chosen = sensors(running[1], TABLES[1], settings={"preset": "labjack-ain"})
     found = await read(chosen, 40, host_clock(SPEED))
     counts = np.concatenate([block.counts for block in found["C"]])
@@ -109,7 +109,7 @@ async def test_floats_over_tcp(running: tuple[RunningDevice, ...]) -> None:
     assert all(block.instants_ns is not None for block in found["C"])
 
 
-async def test_registers_with_others_between_are_read_apart() -> None:
+async def test_registers_with_gaps_are_read_separately() -> None:
     """A device refuses a request for registers it does not have."""
     settings = {
         "addresses": [10, 20, 300],
@@ -129,7 +129,7 @@ async def test_registers_with_others_between_are_read_apart() -> None:
             await read([whole], 1, host_clock(SPEED))
 
 
-async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> None:
+async def test_an_absent_device_is_named_in_the_error(running: tuple[RunningDevice, ...]) -> None:
     absent = [
         s.model_copy(update={"settings": {"preset": "witmotion", "device_id": 7, "timeout": 0.05}})
         for s in on_bus(running[0])
@@ -147,7 +147,7 @@ async def test_who_is_not_there_is_named(running: tuple[RunningDevice, ...]) -> 
         await read(sensors(running[1], TABLES[1], settings={}), 1, host_clock(SPEED))
 
 
-async def test_a_slave_that_is_off_for_a_while_comes_back_set_up(tmp_path: Path) -> None:
+async def test_a_slave_that_was_off_is_configured_again(tmp_path: Path) -> None:
     """The other on the bus is polled on; who comes back is set to its rate again."""
     off = {"kind": "silent", "sensors": ["B"], "at": 29.0, "every": 40.0, "duration": 8.0}
     log = tmp_path / "sent"
@@ -216,7 +216,7 @@ async def test_a_cancellation_is_not_lost_to_a_reply_that_comes_with_it(
             await reading
 
 
-async def test_a_bus_is_taken_up_again_without_the_one_who_is_silent(
+async def test_a_bus_is_opened_again_without_a_silent_slave(
     running: tuple[RunningDevice, ...],
 ) -> None:
     both = on_bus(running[0], timeout=0.05)
@@ -231,7 +231,7 @@ async def test_a_bus_is_taken_up_again_without_the_one_who_is_silent(
     assert first.sensor == "A"
 
 
-async def test_replies_of_others_and_short_ones_are_named_and_counted() -> None:
+async def test_replies_of_other_units_and_short_ones_are_counted() -> None:
     """A slave that answers in turn as it should, as another unit, too shortly, and not at all."""
     tasks: list[asyncio.Task[None] | None] = []
 
@@ -285,7 +285,7 @@ async def test_a_bus_that_vanishes_ends_the_session() -> None:
                     pass
 
 
-async def test_a_late_reply_never_answers_the_next_request() -> None:
+async def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
     """A slave that answers one request too late: its reply must not be taken for the next one."""
     from pymodbus.framer import FramerRTU  # noqa: PLC0415
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 RATE = 200.0
 
 
-def test_the_end_is_where_the_times_say() -> None:
+def test_the_end_agrees_with_the_sample_times() -> None:
     spec = device_spec(device("A", "text"))
     source = Source(scenario("A"), spec)
     samples = Samples(source, spec.sensors)
@@ -34,7 +34,7 @@ def test_the_end_is_where_the_times_say() -> None:
         assert np.searchsorted(times, now, side="right") == min(2, start)
 
 
-def test_a_fifo_nobody_read_for_a_day_answers_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fifo_unread_for_a_day_replies_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
     """It simulates what it holds, not what found no room."""
     made: list[int] = []
     counts = Source.counts
@@ -72,7 +72,7 @@ def test_a_fifo_that_lags_simulates_each_second_once(monkeypatch: pytest.MonkeyP
     assert len(made) == len(set(made))
 
 
-def test_a_scream_server_whose_client_is_gone_rests() -> None:
+def test_a_scream_server_without_client_is_idle() -> None:
     spec = replace(device_spec(device("A", "guralp", port="udp")), utc_ns=1_795_219_200 * 10**9)
     server = create_guralp(spec, Source(scenario("A"), spec))[0].endpoint
     server.receive(b"GCFSEND:B\0", 1.0)

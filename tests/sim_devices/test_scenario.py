@@ -39,12 +39,12 @@ def test_the_documented_example_is_valid_and_survives_its_table() -> None:
     assert example.sensors["B"].sampling_rate == 200.0
 
 
-def test_what_others_read_from_the_table_is_no_fault() -> None:
+def test_keys_of_other_modules_are_accepted() -> None:
     table = {**documented(), "speed": 10.0, "faults": {"A": "unplugged"}}
     assert Scenario.from_dict(table, sampling_rate=200.0).names == ("A", "B", "C")
 
 
-def test_every_fault_is_told_with_its_key_its_value_and_what_was_expected() -> None:
+def test_every_error_has_key_value_and_expectation() -> None:
     table = documented()
     table["motion"]["spectra"][0]["level"] = -1.0
     table["sensors"]["A"]["gain"] = "much"
@@ -92,12 +92,12 @@ def test_a_sensor_must_fit_its_motion(
         scenario(motion, A=sensor)
 
 
-def test_an_unknown_sensor_is_named_with_the_known_ones() -> None:
+def test_an_unknown_sensor_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ScenarioError, match="no sensor 'Z' in the simulation; it has A, B"):
         World(scenario(A={}, B={})).samples("Z", 0, 1)
 
 
-def test_rotation_turns_the_channels_and_not_the_motion() -> None:
+def test_rotation_rotates_the_channels_and_not_the_motion() -> None:
     turned = scenario(A={"rotation": 10.0}).directions("A")
     c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
     assert np.allclose(turned, [[c, s, 0], [-s, c, 0], [0, 0, 1]])

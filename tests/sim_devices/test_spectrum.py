@@ -69,7 +69,7 @@ def test_a_sum_adds() -> None:
         ((2.0, 1.0), (1.0, 1.0), "must increase strictly"),
     ],
 )
-def test_a_table_that_is_none_is_refused(
+def test_an_invalid_table_is_refused(
     frequency: tuple[float, ...], level: tuple[float, ...], said: str
 ) -> None:
     with pytest.raises(ValidationError, match=said):

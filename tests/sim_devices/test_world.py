@@ -45,7 +45,7 @@ def csm(*channels: FloatArray) -> tuple[FloatArray, ComplexArray, int]:
     return frequency, matrix, n_segments
 
 
-def test_motion_and_noise_have_the_psd_asked_for_to_statistical_error() -> None:
+def test_motion_and_noise_have_the_requested_psd_within_statistical_error() -> None:
     spectra = [
         {"shape": "mixed", "level": 1.0},
         {"shape": "pink", "level": 5.0},
@@ -89,7 +89,7 @@ def test_cross_psd_follows_the_mixing_matrix() -> None:
     assert np.all(np.abs(matrix[band].mean(axis=0) - wanted) < 5 * error)
 
 
-def test_sensors_feel_one_motion_whatever_their_rate_and_clock() -> None:
+def test_sensors_measure_one_motion_at_any_rate_and_clock() -> None:
     sensors = {
         "A": {},
         "B": {"sampling_rate": 333.0, "clock": {"offset": 0.123, "ppm": 40.0, "wander": 1.0}},
@@ -101,7 +101,7 @@ def test_sensors_feel_one_motion_whatever_their_rate_and_clock() -> None:
     assert np.array_equal(world.samples("B", 1_000_000, 300), world.motion("A").at(at_b))
 
 
-def test_any_block_can_be_entered_and_read_in_any_pieces() -> None:
+def test_any_block_can_be_read_in_any_pieces() -> None:
     noisy = {"A": {"noise": white(1.0), "clock": {"ppm": -20.0, "wander": 0.3}}}
     whole = World(scenario(noisy)).samples("A", 60_000, 20_000)
     other = World(scenario(noisy))
@@ -160,7 +160,7 @@ class _Given(GaussianSeries):
         return self._given[None, first : first + n]
 
 
-def test_delay_gain_and_turn_do_what_they_say() -> None:
+def test_delay_gain_and_rotation_are_applied() -> None:
     delay, angle = 0.0137, 25.0
     sensors = {"A": {}, "B": {"delay": delay, "gain": [2.0, 1.0, 0.5], "rotation": angle}}
     world = World(scenario(sensors))
@@ -171,7 +171,7 @@ def test_delay_gain_and_turn_do_what_they_say() -> None:
     assert np.std(felt - expected) < 1e-6 * np.std(expected)
 
 
-def test_a_response_shapes_what_the_sensor_feels() -> None:
+def test_a_response_filters_the_motion() -> None:
     corner = 2 * np.pi * 20.0
     low_pass = {"poles": [[-corner, 0.0]], "normalised_at": 0.001}
     model = scenario({"A": {}, "B": {"response": low_pass}})
@@ -183,7 +183,7 @@ def test_a_response_shapes_what_the_sensor_feels() -> None:
     assert np.max(np.abs(found - 1 / (1 + 1j * frequency[band] / 20.0))) < 0.01
 
 
-def test_noise_is_each_sensors_and_each_channels_own() -> None:
+def test_noise_is_independent_between_sensors_and_channels() -> None:
     own = {"noise": white(1.0), "gain": 0.0}
     model = scenario({"A": own, "B": own, "C": {**own, "seed": 5}, "D": {**own, "seed": 6}})
     channels = np.concatenate([World(model).samples(n, 0, 100_000).T for n in model.names])
@@ -192,7 +192,7 @@ def test_noise_is_each_sensors_and_each_channels_own() -> None:
     assert np.max(np.abs(off)) < 5 / np.sqrt(100_000)
 
 
-def test_the_true_cross_spectral_matrix_is_what_the_samples_have() -> None:
+def test_the_samples_have_the_true_cross_spectral_matrix() -> None:
     sensors: dict[str, dict[str, Any]] = {
         "A": {"noise": white(0.5)},
         "B": {"rotation": [40, 20, 0], "delay": 0.004, "noise": white(2.0), "gain": 1.5},

@@ -44,7 +44,7 @@ def checked() -> BlockValidator:
 
 
 @pytest.mark.parametrize("case", FAULTY)
-def test_what_the_file_cannot_hold_is_named(case: str) -> None:
+def test_blocks_that_the_file_cannot_hold_are_refused(case: str) -> None:
     changes, said = FAULTY[case]
     with pytest.raises(FaultyDriverError, match=f"^bus: driver 'played' yielded .*{said}"):
         checked().validated(replace(block("a", 100, 10, NOW), **changes))
@@ -60,12 +60,12 @@ def test_what_the_file_cannot_hold_is_named(case: str) -> None:
         (Event("a", "status", "", cast("HostTime", 5)), "an event received at 5"),
     ],
 )
-def test_what_is_no_item_of_its_sensors_is_named(item: object, said: str) -> None:
+def test_items_of_other_types_or_sensors_are_refused(item: object, said: str) -> None:
     with pytest.raises(FaultyDriverError, match=said):
         checked().validated(item)
 
 
-def test_instants_come_always_or_never() -> None:
+def test_sample_times_are_in_all_blocks_or_none() -> None:
     one = checked()
     one.validated(block("a", 0, 10, NOW))
     one.validated(block("b", 0, 10, NOW, instants_ns=np.arange(10)))
@@ -74,12 +74,12 @@ def test_instants_come_always_or_never() -> None:
 
 
 @pytest.mark.parametrize("kind", ["i1", "u2", "i4", "i8", "u8", "f4", "f8"])
-def test_counts_of_any_type_that_fit_are_good(kind: str) -> None:
+def test_counts_of_any_fitting_type_are_valid(kind: str) -> None:
     one = block("a", 0, 5, NOW)
     item = replace(one, counts=one.counts.astype(kind))
     assert checked().validated(item) is item
 
 
-def test_events_of_the_port_are_good() -> None:
+def test_events_of_the_port_are_valid() -> None:
     item = Event("", "status", "of the port", NOW)
     assert checked().validated(item) is item

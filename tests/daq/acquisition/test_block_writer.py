@@ -121,7 +121,7 @@ def test_a_sensor_without_a_block_since_it_was_connected_again_has_a_gap_at_the_
         assert recording.sensors[0].gaps["reason"].tolist() == [b"lost at the end"]
 
 
-def test_that_a_sensor_was_late_is_recorded_only_if_it_is_lost_afterwards(tmp_path: Path) -> None:
+def test_a_late_event_is_recorded_only_if_the_sensor_is_lost_afterwards(tmp_path: Path) -> None:
     with running(tmp_path / "r.h5") as run:
         run.samples(0)
         run.write(SensorLate(run.event(EventKind.LATE)))

@@ -64,7 +64,7 @@ def _kind(item: Item) -> list[str]:
     return [event.kind] if isinstance(event, Event) else []
 
 
-async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
+async def test_a_stall_is_reported_before_the_driver_closes_its_session() -> None:
     """A LabJack is told to stop its stream, and one that is gone takes 2 s not to answer."""
     device = PlayedDevice()
     driver = SlowToLeave({"A": device})
@@ -90,7 +90,7 @@ async def test_a_stall_is_said_before_the_driver_has_left_the_device() -> None:
     assert kinds == ["connected", "stalled", "connected"]
 
 
-def test_only_a_session_that_lived_as_long_as_the_wait_shortens_it() -> None:
+def test_only_a_session_as_long_as_the_delay_resets_the_delay() -> None:
     back_off = BackOff()
     assert [back_off.next_delay() for _ in range(6)] == [0.2, 0.4, 0.8, 1.6, 3.2, MAX_RETRY_DELAY]
     back_off.session_lasted(MAX_RETRY_DELAY - 0.1)
@@ -99,7 +99,7 @@ def test_only_a_session_that_lived_as_long_as_the_wait_shortens_it() -> None:
     assert back_off.next_delay() == 0.2
 
 
-async def test_a_device_that_comes_and_goes_is_tried_less_and_less_often() -> None:
+async def test_delays_grow_for_a_device_that_connects_only_briefly() -> None:
     """One block is no success: it would be set up anew five times a second, for weeks."""
     device, clock = PlayedDevice(), ManualClock()
     driver = PlayedDriver({"A": device})
@@ -177,13 +177,13 @@ async def test_a_pause_within_the_patience_of_the_session_ends_nothing(pause: fl
     assert device.n_sessions == 1
 
 
-async def test_lost_is_said_once_the_patience_of_the_session_is_over() -> None:
+async def test_a_loss_is_reported_after_the_patience_of_the_session() -> None:
     device = PlayedDevice()
     kinds = await kinds_of(driver_with(device, 3.0), device, ManualClock(), [0.1, 3.5])
     assert kinds == ["connected", "late", "stalled", "connected"]
 
 
-async def test_a_session_that_states_nothing_has_the_patience_of_the_contract() -> None:
+async def test_a_session_without_patience_has_the_default() -> None:
     device = PlayedDevice()
     driver = driver_with(device, None)
     kinds = await kinds_of(driver, device, ManualClock(), [0.1, 0.9 * DEFAULT_PATIENCE, 0.1])
@@ -191,7 +191,7 @@ async def test_a_session_that_states_nothing_has_the_patience_of_the_contract() 
 
 
 @pytest.mark.parametrize("interval", [3.0, 4.0, 25.0])
-async def test_a_logger_that_writes_now_and_then_is_not_reconnected_for_ever(
+async def test_an_infrequent_logger_is_not_reconnected_repeatedly(
     interval: float,
 ) -> None:
     """A tenth of a second comes at once, the next much later: its interval is learned."""
@@ -205,7 +205,7 @@ async def test_a_logger_that_writes_now_and_then_is_not_reconnected_for_ever(
     assert len(kinds[n_first:]) > 10  # late, and on time again: it goes on
 
 
-async def test_what_one_session_learned_the_next_one_knows() -> None:
+async def test_learned_intervals_are_passed_to_the_next_session() -> None:
     device = PlayedDevice()
     driver = driver_with(device, 1.0)
     clock = ManualClock()
@@ -272,7 +272,7 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
     assert "the computer was suspended for 37" in said[0].text
 
 
-def test_host_time_goes_on_while_the_computer_is_suspended() -> None:
+def test_host_time_continues_while_the_computer_is_suspended() -> None:
     awake_ns = asleep_ns = 0
     clock = SystemClock(2.0, monotonic_ns=lambda: awake_ns, always_ns=lambda: awake_ns + asleep_ns)
     before = clock.now()

@@ -99,7 +99,7 @@ async def test_the_same_adapter_is_found_under_another_name() -> None:
     assert texts(items) == ["on /dev/ttyUSB1"]
 
 
-async def test_another_adapter_is_taken_if_the_device_has_the_serial_number() -> None:
+async def test_another_adapter_is_accepted_if_the_serial_number_matches() -> None:
     usb = Usb(ttyUSB0=FTDI_1)
     connection, queue = await run(usb)
     items = await moved_to(usb, connection, queue)
@@ -107,7 +107,7 @@ async def test_another_adapter_is_taken_if_the_device_has_the_serial_number() ->
 
 
 @pytest.mark.parametrize("serial_number", ["2", ""])
-async def test_another_device_on_a_new_port_is_not_taken(serial_number: str) -> None:
+async def test_another_device_on_a_new_port_is_refused(serial_number: str) -> None:
     usb = Usb(ttyUSB0=FTDI_1, ttyUSB5="0403:6001 FT5")
     stranger, other = PlayedDevice(serial_number=serial_number), PlayedDevice(serial_number="1")
     usb.driver.devices["/dev/ttyUSB5"] = other  # there before: another sensor may have it

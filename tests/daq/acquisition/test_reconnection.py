@@ -53,7 +53,7 @@ def table(name: str, driver: str) -> dict[str, Any]:
     return device(name, driver, port="tcp", channels={name: LABJACK})
 
 
-async def test_gaps_are_exact_where_the_device_counted_on(tmp_path: Path) -> None:
+async def test_gaps_are_exact_if_the_device_continued_to_count(tmp_path: Path) -> None:
     tables = [table(name, driver) for name, (driver, _) in CASES.items()]
     told = spec(*tables, speed=SPEED, age=0.0)
     told["faults"] = [
@@ -112,7 +112,7 @@ PERIOD = 0.5
 """Of the packets, s of world time: 100 scans of five."""
 
 
-async def test_a_stall_is_noticed_in_two_block_periods_and_a_lost_block_is_no_stall(
+async def test_a_stall_is_detected_in_two_block_periods_and_a_lost_block_is_no_stall(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(

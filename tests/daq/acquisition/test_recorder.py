@@ -130,7 +130,7 @@ async def test_every_sensor_is_recorded(tmp_path: Path) -> None:
         assert kinds[-1] == ("", "stopped")
 
 
-async def test_all_failures_at_the_start_come_at_once(tmp_path: Path) -> None:
+async def test_all_failures_at_the_start_are_reported_together(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b", "c")
     run.device("a").failure = NotConnectedError("sensor 'a' on a: no such port")
     run.device("c").failure = NoAnswerError("sensor 'c' on c: no answer")
@@ -143,7 +143,7 @@ async def test_all_failures_at_the_start_come_at_once(tmp_path: Path) -> None:
     assert run.device("b").left_quiet
 
 
-async def test_a_device_that_breaks_its_protocol_at_the_start_is_a_device_in_trouble(
+async def test_a_protocol_error_at_the_start_is_a_device_error(
     tmp_path: Path,
 ) -> None:
     run = Run(tmp_path / "r.h5", "a")
@@ -152,7 +152,7 @@ async def test_a_device_that_breaks_its_protocol_at_the_start_is_a_device_in_tro
         await run.record()
 
 
-async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> None:
+async def test_a_lost_device_returns_and_the_other_continues(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     async with run.going():
         run.send("a", 0, 200)
@@ -178,7 +178,7 @@ async def test_a_lost_device_returns_and_the_other_goes_on(tmp_path: Path) -> No
         assert said[1][1] == "cable"
 
 
-async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -> None:
+async def test_a_stalled_device_is_detected_and_reconnected(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
         run.send("a", 0, 100)
@@ -194,7 +194,7 @@ async def test_a_stalled_device_is_noticed_and_connected_again(tmp_path: Path) -
         assert kinds == ["connected", "late", "stalled", "connected"]
 
 
-async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(tmp_path: Path) -> None:
+async def test_one_lost_block_only_makes_a_sensor_late(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
         run.send("a", 0, 50)
@@ -210,7 +210,7 @@ async def test_one_lost_block_makes_a_sensor_late_and_nothing_else(tmp_path: Pat
         assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (100, 50, 0)
 
 
-async def test_a_word_of_the_decoder_does_not_make_a_sensor_lost(tmp_path: Path) -> None:
+async def test_events_of_the_decoder_do_not_make_a_sensor_lost(tmp_path: Path) -> None:
     """Decoders call an answer or a block refused, too."""
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
@@ -226,7 +226,7 @@ async def test_a_word_of_the_decoder_does_not_make_a_sensor_lost(tmp_path: Path)
         assert not run.statuses[-1].sensors["a"].state.is_lost
 
 
-async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> None:
+async def test_a_faulty_block_ends_only_its_sensors_session(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     async with run.going():
         run.send("a", 0, 100)
@@ -247,7 +247,7 @@ async def test_a_faulty_block_ends_its_sensors_session_only(tmp_path: Path) -> N
         ]
 
 
-async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> None:
+async def test_an_item_that_is_no_block_ends_only_its_session(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     items: asyncio.Queue[Any] = run.device("a").items
     async with run.going():
@@ -262,7 +262,7 @@ async def test_what_is_no_block_at_all_ends_its_session_only(tmp_path: Path) -> 
         ]
 
 
-async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
+async def test_a_driver_that_does_not_close_its_session_does_not_delay_the_end(
     tmp_path: Path,
 ) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
@@ -278,7 +278,7 @@ async def test_a_driver_that_does_not_leave_its_device_does_not_hold_up_the_end(
         ]
 
 
-async def test_a_driver_that_cannot_be_ended_is_left_alone(tmp_path: Path) -> None:
+async def test_a_driver_that_cannot_be_cancelled_is_abandoned(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").may_end = may_end = asyncio.Event()
     async with run.going():
@@ -294,7 +294,7 @@ async def test_a_driver_that_cannot_be_ended_is_left_alone(tmp_path: Path) -> No
     await asyncio.wait([left])
 
 
-async def test_who_says_nothing_on_the_control_port_does_not_hold_up_the_end(
+async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
     tmp_path: Path,
 ) -> None:
     run = Run(tmp_path / "r.h5", "a")
@@ -338,7 +338,7 @@ async def test_a_wrong_rate_is_refused_at_the_start(tmp_path: Path) -> None:
         await run.record()
 
 
-async def test_a_slightly_different_rate_is_taken_over(tmp_path: Path) -> None:
+async def test_a_slightly_different_rate_is_accepted(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").sampling_rate = 100.1
     async with run.going():
@@ -362,7 +362,7 @@ async def test_repeated_blocks_are_recorded_once(tmp_path: Path) -> None:
         assert [text.split()[0] for text in said] == ["100", "150"]
 
 
-async def test_a_fault_in_a_driver_concerns_its_device_only(tmp_path: Path) -> None:
+async def test_an_error_in_a_driver_affects_only_its_device(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     async with run.going():
         run.send("a", 0, 100)
@@ -375,7 +375,7 @@ async def test_a_fault_in_a_driver_concerns_its_device_only(tmp_path: Path) -> N
         assert ("disconnected", "a bug") in [(e.kind, e.text) for e in recording.events]
 
 
-async def test_the_duration_is_of_the_devices(tmp_path: Path) -> None:
+async def test_the_duration_is_measured_in_device_time(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     run.duration = 2.0
     run.send("a", 0, 200)
@@ -386,7 +386,7 @@ async def test_the_duration_is_of_the_devices(tmp_path: Path) -> None:
     assert [sensor.samples for sensor in status.sensors.values()] == [200, 200]
 
 
-async def test_a_lost_sensor_is_not_waited_for_beyond_the_duration(tmp_path: Path) -> None:
+async def test_the_run_does_not_wait_for_a_lost_sensor_beyond_the_duration(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     run.duration = 2.0
     async with run.going() as task:
@@ -412,7 +412,7 @@ async def test_sensors_on_one_port_share_a_session(tmp_path: Path) -> None:
     assert run.device("bus").n_sessions == 1
 
 
-async def test_commands_from_outside(tmp_path: Path) -> None:
+async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going() as task:
         run.send("a", 0, 100)
@@ -437,7 +437,7 @@ async def test_commands_from_outside(tmp_path: Path) -> None:
         assert recording.events[-1].text == "stopped by command"
 
 
-async def test_nonsense_on_the_control_port_harms_nothing(tmp_path: Path) -> None:
+async def test_invalid_requests_to_the_control_port_have_no_effect(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
         run.send("a", 0, 100)
@@ -457,7 +457,7 @@ async def test_nonsense_on_the_control_port_harms_nothing(tmp_path: Path) -> Non
         assert (await asyncio.to_thread(ask, run.path, "status"))["closed"] is False
 
 
-async def test_stopped_before_it_began(tmp_path: Path) -> None:
+async def test_a_run_stopped_before_its_start_leaves_no_file(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     run.stop.set()
     status = await run.record()
@@ -465,7 +465,7 @@ async def test_stopped_before_it_began(tmp_path: Path) -> None:
     assert not run.path.exists()
 
 
-async def test_a_file_that_cannot_be_made(tmp_path: Path) -> None:
+async def test_a_file_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "r.h5").write_text("precious", encoding="utf-8")
     run = Run(tmp_path / "r.h5", "a")
     with pytest.raises(RecordingError, match="exists already"):
@@ -525,7 +525,7 @@ except RecordingError as error:
 """
 
 
-def test_a_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_run_with_an_error(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     # A process of its own: HDF5 may crash the interpreter when it exits with what it cannot write.
     said = subprocess.run(
@@ -584,7 +584,7 @@ asyncio.run(main())
 """
 
 
-def test_a_recording_that_the_disk_refuses_goes_on_in_another_file(tmp_path: Path) -> None:
+def test_a_recording_continues_in_another_file_after_a_disk_error(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     said = subprocess.run(
         [sys.executable, "-c", REFUSED_ONCE, str(path)],
@@ -651,7 +651,7 @@ def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
     assert verify(path).closed
 
 
-def test_the_usual_path() -> None:
+def test_the_default_path_has_bench_and_time() -> None:
     path = recording_path(bench("a"), ManualClock(0).now())
     assert path.as_posix() == "recordings/played-bench-20010909T014640Z.h5"
 

@@ -100,7 +100,7 @@ def check_against_truth(path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["SIGINT", "stop"])
-def test_it_closes_the_file_when_asked(
+def test_the_recorder_closes_its_file_on_a_signal(
     running: tuple[RunningDevice, ...], tmp_path: Path, how: str
 ) -> None:
     path = tmp_path / "r.h5"
@@ -123,7 +123,7 @@ def test_it_closes_the_file_when_asked(
     check_against_truth(path)
 
 
-def test_killed_in_the_middle_nothing_acknowledged_is_lost(
+def test_a_killed_recorder_loses_no_acknowledged_rows(
     running: tuple[RunningDevice, ...], tmp_path: Path
 ) -> None:
     path = tmp_path / "r.h5"

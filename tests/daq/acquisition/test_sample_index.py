@@ -40,7 +40,7 @@ def test_within_a_session_a_jump_is_a_gap_of_that_length() -> None:
     assert continuity.next_sample == 25
 
 
-def test_an_estimate_of_the_protocol_stays_one() -> None:
+def test_an_estimate_of_the_protocol_remains_an_estimate() -> None:
     continuity = SampleIndexer(RATE)
     continuity.place(block(0, 10, 0.1))
     placed = continuity.place(block(15, 10, 0.25, flags=BlockFlag.MISSING_ESTIMATED))
@@ -68,7 +68,7 @@ def test_a_new_session_is_placed_by_host_time() -> None:
     assert follows.block.first_sample == 530
 
 
-def test_a_session_that_is_resumed_goes_on_in_the_index_of_the_last() -> None:
+def test_a_resumed_session_continues_the_index_of_the_last() -> None:
     continuity = SampleIndexer(RATE)
     continuity.place(block(0, 10, 0.1))
     continuity.new_session("refused")
@@ -82,7 +82,7 @@ def test_a_session_that_is_resumed_goes_on_in_the_index_of_the_last() -> None:
     assert placed.gap == Gap(620, 10, "lost", estimated=False)
 
 
-def test_device_time_makes_it_exact() -> None:
+def test_device_time_makes_the_gap_exact() -> None:
     continuity = SampleIndexer(RATE)
     utc = BlockFlag.DEVICE_UTC
     continuity.place(block(0, 10, 0.1, flags=utc, counter=10**18))
@@ -92,7 +92,7 @@ def test_device_time_makes_it_exact() -> None:
     assert placed.gap == Gap(10, 290, "stalled", estimated=False)
 
 
-def test_what_a_device_sends_again_after_a_break_is_recorded_once() -> None:
+def test_samples_sent_again_after_a_break_are_recorded_once() -> None:
     continuity = SampleIndexer(RATE)
     utc = BlockFlag.DEVICE_UTC
     continuity.place(block(0, 200, 2.0, flags=utc, counter=10**18))
@@ -115,7 +115,7 @@ def test_a_device_that_returns_with_another_date_is_placed_by_host_time(date: in
     assert placed.gap == Gap(10, 510, "disconnected", estimated=True)
 
 
-def test_a_reset_in_the_middle() -> None:
+def test_a_reset_within_a_session_is_placed_by_host_time() -> None:
     continuity = SampleIndexer(RATE)
     continuity.place(block(0, 100, 1.0))
     placed = continuity.place(block(0, 10, 3.1, flags=BlockFlag.CLOCK_RESTART, reason="reset"))
@@ -131,7 +131,7 @@ def test_a_session_that_was_lost_without_a_sample_changes_nothing() -> None:
     assert placed.block.first_sample == 0
 
 
-def test_what_is_missing_at_the_end() -> None:
+def test_samples_missing_at_the_end_are_a_gap() -> None:
     continuity = SampleIndexer(RATE)
     assert continuity.lost_until(at(5.0), "lost") is None
     continuity.place(block(0, 10, 0.1))

@@ -36,12 +36,12 @@ def test_a_one_shot_is_due_once_and_in_its_zone() -> None:
     ]
 
 
-def test_times_are_of_the_time_zone() -> None:
+def test_times_are_in_the_time_zone_of_the_entry() -> None:
     due = next(due_times(entry("0 22 * * *", "Europe/Berlin"), START))
     assert due.astimezone(UTC).hour == 21
 
 
-def test_on_the_day_the_clocks_change() -> None:
+def test_times_are_correct_on_the_day_of_a_clock_change() -> None:
     before = datetime(2027, 3, 27, 12, 0, tzinfo=UTC)
     times = list(islice(due_times(entry("30 2 * * *", "Europe/Berlin"), before), 2))
     # 02:30 does not exist on 28 March 2027: the run is then, at 03:00, not lost.
@@ -49,7 +49,7 @@ def test_on_the_day_the_clocks_change() -> None:
     assert times[1].astimezone(UTC) == datetime(2027, 3, 29, 0, 30, tzinfo=UTC)
 
 
-def test_in_the_hour_that_comes_twice_runs_come_twice() -> None:
+def test_runs_are_due_twice_in_a_repeated_hour() -> None:
     """25 October 2026 in Berlin: hourly runs stay hourly, a daily one stays daily."""
     before = datetime(2026, 10, 24, 23, 0, tzinfo=UTC)
     hourly = entry("30 * * * *", "Europe/Berlin")
@@ -60,10 +60,10 @@ def test_in_the_hour_that_comes_twice_runs_come_twice() -> None:
     assert days == ["25 02:30", "26 02:30"]
 
 
-def test_a_time_that_never_comes_is_no_schedule() -> None:
+def test_a_time_that_never_occurs_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a cron line"):
         Schedule(cron=("0 0 31 4 *",))
 
 
-def test_no_entries_no_runs() -> None:
+def test_without_entries_no_run_is_due() -> None:
     assert list(all_due(Schedule(), START)) == []

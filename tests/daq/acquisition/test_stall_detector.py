@@ -56,7 +56,7 @@ def said() -> Said:
     return Said()
 
 
-async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -> None:
+async def test_late_is_reported_two_block_periods_after_the_last_block(said: Said) -> None:
     """Not at the next look of a clock that ticks: at that very instant."""
 
     async def wait() -> None:
@@ -73,7 +73,7 @@ async def test_late_is_said_two_block_periods_after_the_last_block(said: Said) -
     assert asyncio.get_running_loop().time() == pytest.approx(DEFAULT_PATIENCE)
 
 
-async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
+async def test_a_block_ends_the_late_state(said: Said) -> None:
     async with StallDetector({"a": RATE}, said) as watch:
         watch.block_received(block("a", 20))
         with watch.waiting():
@@ -84,7 +84,7 @@ async def test_a_block_takes_back_that_it_was_late(said: Said) -> None:
     assert [after for _, _, after in said.items] == pytest.approx([0.4, 0.4])
 
 
-async def test_of_several_on_a_port_one_can_be_lost(said: Said) -> None:
+async def test_one_of_several_sensors_on_a_port_can_be_lost(said: Said) -> None:
     async with StallDetector({"a": RATE, "b": RATE}, said) as watch:
         watch.block_received(block("a", 10))
         with watch.waiting():
@@ -94,7 +94,7 @@ async def test_of_several_on_a_port_one_can_be_lost(said: Said) -> None:
     assert [item[:2] for item in said.items] == [("a", "late"), ("a", "stalled")]
 
 
-async def test_what_could_not_be_said_is_said_later(said: Said) -> None:
+async def test_a_report_that_was_not_accepted_is_repeated(said: Said) -> None:
     said.refused = 3
     async with StallDetector({"a": RATE}, said) as watch:
         watch.block_received(block("a", 10))
@@ -103,7 +103,7 @@ async def test_what_could_not_be_said_is_said_later(said: Said) -> None:
     assert said.refused == 0
 
 
-async def test_a_busy_host_is_no_devices_fault(said: Said) -> None:
+async def test_a_busy_host_makes_no_device_late(said: Said) -> None:
     async with StallDetector({"a": RATE}, said) as watch:
         watch.block_received(block("a", 10))
         with watch.waiting():
@@ -115,7 +115,7 @@ async def test_a_busy_host_is_no_devices_fault(said: Said) -> None:
     assert not said.items
 
 
-async def test_nobody_is_late_while_nobody_waits(said: Said) -> None:
+async def test_no_sensor_is_late_while_no_task_waits(said: Said) -> None:
     """Writing lags: blocks are there, and not asked for."""
     async with StallDetector({"a": RATE}, said) as watch:
         watch.block_received(block("a", 10))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def test_sensors_of_one_clock_pass_bit_exact_however_the_reading_is_cut(tmp_path: Path) -> None:
+def test_samples_of_one_clock_are_bit_exact_for_any_division_of_reads(tmp_path: Path) -> None:
     raw = {name: counts(5000, 2, seed) for seed, name in enumerate("abc")}
     path = write(tmp_path / "r.h5", {n: Sensor(c, clock="one") for n, c in raw.items()})
     with Recording.open(path) as recording:
@@ -39,7 +39,7 @@ def test_sensors_of_one_clock_pass_bit_exact_however_the_reading_is_cut(tmp_path
         assert np.array_equal(aligned.read(1234, 4321)[0], whole[1234:4321])
 
 
-def test_exact_times_align_whole_samples_and_name_the_start(tmp_path: Path) -> None:
+def test_exact_times_align_samples_and_give_the_start(tmp_path: Path) -> None:
     raw = {name: counts(3000, 1, seed) for seed, name in enumerate("abc")}
     starts = {"a": 0.0055, "b": 0.1255, "c": 0.0355}  # 12 and 3 samples later
     sensors = {n: Sensor(c, utc=True, start=starts[n]) for n, c in raw.items()}
@@ -55,7 +55,7 @@ def test_exact_times_align_whole_samples_and_name_the_start(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.3, 30.0, -30.0, 10_800.0])  # of the host's UTC
-def test_a_sensor_with_utc_meets_those_without_whatever_the_host_takes_utc_for(
+def test_a_sensor_with_utc_is_aligned_with_others_for_any_host_utc(
     tmp_path: Path, ahead: float
 ) -> None:
     sensors = {
@@ -71,7 +71,7 @@ def test_a_sensor_with_utc_meets_those_without_whatever_the_host_takes_utc_for(
         assert 2800 < aligned.n_available < 3000
 
 
-def test_a_device_whose_channels_are_out_of_step_is_slow_and_not_wrong(tmp_path: Path) -> None:
+def test_unsynchronised_channels_delay_a_device_without_shifting_it(tmp_path: Path) -> None:
     sensors = {
         "a": Sensor(counts(6000, 1, 1)),
         "b": Sensor(counts(6000, 1, 2), utc=True, late=7.5),
@@ -87,9 +87,7 @@ def test_a_device_whose_channels_are_out_of_step_is_slow_and_not_wrong(tmp_path:
 
 
 @pytest.mark.parametrize("ahead", [3, -40])
-def test_wrong_utc_until_a_device_finds_the_right_one_moves_nothing(
-    tmp_path: Path, ahead: int
-) -> None:
+def test_a_correction_of_device_utc_moves_no_samples(tmp_path: Path, ahead: int) -> None:
     sensors = {
         "a": Sensor(counts(6000, 1, 1)),
         "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
@@ -109,7 +107,9 @@ def test_wrong_utc_until_a_device_finds_the_right_one_moves_nothing(
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_a_gap_is_invalid_for_all_and_nothing_else_is(tmp_path: Path, shared: bool) -> None:
+def test_a_gap_is_invalid_for_all_sensors_and_other_samples_are_valid(
+    tmp_path: Path, shared: bool
+) -> None:
     clock = {name: "one" if shared else name for name in "abc"}
     sensors = {n: Sensor(counts(4000, 1, ord(n)), clock=clock[n]) for n in "abc"}
     sensors["b"].gaps = ((1530, 1571),)
@@ -133,7 +133,7 @@ def _band_limited(times: NDArray[np.float64], seed: int, edge: float) -> NDArray
     return np.asarray(np.cos(2 * np.pi * np.outer(times, frequency) + phase).sum(axis=1))
 
 
-def test_free_running_sensors_meet_on_the_grid(tmp_path: Path) -> None:
+def test_free_running_sensors_are_aligned_on_the_grid(tmp_path: Path) -> None:
     sensors = {}
     for name, ppm, start in (("a", 0.0, 0.0), ("b", 18.0, 0.0123), ("c", -20.0, 0.0371)):
         rate = 100.0 * (1 + ppm * 1e-6)
@@ -153,7 +153,7 @@ def test_free_running_sensors_meet_on_the_grid(tmp_path: Path) -> None:
             assert state.ppm == pytest.approx(ppm, abs=0.01)
 
 
-def test_unequal_rates_meet_at_the_lower_without_aliases(tmp_path: Path) -> None:
+def test_unequal_rates_are_resampled_to_the_lowest_without_aliases(tmp_path: Path) -> None:
     times = {"a": np.arange(20_000) / 100.0, "b": np.arange(50_000) / 250.0}
     sensors = {}
     for name, rate in (("a", 100.0), ("b", 250.0)):
@@ -169,7 +169,7 @@ def test_unequal_rates_meet_at_the_lower_without_aliases(tmp_path: Path) -> None
         assert np.std(inner[:, 1] - inner[:, 0]) < 1e-5 * np.std(inner[:, 0])
 
 
-def test_a_restart_gets_a_clock_of_its_own(tmp_path: Path) -> None:
+def test_a_restart_begins_a_new_clock_epoch(tmp_path: Path) -> None:
     first = Sensor(counts(3000, 1, 1), clock="a")
     other = Sensor(counts(3000, 1, 2), clock="b", restarts=(1500,))
     writer = create(tmp_path / "r.h5", {"a": first, "b": other})
@@ -188,7 +188,7 @@ def test_a_restart_gets_a_clock_of_its_own(tmp_path: Path) -> None:
         assert moved == pytest.approx(3.7e-3, abs=1e-5)
 
 
-def test_blocks_beyond_those_taken_at_once_go_on_where_the_others_ended(tmp_path: Path) -> None:
+def test_blocks_read_in_several_steps_are_contiguous(tmp_path: Path) -> None:
     raw = {name: counts(17_000, 1, seed) for seed, name in enumerate("ab")}  # a block each
     gaps = ((16_384, 16_386),)
     sensors = {n: Sensor(c, 10.0, clock="one", gaps=gaps) for n, c in raw.items()}
@@ -206,7 +206,7 @@ def test_blocks_beyond_those_taken_at_once_go_on_where_the_others_ended(tmp_path
         assert np.array_equal(samples[valid], np.hstack([*raw.values()])[valid].astype(float))
 
 
-def test_a_growing_file_is_read_as_far_as_it_is_committed(tmp_path: Path) -> None:
+def test_a_growing_file_is_read_up_to_its_committed_rows(tmp_path: Path) -> None:
     sensors = {name: Sensor(counts(2000, 1, ord(name)), clock="one") for name in "abc"}
     writer = create(tmp_path / "r.h5", sensors)
     with Recording.open(tmp_path / "r.h5") as recording:
@@ -240,7 +240,7 @@ def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("begun", [0.0, 8.0])  # seconds after the recording was created
-def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(
+def test_sensors_of_one_clock_with_different_starts_are_aligned_exactly(
     tmp_path: Path, begun: float
 ) -> None:
     raw = counts(5000, 1, 8)
@@ -261,7 +261,7 @@ def test_sensors_of_one_clock_that_began_apart_meet_sample_by_sample(
         assert [clock.offset_source for clock in aligned.clocks] == [None, by_arrivals, by_arrivals]
 
 
-def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path: Path) -> None:
+def test_the_motion_gives_the_offset_of_shared_clocks_if_arrivals_cannot(tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
     motion = np.cumsum(rng.standard_normal((12_200, 1)), axis=0)
 
@@ -288,7 +288,7 @@ def test_the_motion_tells_how_many_samples_apart_where_arrivals_cannot(tmp_path:
     assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
 
 
-def test_a_first_sensor_that_hears_noise_only_keeps_no_other_from_being_refined(
+def test_a_first_sensor_with_noise_only_does_not_prevent_refinement_of_others(
     tmp_path: Path,
 ) -> None:
     motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
@@ -309,7 +309,7 @@ def test_a_first_sensor_that_hears_noise_only_keeps_no_other_from_being_refined(
     assert np.abs(apart).max() < 1e-4  # 2.7e-2 by arrival times
 
 
-def test_an_hour_of_suspend_is_a_short_gap_and_clocks_meet_again_behind_it(tmp_path: Path) -> None:
+def test_clocks_are_aligned_after_an_hour_of_suspension(tmp_path: Path) -> None:
     # CLOCK_MONOTONIC stands still in suspend; the sensors' counters do not.
     hour, n_before, n_after = 3600.0, 30_000, 30_000
     writer_of, found = {}, []
@@ -348,7 +348,7 @@ def test_an_hour_of_suspend_is_a_short_gap_and_clocks_meet_again_behind_it(tmp_p
 
 
 @pytest.mark.parametrize(("late", "missed"), [(2e-4, 0), (7.3e-3, 0), (7.3e-3, 130)])
-def test_a_sensor_wired_twice_is_named_and_stops_nothing(
+def test_a_sensor_connected_twice_is_reported_and_does_not_stop_the_estimate(
     tmp_path: Path, late: float, missed: int
 ) -> None:
     motion = np.cumsum(np.random.default_rng(1).standard_normal((16_000, 2)), axis=0)
@@ -373,7 +373,7 @@ def test_a_sensor_wired_twice_is_named_and_stops_nothing(
         assert np.isfinite(snapshot.results[method].noise_psd[4:160, [0, 1, 4, 5]]).all()
 
 
-def test_coarse_counts_that_are_equal_by_chance_at_first_are_not_one_sensor(
+def test_coarse_counts_equal_by_chance_do_not_make_one_sensor(
     tmp_path: Path,
 ) -> None:
     rng = np.random.default_rng(0)
@@ -391,7 +391,7 @@ def test_coarse_counts_that_are_equal_by_chance_at_first_are_not_one_sensor(
     assert rates == pytest.approx([0.0, 10.0], abs=0.01)
 
 
-def test_a_shared_clock_has_a_rate_too(tmp_path: Path) -> None:
+def test_a_shared_clock_has_a_rate(tmp_path: Path) -> None:
     rate = 100.0 * (1 + 18e-6)
     sensors = {
         n: Sensor(counts(60_000, 1, 1), rate=rate, nominal=100.0, clock="one") for n in "abc"

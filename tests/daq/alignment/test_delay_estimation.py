@@ -38,7 +38,7 @@ def huddle(n_segments: int, delays: FloatArray, noise: float, seed: int) -> Floa
     return np.asarray(samples + noise * rng.standard_normal(samples.shape))
 
 
-def test_known_delays_are_measured_as_well_as_stated() -> None:
+def test_known_delays_are_measured_within_their_stated_error() -> None:
     n = 80
     delays = 4e-4 + 2e-4 * np.sin(np.arange(n) / 9.0)
     samples = huddle(n, delays, 0.03, 1)
@@ -65,7 +65,7 @@ def test_later_batches_are_measured_in_the_frame_of_the_first() -> None:
     assert second[:, 1].mean() - first[:, 1].mean() == pytest.approx(3e-3, abs=5e-6)
 
 
-def test_without_common_motion_nothing_is_claimed() -> None:
+def test_without_common_motion_no_delay_is_returned() -> None:
     rng = np.random.default_rng(3)
     n = 120
     samples = rng.standard_normal(((n - 1) * HOP + LENGTH, 4))
@@ -98,7 +98,7 @@ def test_a_reference_without_the_common_motion_is_replaced(dead: bool) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_hum_moves_no_sensor_by_half_periods(seed: int) -> None:
+def test_hum_does_not_shift_sensors_by_half_periods(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 120 * HOP + LENGTH
     phase = np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + np.array([0.0, 1.2])
@@ -112,7 +112,7 @@ def test_hum_moves_no_sensor_by_half_periods(seed: int) -> None:
 
 
 @pytest.mark.parametrize("delay", [0.9, 1.5, 1.9, -1.5])  # a segment lasts 5 s
-def test_a_long_constant_delay_is_told_from_its_alias(delay: float) -> None:
+def test_a_long_constant_delay_is_distinguished_from_its_alias(delay: float) -> None:
     motion = np.random.default_rng(5).standard_normal((100 * HOP, 2))
     motion += 0.03 * np.random.default_rng(6).standard_normal(motion.shape)
     samples = np.hstack([motion, np.roll(motion, round(delay * RATE), axis=0)])[LENGTH:-LENGTH]

@@ -67,7 +67,7 @@ def work_of(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Work, int]:
     return work, snapshot.n_segments
 
 
-def test_polled_sensors_with_many_gaps_take_no_more_work(
+def test_many_gaps_of_polled_sensors_do_not_increase_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none, n_whole = work_of(
@@ -100,7 +100,7 @@ def test_polled_sensor_keeps_one_clock_across_gaps(tmp_path: Path) -> None:
     assert np.abs(samples[kept] - expected[kept]).max() < 1e-5  # resampling errs by -110 dB
 
 
-def test_time_that_goes_back_begins_an_epoch() -> None:
+def test_a_backward_step_of_time_begins_an_epoch() -> None:
     seconds = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.3, 0.4, 0.5])
     clock = from_instants(
         "a",
@@ -115,7 +115,7 @@ def test_time_that_goes_back_begins_an_epoch() -> None:
     assert clock.state.ppm == pytest.approx(0.0)
 
 
-def test_half_of_all_samples_lost_is_said_at_once(tmp_path: Path) -> None:
+def test_loss_of_half_of_all_samples_is_reported_immediately(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     lost = {name: rng.random(N_SAMPLES) < 0.5 for name in NAMES}
     for gone in lost.values():
@@ -125,7 +125,7 @@ def test_half_of_all_samples_lost_is_said_at_once(tmp_path: Path) -> None:
         estimate([path], Settings(segment=4.0))
 
 
-def test_free_running_sensors_with_many_gaps_take_no_more_reads(
+def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     motion = counts(N_SAMPLES, 1, 3)

@@ -31,7 +31,7 @@ def inner(n: int, step: float, ratio: float = 1.0) -> FloatArray:
 
 @pytest.mark.parametrize("ppm", [-20.0, 0.0, 20.0, 100.0, 1000.0, 10_000.0])
 @pytest.mark.parametrize("frequency", [0.003, 0.1, 0.3, 0.45])
-def test_tones_up_to_the_usable_edge_are_met_to_100_db(ppm: float, frequency: float) -> None:
+def test_tones_up_to_the_usable_edge_have_errors_below_100_db(ppm: float, frequency: float) -> None:
     n = 6000
     assert error_db(frequency, inner(n, 1 + ppm * 1e-6), n) < -100
 
@@ -51,14 +51,14 @@ def test_a_lower_rate_keeps_its_band_and_removes_what_would_alias(ratio: float) 
         assert 10 * np.log10(2 * np.mean(left**2)) < -100
 
 
-def test_samples_on_whole_positions_come_out_bit_exact() -> None:
+def test_samples_at_integer_positions_are_bit_exact() -> None:
     samples = np.random.default_rng(1).standard_normal((3000, 3))
     assert np.array_equal(resample(samples, np.arange(100.0, 2900.0)), samples[100:2900])
     assert are_whole(np.arange(7.0, 1e7, 1000.0)[:1])
     assert not are_whole(np.arange(100.0) + 0.001)
 
 
-def test_pieces_cut_at_spans_join_without_a_seam() -> None:
+def test_pieces_divided_at_spans_equal_the_whole() -> None:
     rng = np.random.default_rng(2)
     samples = rng.standard_normal((8 * SPAN, 2))
     # From 8 to 28 ppm: two, three and four delays a span.
@@ -86,7 +86,7 @@ def test_spans_and_single_rows_of_the_kernel_agree() -> None:
     assert np.ptp(values) < 1e-5 * np.std(samples)
 
 
-def test_beyond_the_samples_counts_as_zero() -> None:
+def test_input_beyond_the_samples_is_zero() -> None:
     samples = np.ones((50, 1))
     assert np.array_equal(resample(samples, np.arange(-3.0, 2.0))[:, 0], [0, 0, 0, 1, 1])
     assert resample(samples, np.array([])).shape == (0, 1)

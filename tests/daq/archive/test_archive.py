@@ -113,7 +113,7 @@ def test_processes_that_were_interrupted_and_resumed_write_the_same_bytes(
     assert content(other) == content(store)
 
 
-def test_only_new_recordings_are_taken(paths: list[Path], copy: Store, tmp_path: Path) -> None:
+def test_only_new_recordings_are_processed(paths: list[Path], copy: Store, tmp_path: Path) -> None:
     moved = tmp_path / "moved.h5"
     shutil.copyfile(paths[0], moved)  # another name and time, the same run
     longer = record(tmp_path / "four.h5", begin_ns=START_NS + 50 * HOUR_NS, seed=4)
@@ -122,7 +122,7 @@ def test_only_new_recordings_are_taken(paths: list[Path], copy: Store, tmp_path:
     assert found.current == [moved, *paths]
 
 
-def test_a_recording_that_has_grown_replaces_what_was_kept(paths: list[Path], copy: Store) -> None:
+def test_a_grown_recording_replaces_its_earlier_spectra(paths: list[Path], copy: Store) -> None:
     entry = copy.entries()[0][0]
     with h5py.File(entry.path, "r+") as file:
         file.attrs["source_samples"] -= 1000
@@ -138,9 +138,7 @@ def _killed_while_writing(path: Path) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_what_a_killed_process_left_is_never_taken_for_spectra(
-    paths: list[Path], copy: Store
-) -> None:
+def test_files_of_killed_processes_are_not_read_as_spectra(paths: list[Path], copy: Store) -> None:
     before = content(copy)
     process = multiprocessing.get_context("fork").Process(
         target=_killed_while_writing, args=(copy.folder / "killed.h5",)
@@ -155,7 +153,7 @@ def test_what_a_killed_process_left_is_never_taken_for_spectra(
     assert content(copy) == before
 
 
-def test_a_task_that_fails_is_reported_and_the_others_are_done(
+def test_a_failed_task_is_reported_and_the_others_are_completed(
     paths: list[Path], store: Store, tmp_path: Path
 ) -> None:
     other = store_for(tmp_path / "other", paths[0])
@@ -186,14 +184,14 @@ def test_settings_of_the_archive_cannot_be_mixed(copy: Store) -> None:
     ("settings", "message"),
     [({"octaves": True}, "--no-octaves"), ({"segment": 7200.0}, "choose --stretch day")],
 )
-def test_settings_that_no_stretch_can_have_are_refused(
+def test_impossible_settings_are_refused(
     paths: list[Path], tmp_path: Path, settings: dict[str, object], message: str
 ) -> None:
     with pytest.raises(WrongSettingError, match=message):
         store_for(tmp_path / "no", paths[0], replace(SETTINGS, **settings))  # type: ignore[arg-type]  # of several types
 
 
-def test_recordings_of_other_sensors_are_named_and_the_rest_taken(
+def test_recordings_of_other_sensors_are_reported_and_the_rest_processed(
     paths: list[Path], tmp_path: Path
 ) -> None:
     other = record(tmp_path / "other.h5", names="ABD")
@@ -235,7 +233,7 @@ class _Executed:
         lambda content: content[:0],
     ],
 )
-def test_damaged_files_are_named_left_out_and_made_again(
+def test_damaged_files_are_reported_excluded_and_rebuilt(
     paths: list[Path], copy: Store, store: Store, damage: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(copy.folder.parent)
@@ -250,7 +248,7 @@ def test_damaged_files_are_named_left_out_and_made_again(
     assert not (copy.folder.parent / "executed").exists()
 
 
-def test_a_stretch_with_a_wrong_checksum_is_named_and_left_out(copy: Store) -> None:
+def test_a_stretch_with_a_wrong_checksum_is_reported_and_excluded(copy: Store) -> None:
     entry = copy.entries()[0][0]
     with SpectraFile(entry.path) as file:
         n_segments = file.stretches["n_segments"]
@@ -276,7 +274,7 @@ def test_folders_that_are_no_archive_are_not_written_into(tmp_path: Path, store:
             Store.open(tmp_path)
 
 
-def test_recordings_in_folders(paths: list[Path], tmp_path: Path) -> None:
+def test_recordings_in_folders_are_found(paths: list[Path], tmp_path: Path) -> None:
     folder = paths[0].parent
     assert recordings_in([folder, paths[0]], leave_out=tmp_path) == sorted(paths)
     with pytest.raises(RecordingError, match="no recording"):
@@ -285,7 +283,7 @@ def test_recordings_in_folders(paths: list[Path], tmp_path: Path) -> None:
         recordings_in([tmp_path / "none.h5"], leave_out=tmp_path)
 
 
-def test_days_and_density_hold_the_noise_that_was_put_in(store: Store) -> None:
+def test_days_and_density_have_the_true_noise(store: Store) -> None:
     found = answer(store.plan, store.entries()[0], SETTINGS)
     truth = (20.0**2 + 1 / 12) / 1e12 * 2 / 10.0  # noise and rounding, over half the rate
     assert list((found.days_utc_ns - START_NS) / HOUR_NS) == [0, 24]

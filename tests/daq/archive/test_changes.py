@@ -20,7 +20,7 @@ def series(
 
 
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
-def test_false_alarms_come_as_often_as_stated(scatter: float) -> None:
+def test_the_rate_of_false_alarms_is_as_stated(scatter: float) -> None:
     rng = np.random.default_rng(5)
     rate, n = 0.2, 60
     alarms = sum(
@@ -32,7 +32,7 @@ def test_false_alarms_come_as_often_as_stated(scatter: float) -> None:
         assert alarms >= binom.ppf(0.001, n, rate / 2)
 
 
-def test_a_change_is_found_at_its_day_with_its_size() -> None:
+def test_a_change_is_found_with_its_day_and_size() -> None:
     level, spread = series(np.random.default_rng(6))
     level[25:, 3] *= 1.02
     level[10, 5] = np.nan
@@ -50,7 +50,7 @@ def test_scatter_from_day_to_day_is_no_change() -> None:
     assert not changes(level, spread).found.any()
 
 
-def test_few_days_decide_nothing() -> None:
+def test_few_days_give_no_decision() -> None:
     level, spread = series(np.random.default_rng(8), n_days=7)
     level[4:] *= 3
     found = changes(level, spread)
@@ -71,7 +71,7 @@ def test_the_slope_is_that_of_the_line() -> None:
 
 
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
-def test_the_interval_of_the_slope_covers(scatter: float) -> None:
+def test_the_interval_of_the_slope_covers_the_truth(scatter: float) -> None:
     rng = np.random.default_rng(9)
     n = 60
     covered = 0

@@ -35,7 +35,7 @@ name = "X"
 """
 
 
-def test_comments_and_order_stay(tmp_path: Path) -> None:
+def test_comments_and_order_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(BENCH, encoding="utf-8")
     path.chmod(0o640)
@@ -53,7 +53,7 @@ def test_comments_and_order_stay(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_cannot_be_written_stays(
+def test_a_file_that_cannot_be_written_is_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "lab.toml"

@@ -77,7 +77,7 @@ def faults(text: str) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_a_small_bench() -> None:
+def test_a_small_bench_is_loaded() -> None:
     bench = read(HEAD + THREE)
     assert [sensor.sampling_rate for sensor in bench.sensors] == [200.0] * 3
     assert bench.estimate.segment == 10.0
@@ -87,7 +87,7 @@ def test_a_small_bench() -> None:
     assert list(bench.ports()) == ["/dev/a", "/dev/b", "/dev/c"]
 
 
-def test_relative_directories_are_beside_the_file(tmp_path: Path) -> None:
+def test_relative_directories_are_relative_to_the_file(tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     path.write_text(HEAD + THREE, encoding="utf-8")
     loaded = parse(path.read_text(encoding="utf-8"), path, drivers=DRIVERS)
@@ -95,7 +95,7 @@ def test_relative_directories_are_beside_the_file(tmp_path: Path) -> None:
     assert loaded.source == path
 
 
-def test_an_absent_file(tmp_path: Path) -> None:
+def test_an_absent_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(BenchFileError, match=r"none\.toml: cannot be read: No such file"):
         load(tmp_path / "none.toml")
 
@@ -272,7 +272,7 @@ def test_each_fault_names_file_key_value_and_what_was_expected(text: str, expect
     assert expected in found[0]
 
 
-def test_too_few_sensors() -> None:
+def test_too_few_sensors_are_refused() -> None:
     found = faults(HEAD + sensor_text("a") + sensor_text("b"))
     assert found == [
         'bench.toml: sensors = "2 sensors": expected at least 3 for method three-sensor'
@@ -281,7 +281,7 @@ def test_too_few_sensors() -> None:
     assert len(read(HEAD + sensor_text("a") + sensor_text("b") + method).sensors) == 2
 
 
-def test_all_faults_at_once() -> None:
+def test_all_errors_are_reported_together() -> None:
     text = """
 sampling_rate = -1
 colour = "red"
@@ -316,13 +316,13 @@ sensitivity = 1
         assert expected in found
 
 
-def test_what_a_device_cannot_do_is_said_without_it() -> None:
+def test_impossible_settings_are_reported_without_the_device() -> None:
     text = HEAD.replace("200", "201") + sensor_text("A", driver="epson")
     with pytest.raises(BenchFileError, match=r'sensors\["A"\]\.sampling_rate = 201'):
         bench_file.parse(text)
 
 
-def test_not_toml_says_where() -> None:
+def test_errors_in_toml_have_their_position() -> None:
     assert "at line 1, column" in faults("name = = 3")[0]
 
 
@@ -332,7 +332,7 @@ def test_a_recorded_bench_is_read_without_its_drivers() -> None:
 
 
 @given(st.floats(1e-3, 1e7, allow_nan=False))
-def test_durations_come_back(seconds: float) -> None:
+def test_durations_survive_writing_and_reading(seconds: float) -> None:
     assert parse_duration(format_duration(seconds)) == pytest.approx(seconds, rel=0.01)
 
 
@@ -349,21 +349,21 @@ def test_durations_come_back(seconds: float) -> None:
         (2.5, 2.5),
     ],
 )
-def test_durations(text: str | float, seconds: float) -> None:
+def test_durations_are_parsed(text: str | float, seconds: float) -> None:
     assert parse_duration(text) == pytest.approx(seconds)
 
 
-def test_no_time_at_all_is_a_duration_where_that_makes_sense() -> None:
+def test_zero_is_a_duration_where_it_is_allowed() -> None:
     assert parse_duration("0s", zero=True) == 0
 
 
 @pytest.mark.parametrize("text", ["", "s", "-1s", "1h 30", "3 parsecs", "0", "1 2", True])
-def test_not_durations(text: str | float) -> None:
+def test_invalid_durations_are_refused(text: str | float) -> None:
     with pytest.raises(ValueError, match="expected a positive duration"):
         parse_duration(text)
 
 
-def test_poles_and_zeros_are_one_at_their_frequency() -> None:
+def test_poles_and_zeros_have_unit_gain_at_their_frequency() -> None:
     response = PolesZeros(
         zeros=(0j, 0j), poles=(-0.1 + 0.1j, -0.1 - 0.1j, -300 + 0j), frequency=2.0
     )
@@ -382,12 +382,12 @@ def test_poles_and_zeros_are_one_at_their_frequency() -> None:
         ("# " + "x" * (1 << 20), "expected at most 1048576"),
     ],
 )
-def test_a_file_that_would_take_for_ever_is_refused(text: str, said: str) -> None:
+def test_a_file_with_excessive_nesting_is_refused(text: str, said: str) -> None:
     with pytest.raises(BenchFileError, match=said):
         parse(text)
 
 
-def test_long_lists_of_numbers_are_no_such_file() -> None:
+def test_long_lists_of_numbers_are_accepted() -> None:
     numbers = ", ".join(f"{n}.5" for n in range(1, 400))
     with pytest.raises(BenchFileError) as refused:
         parse(f"psd = [{numbers}]\nnote = '''{'.' * 200} 1.2.3'''")

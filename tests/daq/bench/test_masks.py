@@ -55,7 +55,7 @@ def test_accelerometer_models(name: str, period: float, level: float) -> None:
     assert found == pytest.approx([level], abs=1e-6)
 
 
-def test_a_mask_is_nothing_outside_and_turns_into_other_units() -> None:
+def test_a_mask_is_undefined_outside_and_converts_to_other_units() -> None:
     mask = Mask("m", "m/s²", (1.0, 10.0), (1e-6, 1e-8))
     at = np.array([0.0, 0.99, 1.0, 10**0.5, 10.0, 10.1])
     psd = mask.at(at, "m/s²")
@@ -89,7 +89,7 @@ def test_units_of_noise_density(text: str, unit: str, value: float, psd: float) 
 
 
 @pytest.mark.parametrize("text", ["", "dB", "V", "m/s²", "g/Hz", "µg/√s"])
-def test_what_is_no_density_is_refused(text: str) -> None:
+def test_units_that_are_no_density_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"such as µg/√Hz, \(m/s²\)²/Hz"):
         DensityUnit.parse(text)
 
@@ -154,7 +154,7 @@ def test_any_bytes_are_a_mask_or_refused(content: bytes) -> None:
     assert len(mask.frequency) == len(mask.psd) >= 2
 
 
-def test_masks_are_named_by_model_and_file(tmp_path: Path) -> None:
+def test_masks_are_given_by_model_or_file(tmp_path: Path) -> None:
     path = tmp_path / "sheet.csv"
     path.write_text("frequency (Hz),noise (g²/Hz)\n1,2\n3,4\n", encoding="utf-8")
     assert [mask.name for mask in masks_named(f"nlnm, AHNM,{path}")] == ["NLNM", "AHNM", "sheet"]
@@ -206,9 +206,7 @@ def test_a_recording_holds_the_points_of_a_file(tmp_path: Path) -> None:
         ('frequency = [1, 2]\npsd = [1, 1]\nunit = "V/√Hz"', r'\.unit = "V/√Hz": unit .*\(A\.X\)'),
     ],
 )
-def test_limits_that_are_no_masks_are_errors_in_the_file(
-    limit: str, said: str, tmp_path: Path
-) -> None:
+def test_invalid_limits_are_errors_of_the_bench_file(limit: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(BenchFileError, match=said):
         bench_file.load(bench_with(limit, tmp_path))
 

@@ -32,7 +32,7 @@ def bench(driver: str, settings: str, *, port: str = "/dev/ttyUSB0", rate: float
         ("text", "columns = [0, 1.0, 2]", "columns[2]"),
     ],
 )
-def test_settings_are_of_their_type(driver: str, settings: str, key: str) -> None:
+def test_settings_of_wrong_type_are_refused(driver: str, settings: str, key: str) -> None:
     with pytest.raises(
         BenchFileError, match=rf'sensors\["A"\].settings.{re.escape(key)} = .*: expected (a|true)'
     ):
@@ -41,7 +41,7 @@ def test_settings_are_of_their_type(driver: str, settings: str, key: str) -> Non
 
 @pytest.mark.parametrize("driver", ["epson", "fifo", "text"])
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:99999", "socket://bridge"])
-def test_a_port_that_is_no_address_is_said_as_it_was_written(driver: str, port: str) -> None:
+def test_an_invalid_port_is_reported_as_written(driver: str, port: str) -> None:
     with pytest.raises(
         BenchFileError,
         match=rf'sensors\["A"\].port = "{re.escape(port)}": expected socket://host:port',
@@ -61,7 +61,7 @@ def test_a_port_that_is_no_address_is_said_as_it_was_written(driver: str, port: 
         ("fifo", "timeout = 1\npoll_interval = 0.5\nunit = 7"),
     ],
 )
-def test_what_toml_writes_is_taken(driver: str, settings: str) -> None:
+def test_values_as_written_in_toml_are_accepted(driver: str, settings: str) -> None:
     driver_type(driver).settings.model_validate(tomllib.loads(settings))
 
 
@@ -104,7 +104,7 @@ def test_what_toml_writes_is_taken(driver: str, settings: str) -> None:
         ("fifo", 'baud_rate = 500000\nparity = "E"', {"rate": 7812.0}, ".* at least 547031"),
     ],
 )
-def test_what_devices_cannot_do(
+def test_impossible_settings_of_devices_are_refused(
     driver: str, settings: str, changes: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(BenchFileError, match=rf'sensors\["A"\]\.{said}'):
@@ -112,7 +112,7 @@ def test_what_devices_cannot_do(
 
 
 @pytest.mark.parametrize("time_format", ["%Q", "%H:%M:%S", "%Y-%m-%d %I:%M:%S", "", "now"])
-def test_a_time_format_that_gives_no_time_is_named(time_format: str) -> None:
+def test_a_time_format_without_time_is_refused(time_format: str) -> None:
     settings = f'time_column = 0\ntime_format = "{time_format}"'
     with pytest.raises(
         BenchFileError, match=r"settings.time_format = .*: expected \"epoch\", \"millis\""

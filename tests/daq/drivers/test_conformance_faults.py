@@ -158,11 +158,11 @@ async def _recorded(served: Served, path: Path) -> dict[str, list[str]]:
                 return struck
 
 
-def test_no_mode_is_left_out() -> None:
+def test_every_mode_is_tested() -> None:
     assert set(FAULTS) == set(CASES)
 
 
-def test_each_sample_is_in_its_place(
+def test_each_sample_has_its_index(
     tmp_path: Path, subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One test, for all modes are recorded once."""

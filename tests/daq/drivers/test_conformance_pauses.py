@@ -90,7 +90,9 @@ async def _recorded(served: Served, path: Path) -> float:
     return begun
 
 
-def test_what_a_pausing_device_kept_is_recorded(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_samples_kept_by_a_pausing_device_are_recorded(
+    tmp_path: Path, subtests: pytest.Subtests
+) -> None:
     path = tmp_path / "pauses.h5"
     with serving_all(speed=SPEED, faults=script()) as served:
         begun = run(_recorded(served, path))

@@ -80,7 +80,7 @@ class StrictDevice:
         return 0
 
 
-async def test_window_and_command_are_two_writes_far_enough_apart() -> None:
+async def test_window_and_command_are_separate_writes_with_the_required_interval() -> None:
     strict = StrictDevice()
     device = Device(SENSOR, cast("ByteStream", strict))
     assert await device.read(commands.ID) == commands.DEVICE_ID
@@ -122,7 +122,7 @@ class Restarted:
         return 0
 
 
-async def test_frames_before_a_restart_have_the_time_at_which_they_came() -> None:
+async def test_frames_before_a_restart_have_their_arrival_time() -> None:
     """Seven of twenty wait in the kernel until the device is found to be silent."""
     configuration = Configuration.of(SENSOR)
     zeros = np.zeros(27, np.int32)

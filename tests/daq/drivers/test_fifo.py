@@ -116,7 +116,7 @@ def assert_felt(
     assert np.abs(expected - counts).max() <= 0.5
 
 
-async def test_at_the_rate_it_leaves_the_factory_with_every_sample_comes() -> None:
+async def test_every_sample_is_received_at_the_factory_rate() -> None:
     """7812 Hz of three channels: 191 reads a second."""
     one = table("A", rate=7812.0, settings={"capacity": 65_535})
     world = spec(one, sampling_rate=7812.0, age=0.0)
@@ -128,7 +128,7 @@ async def test_at_the_rate_it_leaves_the_factory_with_every_sample_comes() -> No
     assert_felt(scenario("A", sampling_rate=7812.0), "A", blocks, world, 4000)
 
 
-async def test_who_asks_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_replies_are_not_delayed(monkeypatch: pytest.MonkeyPatch) -> None:
     """However rarely a device sends what is due."""
     monkeypatch.setattr("sim_devices.server.serve.LEAST_INTERVAL", 1e3)
     described = device_spec(table("A"))
@@ -143,7 +143,7 @@ async def test_who_asks_is_not_held_up(monkeypatch: pytest.MonkeyPatch) -> None:
     await served.close()
 
 
-async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_link_that_is_too_slow_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daq.drivers.modbus.fifo.NOT_LESS", 0.4)
     one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
     with serving(spec(one, sampling_rate=RATE)) as (running,):
@@ -152,7 +152,7 @@ async def test_a_link_that_is_too_slow_is_named(monkeypatch: pytest.MonkeyPatch)
             await record(slow, 1)
 
 
-async def test_a_lost_reply_is_no_slow_link(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_lost_reply_is_not_reported_as_a_slow_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """However much waits: a link is slow where that never lessens."""
     monkeypatch.setattr("daq.drivers.modbus.fifo.NOT_LESS", 0.4)
 
@@ -193,7 +193,7 @@ async def test_a_lost_reply_is_no_slow_link(monkeypatch: pytest.MonkeyPatch) -> 
     assert isinstance(items[1], Block)
 
 
-async def test_an_overflow_is_told_and_the_gap_estimated(
+async def test_an_overflow_is_reported_and_its_gap_estimated(
     running: tuple[RunningDevice, ...],
 ) -> None:
     """2000 samples fit; nobody reads for 2.5 s, 5000 samples."""
@@ -218,7 +218,7 @@ async def test_an_overflow_is_told_and_the_gap_estimated(
         ({"sampling_rate": 0.5}, BenchFileError, "expected whole Hz"),
     ],
 )
-async def test_what_does_not_fit_is_named(
+async def test_wrong_settings_are_reported(
     running: tuple[RunningDevice, ...], changes: dict[str, Any], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):

@@ -68,7 +68,7 @@ async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]
 
 
 @pytest.mark.parametrize("index", range(4))
-async def test_every_link_gives_what_the_sensor_felt(
+async def test_every_link_delivers_the_samples_of_the_sensor(
     running: tuple[RunningDevice, ...], index: int
 ) -> None:
     blocks, events = await record(sensor(running, index), 1200)
@@ -84,7 +84,7 @@ async def test_every_link_gives_what_the_sensor_felt(
     assert any("GPS" in e.text for e in events)
 
 
-async def test_the_streams_feel_one_motion_at_the_utc_they_state(
+async def test_streams_have_the_same_motion_at_their_stated_utc(
     running: tuple[RunningDevice, ...],
 ) -> None:
     """Two digitizers at once: the same instants of UTC hold the same motion."""
@@ -100,7 +100,7 @@ async def test_the_streams_feel_one_motion_at_the_utc_they_state(
     assert apart.std() < 5e-5 < first.std() / COUNTS / 50
 
 
-async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+async def test_the_digitizers_information_is_reported(running: tuple[RunningDevice, ...]) -> None:
     one = sensor(running, 0, settings={"system_id": "GURA"}, serial_number="DEMO")
     async with DRIVER.open([one], host_clock(SPEED)) as session:
         (information,) = session.information
@@ -132,20 +132,20 @@ async def test_what_the_digitizer_says_about_itself(running: tuple[RunningDevice
         ),
     ],
 )
-async def test_what_does_not_fit_is_named(
+async def test_wrong_settings_are_reported(
     running: tuple[RunningDevice, ...], changes: dict[str, Any], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
         await record(sensor(running, 0, **changes), 1)
 
 
-def test_a_rate_that_gcf_has_no_code_for_is_named() -> None:
+def test_a_rate_without_gcf_code_is_refused() -> None:
     device = DeviceSpec(("A",), "guralp", "pty", 301.0, {})
     with pytest.raises(ScenarioError, match=r"'A': sampling_rate = 301; GCF has 400, 500, .* 5000"):
         guralp.create(device, cast("Source", None))
 
 
-async def test_nothing_listens() -> None:
+async def test_an_absent_server_is_reported() -> None:
     gone = device_at("udp://127.0.0.1:9", "D", "guralp")
     with pytest.raises(NotConnectedError, match=r"'D' on udp://127.0.0.1:9: datagrams refused"):
         await record(sensors(gone, TABLES[3])[0], 1)
@@ -192,7 +192,7 @@ async def sending(streams: Sequence[str], n_blocks: int) -> AsyncIterator[str]:
 
 
 @pytest.mark.parametrize("named", [False, True])
-async def test_nothing_that_comes_while_streams_are_found_is_lost(named: bool) -> None:
+async def test_blocks_received_during_discovery_are_not_lost(named: bool) -> None:
     streams = ["0123Z2", "0123N2", "0123E2"]  # a block tells 123Z2
     settings = {"link": "scream", "patience": 5.0} | ({"streams": streams} if named else {})
     async with sending(streams, 2) as port:
@@ -232,7 +232,7 @@ async def unreliable(target: int, n_refused: int) -> AsyncIterator[int]:
     await asyncio.gather(*filter(None, tasks))
 
 
-async def test_recovery_that_failed_is_tried_again() -> None:
+async def test_failed_recovery_is_repeated() -> None:
     """Packets are lost every second; the server's TCP port lets nobody in at first."""
     drops = [{"kind": "drop", "at": 5.5, "every": 0.9}]
     streams = {"streams": ["D000Z2", "D000N2", "D000E2"]}  # known: one link from the beginning

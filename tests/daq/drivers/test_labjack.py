@@ -152,7 +152,7 @@ async def test_all_sensors_have_one_index(running: tuple[RunningDevice, ...]) ->
     assert DRIVER.shares_clock
 
 
-async def test_inputs_may_be_any(running: tuple[RunningDevice, ...]) -> None:
+async def test_any_inputs_can_be_used(running: tuple[RunningDevice, ...]) -> None:
     """The simulated inputs are A's x, y, z on AIN0-2, B's on AIN3-5, C's on AIN6-8."""
     own: dict[str, dict[str, Any]] = {
         "A": {"inputs": ["AIN8", 0, "ain4"]},
@@ -169,7 +169,7 @@ async def test_inputs_may_be_any(running: tuple[RunningDevice, ...]) -> None:
     assert np.corrcoef(a, b)[0, 1] > 0.999
 
 
-async def test_what_the_device_says_about_itself(running: tuple[RunningDevice, ...]) -> None:
+async def test_the_devices_information_is_reported(running: tuple[RunningDevice, ...]) -> None:
     some = bench(running[0], sampling_rate=333.0, serial_number="470001234")
     async with DRIVER.open(some, host_clock(SPEED)) as session:
         information = session.information
@@ -227,7 +227,7 @@ async def test_a_t8_streams(running: tuple[RunningDevice, ...]) -> None:
         (2, {"negative_inputs": [3, 4, 5]}, "its own negative terminal"),
     ],
 )
-async def test_what_the_product_does_not_have_is_named(
+async def test_settings_that_the_product_lacks_are_refused(
     running: tuple[RunningDevice, ...], index: int, settings: dict[str, Any], said: str
 ) -> None:
     own = {NAMES[0] if index == 0 else "T": settings}
@@ -236,7 +236,7 @@ async def test_what_the_product_does_not_have_is_named(
             pass
 
 
-def test_a_bench_file_that_names_the_product_is_checked_without_it(
+def test_a_bench_file_with_the_product_is_checked_without_the_device(
     running: tuple[RunningDevice, ...],
 ) -> None:
     some = bench(running[2], settings={"range": 10.0}, model="LabJack T8")
@@ -244,7 +244,7 @@ def test_a_bench_file_that_names_the_product_is_checked_without_it(
         LabJackDriver().check(some)
 
 
-async def test_a_stream_that_breaks_off_is_started_anew(running: tuple[RunningDevice, ...]) -> None:
+async def test_a_stream_that_ends_is_restarted(running: tuple[RunningDevice, ...]) -> None:
     found, events = await record(bench(running[1]), 1200)
     blocks = found["F"]
     assert [e.text for e in events] == ["the buffer is full (2945)"]
@@ -285,7 +285,7 @@ async def test_a_buffer_that_overflows_is_a_gap_of_exact_length(
     assert "2941" in events[1].text
 
 
-async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
+async def test_a_power_failure_is_detected_by_the_missing_stream() -> None:
     settings = {"mode": "command-response"}
     told = spec(table(["R"], settings=settings), speed=SPEED, sampling_rate=RATE)
     told["faults"] = [{"kind": "reset", "at": 6.0, "every": 1.0}]
@@ -320,7 +320,7 @@ async def test_a_digitizer_that_lost_power_says_that_no_stream_runs() -> None:
         ),
     ],
 )
-async def test_what_cannot_be_is_named(
+async def test_impossible_settings_are_refused(
     running: tuple[RunningDevice, ...],
     changes: dict[str, Any],
     own: dict[str, dict[str, Any]],

@@ -106,7 +106,7 @@ def bench(driver: str, port: str, settings: Sequence[dict[str, Any]]) -> str:
         ),
     ],
 )
-def test_what_cannot_be_is_said_of_the_bench_file(
+def test_impossible_combinations_of_sensors_are_refused(
     driver: str, port: str, settings: list[dict[str, Any]], said: str
 ) -> None:
     wrong = "AB"[len(settings) - 1]
@@ -127,7 +127,9 @@ def test_what_cannot_be_is_said_of_the_bench_file(
         ("registers", BUS, [{"addresses": [0, 300, 65535]}]),
     ],
 )
-def test_what_may_be_is_taken(driver: str, port: str, settings: list[dict[str, Any]]) -> None:
+def test_valid_combinations_of_sensors_are_accepted(
+    driver: str, port: str, settings: list[dict[str, Any]]
+) -> None:
     driver_found = driver_type(driver)
     assert isinstance(driver_found, Checking)
     driver_found.check(

@@ -85,7 +85,7 @@ def flipped(frame: bytes, at: int) -> bytes:
 
 
 @pytest.mark.parametrize("at", [10, 5, 2, 0], ids=["checksum", "value", "length", "unit"])
-async def test_a_damaged_reply_costs_its_poll(at: int) -> None:
+async def test_a_damaged_reply_loses_one_poll(at: int) -> None:
     """One in twenty: 5 % of the samples, whatever byte of the reply is damaged."""
 
     def answer(n: int, _request: bytes) -> bytes:
@@ -98,7 +98,7 @@ async def test_a_damaged_reply_costs_its_poll(at: int) -> None:
     assert n_samples >= 380
 
 
-async def test_garbage_before_a_reply_costs_no_more_than_its_poll() -> None:
+async def test_garbage_before_a_reply_loses_at_most_one_poll() -> None:
     """And its reply never answers the next request."""
 
     def answer(n: int, _request: bytes) -> bytes:
@@ -110,7 +110,7 @@ async def test_garbage_before_a_reply_costs_no_more_than_its_poll() -> None:
     assert n_samples >= 380
 
 
-async def test_a_cut_reply_costs_two_polls() -> None:
+async def test_a_cut_reply_loses_two_polls() -> None:
     """That its rest will not come is known after 60 ms."""
 
     def answer(n: int, _request: bytes) -> bytes:
@@ -123,14 +123,14 @@ async def test_a_cut_reply_costs_two_polls() -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"echo": True}], ids=["recognised", "stated"])
-async def test_an_adapter_that_echoes_is_read(settings: dict[str, object]) -> None:
+async def test_replies_are_read_over_an_adapter_with_echo(settings: dict[str, object]) -> None:
     async with slave(lambda n, request: request + reply(n)) as port:
         n_samples, n_missing, kinds = await polled(sensor(port, **settings), 100)
     assert (n_missing, kinds) == (0, {})
     assert n_samples >= 100
 
 
-async def test_an_echo_is_no_reply_to_a_write() -> None:
+async def test_an_echo_is_not_accepted_as_reply_to_a_write() -> None:
     """Where the user says that the adapter echoes, a silent slave is none that obeys."""
     async with slave(lambda _n, request: request) as port:
         silent = sensor(port)

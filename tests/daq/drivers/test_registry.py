@@ -69,7 +69,7 @@ def _forget() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_driver_that_cannot_be_imported_is_named_and_harms_no_other() -> None:
+def test_a_driver_that_cannot_be_imported_does_not_affect_others() -> None:
     assert {"strange_good", "strange_broken", "epson"} <= set(registry.driver_names())
     assert registry.driver_type("strange_good").name == "text"
     said = (
@@ -84,6 +84,6 @@ def test_a_driver_that_cannot_be_imported_is_named_and_harms_no_other() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_what_is_no_driver_is_named() -> None:
+def test_objects_that_are_no_driver_are_refused() -> None:
     with pytest.raises(DriverError, match=r"'strange_other' .* is no driver: it has no name, summ"):
         registry.driver_type("strange_other")

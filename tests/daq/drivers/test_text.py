@@ -87,7 +87,7 @@ async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]
 
 
 @pytest.mark.parametrize(("index", "dtype"), [(0, np.int32), (1, np.int32), (2, float), (3, float)])
-async def test_every_format_brings_every_sample(
+async def test_every_format_delivers_every_sample(
     running: tuple[RunningDevice, ...], index: int, dtype: type
 ) -> None:
     n = 4 if index == 2 else 400
@@ -108,7 +108,7 @@ async def test_every_format_brings_every_sample(
         assert np.abs(truth[start : start + n] - counts).max() <= 0.5
 
 
-async def test_another_device_on_the_same_port_is_left_out(
+async def test_another_device_on_the_same_port_is_ignored(
     running: tuple[RunningDevice, ...],
 ) -> None:
     one = sensor(running, 0)
@@ -132,7 +132,9 @@ async def test_another_device_on_the_same_port_is_left_out(
     assert 777777777 not in counts
 
 
-async def test_a_quiet_device_is_started_and_stopped(running: tuple[RunningDevice, ...]) -> None:
+async def test_a_device_is_started_and_stopped_by_its_commands(
+    running: tuple[RunningDevice, ...],
+) -> None:
     with pytest.raises(NoAnswerError, match=r"nothing for 0\.125 s; check cable"):
         await record(sensor(running, 2, settings={"start": "", "patience": 0.5}), 2)
     assert (await record(sensor(running, 2), 2))[0]
@@ -145,7 +147,7 @@ async def test_a_quiet_device_is_started_and_stopped(running: tuple[RunningDevic
         (0, {"channel_names": ["EHZ"]}, r'channel_names = \["EHZ"\]: expected one for each'),
     ],
 )
-async def test_formats_that_do_not_fit(
+async def test_formats_that_do_not_match_are_refused(
     running: tuple[RunningDevice, ...], index: int, settings: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(BenchFileError, match=said):
@@ -159,7 +161,7 @@ FAULTS = [
 ]
 
 
-async def test_rows_twice_lost_and_late_leave_every_sample_in_its_place() -> None:
+async def test_repeated_lost_and_late_rows_leave_every_sample_at_its_index() -> None:
     """Packets, counted rows, rows with a time: the motion says which sample is which."""
     chosen = (0, 1, 3)
     world = spec(*(TABLES[i] for i in chosen), speed=SPEED, sampling_rate=RATE)

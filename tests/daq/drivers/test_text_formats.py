@@ -64,7 +64,7 @@ async def test_every_sample_is_read(running: dict[str, RunningDevice], name: str
 
 
 @pytest.mark.parametrize("name", ["decimal comma", "labelled", "json", "millis"])
-async def test_a_port_is_guessed_and_the_guess_is_right(
+async def test_the_format_of_a_port_is_guessed_correctly(
     running: dict[str, RunningDevice], name: str
 ) -> None:
     (found,) = await discover(running[name].port, host_clock(SPEED))
@@ -77,7 +77,7 @@ async def test_a_port_is_guessed_and_the_guess_is_right(
     assert blocks
 
 
-async def test_a_format_that_matches_nothing_says_what_would(
+async def test_a_format_without_matches_suggests_one_that_matches(
     running: dict[str, RunningDevice],
 ) -> None:
     (sensor,) = sensors(
@@ -103,7 +103,7 @@ async def test_a_format_that_matches_nothing_says_what_would(
         ),
     ],
 )
-def test_settings_that_do_not_go_together(
+def test_contradicting_settings_are_refused(
     running: dict[str, RunningDevice], settings: dict[str, Any], said: str
 ) -> None:
     (sensor,) = sensors(running["json"], TABLES[3], settings=settings)

@@ -90,7 +90,7 @@ def test_frame_lengths(burst: BurstFormat, size: int) -> None:
     assert burst.size == size
 
 
-def test_golden_burst_both_ways() -> None:
+def test_a_golden_burst_is_encoded_and_decoded() -> None:
     values = {"flag": 0x8E00, "temperature": 2637, "x": 2**24, "y": -(2**24), "z": 0x00800D80}
     assert commands.encode_bursts(ALL, **values, count=65534) == GOLDEN
     (block,) = decoder().receive(GOLDEN, at(0))
@@ -100,7 +100,7 @@ def test_golden_burst_both_ways() -> None:
     assert block.flags == BlockFlag.CLOCK_RESTART
 
 
-def test_without_a_checksum_or_counter() -> None:
+def test_bursts_without_checksum_or_counter_are_decoded() -> None:
     burst = BurstFormat.of("temperature", "x", "y", "z")
     sent = commands.encode_bursts(burst, x=np.arange(10), y=1, z=2, temperature=3)
     found = decoder(burst).receive(sent, at(0))
@@ -118,7 +118,7 @@ def test_device_reads_what_the_driver_writes_and_recovers_from_a_stray_delimiter
 
 
 @given(st.binary(max_size=200), st.sampled_from([commands.ID, Register(1, 0x0C)]))
-def test_any_bytes_to_the_device_leave_it_able_to_hear(garbage: bytes, register: Register) -> None:
+def test_the_device_accepts_commands_after_any_bytes(garbage: bytes, register: Register) -> None:
     device = CommandDecoder()
     device.receive(garbage)
     device.receive(bytes([commands.DELIMITER]) * 3)
@@ -128,7 +128,7 @@ def test_any_bytes_to_the_device_leave_it_able_to_hear(garbage: bytes, register:
 
 @settings(max_examples=50, deadline=None)
 @given(st.data())
-def test_split_anywhere_the_blocks_are_the_same(data: st.DataObject) -> None:
+def test_blocks_do_not_depend_on_the_division_of_bytes(data: st.DataObject) -> None:
     garbage = data.draw(st.binary(max_size=60))
     stream = frames(0, 20) + garbage + frames(20, 20)[7:]
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
@@ -155,14 +155,14 @@ def test_after_garbage_every_valid_frame_is_decoded(garbage: list[bytes]) -> Non
 @pytest.mark.parametrize(
     "filler", [b"\x80", b"\x0d", b"\x80\x01" + b"\x00" * 21 + b"\x0d", b"\x00"]
 )
-def test_much_garbage_costs_bounded_memory(filler: bytes) -> None:
+def test_garbage_takes_bounded_memory(filler: bytes) -> None:
     one = decoder()
     found = [one.receive(filler * (2**18 // len(filler)), at(k / 1e3)) for k in range(4)]
     assert sum(map(len, found)) <= 4  # events are counted, not repeated
     assert len(samples(one.receive(bytes(24) + frames(0, 5), at(1)))) == 5
 
 
-def test_a_wrong_checksum_is_a_gap_of_exactly_one() -> None:
+def test_a_wrong_checksum_is_a_gap_of_one_sample() -> None:
     stream = bytearray(frames(0, 10))
     stream[24 * 4 + 9] ^= 0x40
     found = decoder().receive(bytes(stream), at(0.05))
@@ -174,7 +174,7 @@ def test_a_wrong_checksum_is_a_gap_of_exactly_one() -> None:
     ]
 
 
-def test_lost_bytes_are_counted_and_the_run_goes_on() -> None:
+def test_lost_bytes_are_counted_and_decoding_continues() -> None:
     stream = frames(0, 10)
     found = decoder().receive(stream[: 24 * 3 + 5] + stream[24 * 6 + 2 :], at(0.05))
     assert sorted(samples(found)) == [0, 1, 2, 7, 8, 9]
@@ -183,7 +183,7 @@ def test_lost_bytes_are_counted_and_the_run_goes_on() -> None:
     assert event.text.startswith("27 bytes")
 
 
-def test_count_wraps() -> None:
+def test_a_wrap_of_count_is_no_gap() -> None:
     one = decoder()
     found = one.receive(frames(65530, 20), at(0))
     assert list(samples(found)) == list(range(20))
@@ -191,7 +191,7 @@ def test_count_wraps() -> None:
 
 
 @pytest.mark.parametrize("missing", [1, 199, 65535, 65536 + 300, 3 * 65536 + 5])
-def test_a_gap_is_exact_however_often_the_counter_wrapped_in_it(missing: int) -> None:
+def test_a_gap_is_exact_for_any_number_of_wraps(missing: int) -> None:
     one = decoder()
     one.receive(frames(0, 200), at(1))
     (block,) = one.receive(frames(200 + missing, 1), at(1 + (missing + 1) / RATE + 0.004))
@@ -200,7 +200,7 @@ def test_a_gap_is_exact_however_often_the_counter_wrapped_in_it(missing: int) ->
     assert not block.flags
 
 
-def test_frames_that_come_twice_are_dropped() -> None:
+def test_repeated_frames_are_dropped() -> None:
     one = decoder()
     found = one.receive(frames(0, 20) + frames(12, 8) + frames(20, 5), at(0.1))
     assert samples(found) == samples(decoder().receive(frames(0, 25), at(0.1)))
@@ -220,7 +220,7 @@ def test_a_reset_restarts_the_clock_and_estimates_the_gap() -> None:
     assert block.device_counter == 0
 
 
-def test_clipping_and_errors_are_noted() -> None:
+def test_clipping_and_errors_are_reported() -> None:
     values = {"temperature": 0, "x": -15 * 2**24, "y": 0, "z": 0}
     (block, event) = decoder().receive(
         commands.encode_bursts(ALL, flag=0x8E01, **values, count=0), at(0)
@@ -233,7 +233,7 @@ def test_clipping_and_errors_are_noted() -> None:
 
 @pytest.mark.parametrize("missing", [0, 1, 7000, 65535, 65536, 5 * 65536 + 300])
 @pytest.mark.parametrize("late", [-0.3, 0.0, 0.7])
-def test_a_stream_that_went_on_unheard_is_taken_on(missing: int, late: float) -> None:
+def test_a_stream_that_continued_while_disconnected_is_resumed(missing: int, late: float) -> None:
     one = decoder()
     one.receive(frames(0, 200) + frames(200, 1)[:11], at(1))
     heard = frames(200 + missing, 4)[5:]
@@ -257,13 +257,13 @@ def test_a_stream_that_went_on_unheard_is_taken_on(missing: int, late: float) ->
         (b"", 4.0),
     ],
 )
-def test_a_stream_that_is_not_that_of_before_is_not_taken_on(heard: bytes, seconds: float) -> None:
+def test_another_stream_is_not_resumed(heard: bytes, seconds: float) -> None:
     one = decoder()
     one.receive(frames(0, 200), at(1))
     assert not one.continues(heard, at(seconds))
 
 
-def test_nothing_follows_where_nothing_was() -> None:
+def test_no_stream_continues_a_decoder_without_frames() -> None:
     assert not decoder().continues(frames(0, 20), at(1))
     other = BurstFormat.of("x", "y", "z", "checksum")
     uncounted = BurstDecoder(
@@ -275,7 +275,7 @@ def test_nothing_follows_where_nothing_was() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_anything_may_be_heard(heard: bytes) -> None:
+def test_continues_accepts_any_bytes(heard: bytes) -> None:
     one = decoder()
     one.receive(frames(0, 20), at(0.1))
     one.continues(heard, at(9))

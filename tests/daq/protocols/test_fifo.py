@@ -38,7 +38,7 @@ def at(seconds: float) -> HostTime:
         ("06 00 30 03 16", "50 06 00 30 03 16 05 7A"),
     ],
 )
-def test_frames_of_a_vendor(pdu: str, frame: str) -> None:
+def test_frames_of_a_vendor_are_encoded_and_decoded(pdu: str, frame: str) -> None:
     """WitMotion's protocol: unlock, and a write to the time register."""
     assert rtu.encode(0x50, bytes.fromhex(pdu)) == bytes.fromhex(frame)
     assert rtu.is_whole(bytes.fromhex(frame))
@@ -64,7 +64,7 @@ def test_requests_and_replies() -> None:
 
 @pytest.mark.parametrize("step", [1, 3, 100])
 @pytest.mark.parametrize("before", [b"", b"\x01\x04\x08\x00", b"\x01\x84\x02\x00\x00", b"\x01" * 9])
-def test_a_reply_is_found_in_anything(step: int, before: bytes) -> None:
+def test_a_reply_is_found_among_any_bytes(step: int, before: bytes) -> None:
     """Half a reply, a damaged refusal, the unit's address repeated: skipped."""
     finder = ReplyFinder()
     finder.expect(rtu.read_request(1, 2, 4))
@@ -75,7 +75,7 @@ def test_a_reply_is_found_in_anything(step: int, before: bytes) -> None:
     assert not finder.waiting
 
 
-def test_replies_that_are_not_ours() -> None:
+def test_replies_to_other_requests_are_ignored() -> None:
     finder = ReplyFinder()
     finder.expect(rtu.read_request(1, 2, 4))
     other_unit = rtu.encode_registers(2, 4, np.arange(4, dtype=np.uint16))
@@ -110,7 +110,7 @@ def test_replies_that_are_not_ours() -> None:
         (rtu.encode_exception(1, 3, 2), "received a reply to function 3, which was not requested"),
     ],
 )
-def test_what_came_instead_is_named_and_counted(line: bytes, said: str) -> None:
+def test_unexpected_bytes_are_described_and_counted(line: bytes, said: str) -> None:
     decoder = FifoDecoder("A", RATE)
     for n in (1, 2):
         decoder.request()
@@ -123,7 +123,7 @@ def test_what_came_instead_is_named_and_counted(line: bytes, said: str) -> None:
 
 @settings(max_examples=100)
 @given(st.binary(max_size=400))
-def test_any_bytes_on_either_end(data: bytes) -> None:
+def test_any_bytes_are_accepted_at_both_ends(data: bytes) -> None:
     finder = ReplyFinder()
     finder.expect(rtu.read_request(1, 2, 125))
     finder.receive(data)
@@ -204,7 +204,7 @@ def numbered(found: list[Block | Event]) -> tuple[list[int], NDArray[Any]]:
 
 
 @pytest.mark.parametrize("header", ["size", "left"])
-def test_everything_that_waits_is_read_once(header: Header) -> None:
+def test_all_words_in_the_fifo_are_read_once(header: Header) -> None:
     device, decoder = Device(header, stale=500), FifoDecoder("A", 8000.0, header=header)
     found = run(device, decoder, 300)
     index, counts = numbered(found)
@@ -223,7 +223,7 @@ def test_everything_that_waits_is_read_once(header: Header) -> None:
 
 @pytest.mark.parametrize("header", ["size", "left"])
 @pytest.mark.parametrize("reached", [True, False])
-def test_reads_without_a_reply(header: Header, reached: bool) -> None:
+def test_unanswered_reads_lose_no_samples_silently(header: Header, reached: bool) -> None:
     """Whether the device took the words out, the level of the next read says."""
     device, decoder = Device(header), FifoDecoder("A", 8000.0, header=header)
     lost: list[int] = []
@@ -284,7 +284,7 @@ def test_a_fifo_that_stays_full_loses_a_little_each_time(header: Header) -> None
     assert np.ptp(late[made > made[-1] - 5000]) <= 100
 
 
-def test_a_fifo_that_was_emptied_gives_no_samples_that_were_none() -> None:
+def test_zeros_behind_the_words_of_a_restarted_device_are_no_samples() -> None:
     """After a power failure it holds less than was asked for, and fills up with zeros."""
     device, decoder = Device("size"), FifoDecoder("A", 8000.0)
     found = run(device, decoder, 50)
@@ -309,7 +309,7 @@ def test_a_fifo_that_was_emptied_gives_no_samples_that_were_none() -> None:
     )
 
 
-def test_nothing_is_thrown_away_where_the_header_is_not_what_was_said() -> None:
+def test_no_words_are_discarded_if_the_header_setting_is_wrong() -> None:
     """What is left, taken for the size, is less than was asked for at every read."""
     found = run(Device("left"), FifoDecoder("A", 8000.0, header="size"), 300)
     index, counts = numbered(found)
@@ -319,7 +319,7 @@ def test_nothing_is_thrown_away_where_the_header_is_not_what_was_said() -> None:
     assert not any(isinstance(item, Event) for item in found)
 
 
-def test_refusals_are_told() -> None:
+def test_refusals_are_reported() -> None:
     decoder = FifoDecoder("A", RATE)
     decoder.request()
     (event,) = decoder.receive(rtu.encode_exception(1, 4, 2), at(1))
@@ -340,7 +340,7 @@ def test_clipping_is_flagged() -> None:
 
 @settings(max_examples=100)
 @given(st.lists(st.binary(max_size=300), max_size=6))
-def test_survives_anything_and_resumes(pieces: list[bytes]) -> None:
+def test_decoding_continues_after_any_bytes(pieces: list[bytes]) -> None:
     device, decoder = Device("size"), FifoDecoder("A", 8000.0)
     found = run(device, decoder, 5)
     for piece in pieces:

@@ -38,7 +38,7 @@ def sample_block(data: bytes) -> SampleBlock:
     return found
 
 
-def test_identifiers_of_the_guide() -> None:
+def test_identifiers_of_the_guide_are_encoded_and_decoded() -> None:
     """DM24 operator's guide, 8.1.1: HPA1 is 825913; the largest plain one is ZIK0ZJ."""
     assert gcf.encode_id("HPA1") == 825_913
     assert gcf.decode_id(825_913) == "HPA1"
@@ -46,13 +46,13 @@ def test_identifiers_of_the_guide() -> None:
     assert gcf.decode_id(1) == "1"
 
 
-def test_an_id_tells_serial_number_and_component_without_its_leading_zeros() -> None:
+def test_serial_number_and_component_are_found_without_leading_zeros() -> None:
     for stream in ("DEMOZ2", "0123Z2", "000BZ2"):
         told = gcf.decode_id(gcf.encode_id(stream))
         assert (gcf.serial_number(told), gcf.component(told)) == (stream[:4], "Z")
 
 
-def test_header_of_a_real_digitizer() -> None:
+def test_the_header_of_a_real_digitizer_is_decoded() -> None:
     """First bytes of a recording of a DM24 (ObsPy's test file 20160603_1955n.gcf)."""
     header = bytes.fromhex("880450c1 15a0ba00 4bbf1814 066404c8".replace(" ", ""))
     body = bytes.fromhex("ffff3f1e") + bytes(800) + bytes.fromhex("ffff3f1e")
@@ -140,7 +140,7 @@ def test_leap_second_has_the_number_of_the_second_before() -> None:
         (19, 99, "differences end at"),
     ],
 )
-def test_damage_is_named(at: int, value: int, said: str) -> None:
+def test_damaged_blocks_are_refused(at: int, value: int, said: str) -> None:
     data = bytearray(gcf.encode_block(block(np.arange(100))))
     data[at] = value
     with pytest.raises(RemoteProtocolError, match=said):
@@ -148,7 +148,7 @@ def test_damage_is_named(at: int, value: int, said: str) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 15, 1025, 1 << 20])
-def test_sizes_no_block_has(size: int) -> None:
+def test_impossible_block_sizes_are_refused(size: int) -> None:
     with pytest.raises(RemoteProtocolError, match="bytes"):
         gcf.decode_block(bytes(size))
 
@@ -165,12 +165,12 @@ def test_sizes_no_block_has(size: int) -> None:
         (block(range(8), system=SystemId("ZZZZZZ", SystemForm.EXTENDED)), "too long"),
     ],
 )
-def test_what_the_format_cannot_say(wrong: SampleBlock, said: str) -> None:
+def test_values_without_encoding_are_refused(wrong: SampleBlock, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         gcf.encode_block(wrong)
 
 
-def test_differences_that_do_not_fit() -> None:
+def test_too_large_differences_are_refused() -> None:
     with pytest.raises(ValueError, match="more than 8 bits"):
         gcf.encode_block(block([0, 300, 0, 0]), width=8)
     with pytest.raises(ValueError, match="more than 24 bits"):

@@ -58,14 +58,14 @@ def joined(found: Iterable[Block | Event]) -> tuple[NDArray[Any], list[Block], l
     return counts, blocks, [item for item in found if isinstance(item, Event)]
 
 
-def test_frame_of_the_specification() -> None:
+def test_the_frame_of_the_specification_is_decoded() -> None:
     """'G', sequence, size, and a checksum over all of it."""
     frame = brp.encode_frame(0x67, bytes(range(16)))
     assert frame[:4] == b"G\x67\x00\x10"
     assert frame[-2:] == (0x47 + 0x67 + 0x10 + sum(range(16))).to_bytes(2, "big")
 
 
-def test_replies_of_the_specification() -> None:
+def test_the_replies_of_the_specification_are_encoded() -> None:
     raw = gcf.encode_id("DEMOZ2").to_bytes(4, "big")
     acknowledged = brp.encode_reply(brp.Reply(raw, None))
     assert acknowledged == bytes((1, raw[3], 0, raw[2], raw[1], raw[0]))
@@ -96,7 +96,7 @@ def test_streams_of_a_sensor_become_its_channels(step: int) -> None:
     assert all(reply.sequence is None for reply in replies)
 
 
-def test_blocks_of_unequal_length_and_start() -> None:
+def test_blocks_of_unequal_length_and_start_are_joined() -> None:
     """Only what all streams have is a sample of the sensor; the first such is sample 0."""
     sent = [(0, 0, 4), (1, 1, 2), (2, 2, 4), (1, 3, 3), (0, 4, 3), (2, 6, 1)]
     decoder = SerialDecoder(SENSORS)
@@ -147,7 +147,7 @@ def test_lost_blocks_are_recovered(how: str) -> None:
 
 
 @pytest.mark.parametrize("due", [12, 99, 126])
-def test_a_digitizer_that_was_restarted_numbers_anew(due: int) -> None:
+def test_a_restart_of_the_digitizers_numbering_is_detected(due: int) -> None:
     """Its frames go on being told apart: one that is damaged afterwards is recovered."""
     blocks, decoder = raw_blocks(60), SerialDecoder(SENSORS)
     first, transmitter = brp.Transmitter(), brp.Transmitter()
@@ -171,7 +171,7 @@ def test_a_digitizer_that_was_restarted_numbers_anew(due: int) -> None:
     assert [e.text for e in events if e.kind == "reset"] == [said]
 
 
-def test_what_stays_lost_is_an_exact_gap() -> None:
+def test_blocks_that_remain_lost_are_an_exact_gap() -> None:
     """Block 13 (stream 1, second 4) never arrives: one second is missing, and no more."""
     target = gcf.encode_block(sample_block(1, 4))
     (counts, blocks, events), _ = conversation(10, lambda _, f: b"" if target in f else f)
@@ -182,7 +182,7 @@ def test_what_stays_lost_is_an_exact_gap() -> None:
     assert [e.kind for e in events] == ["resynchronised"]
 
 
-def test_without_replies_a_loss_is_a_gap_at_once() -> None:
+def test_without_replies_a_loss_is_an_immediate_gap() -> None:
     (counts, blocks, _), times_sent = conversation(
         4, lambda index, frame: b"" if index == 4 else frame, replies=False
     )
@@ -191,7 +191,7 @@ def test_without_replies_a_loss_is_a_gap_at_once() -> None:
     assert [b.first_sample for b in blocks] == [0, 200, 300]
 
 
-def test_a_frame_that_is_always_damaged_does_not_hold_up_the_line() -> None:
+def test_a_frame_that_is_always_damaged_does_not_block_the_line() -> None:
     target = brp.encode_frame(6, raw_blocks(3)[6])
     (counts, _, events), times_sent = conversation(
         10, lambda _, frame: frame[:30] + b"!" + frame[31:] if frame == target else frame
@@ -201,7 +201,7 @@ def test_a_frame_that_is_always_damaged_does_not_hold_up_the_line() -> None:
     assert sum(e.kind == "checksum" for e in events) <= brp.ATTEMPTS + 1
 
 
-def test_terminal_text_and_noise_between_frames() -> None:
+def test_terminal_text_and_noise_between_frames_are_skipped() -> None:
     raw = raw_blocks(1)
     line = b"GURALP DM24\r\nG>" + brp.encode_frame(0, raw[0]) + bytes(range(128, 200))
     line += brp.encode_frame(1, raw[1]) + b"G\x00\xff\xff" + brp.encode_frame(2, raw[2])
@@ -234,7 +234,7 @@ def test_status_becomes_events_and_foreign_streams_are_named_once() -> None:
     assert decoder.streams.silent == STREAMS
 
 
-def test_streams_that_are_found_have_all_their_blocks_and_others_are_named() -> None:
+def test_assigned_streams_keep_all_blocks_and_others_are_reported() -> None:
     streams = Streams({"A": ()})
     names = (*STREAMS, "OTHRZ2")
     sent = [
@@ -341,7 +341,7 @@ def test_little_endian_packets(width: gcf.Width) -> None:
 
 @pytest.mark.parametrize("version", [31, 40, 45])
 @pytest.mark.parametrize("step", [1, 500, 1 << 20])
-def test_tcp_cut_anywhere_and_with_garbage(version: int, step: int) -> None:
+def test_tcp_bytes_cut_anywhere_and_with_garbage_are_decoded(version: int, step: int) -> None:
     stream = b"\x28garbage\x2d" + b"".join(packets(3, version=version))
     decoder = ScreamDecoder(SENSORS)
     found: list[Block | Event] = []
@@ -352,7 +352,7 @@ def test_tcp_cut_anywhere_and_with_garbage(version: int, step: int) -> None:
     assert [e.text for e in events] == ["skipped 9 bytes"]
 
 
-def test_udp_packets_that_overtake_and_that_stay_lost() -> None:
+def test_reordered_and_lost_udp_packets_are_handled() -> None:
     sent = packets(40)
     sent[4], sent[5], sent[7] = sent[5], sent[4], scream.ACKNOWLEDGED
     decoder = ScreamDecoder(SENSORS)
@@ -365,7 +365,7 @@ def test_udp_packets_that_overtake_and_that_stay_lost() -> None:
 
 @pytest.mark.parametrize("lost", range(3, 6))
 @pytest.mark.parametrize("patience", [0, 2])
-def test_one_that_stays_lost_holds_up_less_than_a_block(lost: int, patience: int) -> None:
+def test_a_lost_packet_delays_less_than_one_block(lost: int, patience: int) -> None:
     """What comes two block periods after the last looks like a stall."""
     decoder = ScreamDecoder(SENSORS, patience=patience)
     seconds = []
@@ -379,7 +379,7 @@ def test_one_that_stays_lost_holds_up_less_than_a_block(lost: int, patience: int
     assert seconds == [0, 2, 3, 4, 5, 6, 7]
 
 
-def test_udp_packets_asked_for_again() -> None:
+def test_requested_udp_packets_fill_their_holes() -> None:
     sent = packets(4)
     decoder = ScreamDecoder(SENSORS, patience=32)
     found = [
@@ -392,7 +392,7 @@ def test_udp_packets_asked_for_again() -> None:
     assert not decoder.missing
 
 
-def test_udp_packets_the_server_no_longer_has() -> None:
+def test_udp_packets_that_the_server_no_longer_has_are_a_gap() -> None:
     sent = packets(5)
     decoder = ScreamDecoder(SENSORS, patience=32)
     for i in (0, 1, 2, 3, 5, 6, 7, 8):
@@ -402,7 +402,7 @@ def test_udp_packets_the_server_no_longer_has() -> None:
     np.testing.assert_array_equal(joined(found)[0], expected(200, 300))
 
 
-def test_udp_shutdown_and_nonsense() -> None:
+def test_udp_shutdown_is_reported_and_invalid_packets_are_skipped() -> None:
     decoder = ScreamDecoder(SENSORS)
     found = [*decoder.receive_datagram(scream.NO_SERVER, AT)]
     found += decoder.receive_datagram(bytes(1077), AT)
@@ -414,7 +414,7 @@ def test_udp_shutdown_and_nonsense() -> None:
 
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=300), max_size=8), st.randoms(use_true_random=False))
-def test_serial_survives_anything_and_resumes(pieces: list[bytes], random: Random) -> None:
+def test_serial_decoding_continues_after_any_bytes(pieces: list[bytes], random: Random) -> None:
     """Frames amid noise are all decoded, and nothing but the protocol's own error is raised."""
     frames = [brp.encode_frame(i, raw) for i, raw in enumerate(raw_blocks(4))]
     line = b"".join(pieces)
@@ -429,7 +429,7 @@ def test_serial_survives_anything_and_resumes(pieces: list[bytes], random: Rando
 
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=1500), max_size=4))
-def test_scream_survives_anything_and_resumes(pieces: list[bytes]) -> None:
+def test_scream_decoding_continues_after_any_bytes(pieces: list[bytes]) -> None:
     decoder = ScreamDecoder(SENSORS)
     found = decoder.receive(b"".join(pieces), AT)
     for data in (*packets(4), bytes(1100)):
@@ -459,7 +459,7 @@ def test_memory_stays_bounded() -> None:
 
 
 @pytest.mark.parametrize("before", [3, 20_000, 20_500, 40_000, 60_000])
-def test_a_scream_server_that_was_restarted_numbers_anew(before: int) -> None:
+def test_a_restart_of_a_scream_server_is_detected(before: int) -> None:
     """Its packets go on being told apart: one that is lost afterwards is awaited again."""
     decoder = ScreamDecoder(SENSORS, patience=32)
     blocks = [scream.Packet(0, "", sample_block(i, s)) for s in range(30) for i in range(3)]

@@ -143,7 +143,7 @@ def test_auto_recovery_is_a_gap_of_exact_length(timed: bool) -> None:
     assert "1000 scans" in events[1].text
 
 
-def test_the_timer_counts_a_gap_the_information_does_not() -> None:
+def test_the_timer_gives_a_gap_that_the_information_omits() -> None:
     """The field of 16 bits says 65535; 100 000 scans were skipped."""
     line = encode_packet(Packet(scans(0, 10).ravel(), transaction=0))
     late = Packet(scans(100_010, 10).ravel(), status=2941, information=65_535, transaction=1)
@@ -168,7 +168,7 @@ def test_lost_packets_are_counted_in_samples(timed: bool) -> None:
 
 
 @pytest.mark.parametrize("status", [2942, 2943, 2945])
-def test_fatal_statuses_end_the_stream_until_it_is_started_anew(status: int) -> None:
+def test_fatal_statuses_end_the_stream_until_its_restart(status: int) -> None:
     receiver = decoder()
     broken = np.append(
         scans(0, 10).ravel(), np.array([7, 7, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF], np.uint16)
@@ -189,7 +189,7 @@ def test_fatal_statuses_end_the_stream_until_it_is_started_anew(status: int) -> 
 
 @pytest.mark.parametrize("missing", [0, 1, 999, 107_374, 107_375, 20 * 107_374 + 5])
 @pytest.mark.parametrize("late", [-0.3, 0.0, 0.7])
-def test_a_stream_started_anew_goes_on_where_the_timer_says(missing: int, late: float) -> None:
+def test_a_restarted_stream_is_placed_by_the_timer(missing: int, late: float) -> None:
     """Host time, off by its latency and 100 ppm, tells the wraps (107 374 scans) only."""
     receiver = decoder()
     found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
@@ -203,7 +203,7 @@ def test_a_stream_started_anew_goes_on_where_the_timer_says(missing: int, late: 
 
 
 @pytest.mark.parametrize("timer", [5 * TICKS * 1000, -5 * TICKS * 1000])
-def test_a_timer_that_began_anew_meanwhile_is_not_believed(timer: int) -> None:
+def test_a_reset_timer_is_not_used_for_the_gap(timer: int) -> None:
     receiver = decoder()
     found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
     receiver.restart()
@@ -217,7 +217,7 @@ def test_a_timer_that_began_anew_meanwhile_is_not_believed(timer: int) -> None:
     assert not blocks[2].flags
 
 
-def test_host_time_that_may_be_a_wrap_off_is_not_asked_for_wraps() -> None:
+def test_uncertain_host_time_is_not_used_for_wraps() -> None:
     """A stream broken off for three days: 200 ppm of them are 52 s, half a wrap."""
     receiver = decoder()
     found = receiver.receive(encode_packet(Packet(scans(0, 10).ravel())), at(0.01))
@@ -229,7 +229,7 @@ def test_host_time_that_may_be_a_wrap_off_is_not_asked_for_wraps() -> None:
     assert blocks[1].flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
 
 
-def test_a_burst_comes_to_its_end() -> None:
+def test_a_complete_burst_is_detected() -> None:
     receiver = decoder()
     line = b"".join(packets(scans(0, 20), 60, status=2944, information=60))
     assert indices(of("A", receiver.receive(line, at(1)))[1]) == list(range(20))
@@ -237,7 +237,7 @@ def test_a_burst_comes_to_its_end() -> None:
 
 
 @pytest.mark.parametrize("extreme", [0, 0xFFFF])
-def test_clipping_is_flagged_where_it_is(extreme: int) -> None:
+def test_clipping_is_flagged_for_the_clipped_sensor(extreme: int) -> None:
     rows = scans(0, 10)
     rows[4, 5] = extreme
     found = decoder().receive(encode_packet(Packet(rows.ravel())), at(1))
@@ -245,14 +245,14 @@ def test_clipping_is_flagged_where_it_is(extreme: int) -> None:
     assert of("B", found)[1][0].flags & BlockFlag.CLIPPED
 
 
-def test_unknown_statuses_are_told() -> None:
+def test_unknown_statuses_are_reported() -> None:
     line = encode_packet(Packet(scans(0, 10).ravel(), status=1234))
     counts, _, events = of("A", decoder().receive(line, at(1)))
     assert len(counts) == 10
     assert [(e.kind, e.text) for e in events] == [("status", "stream status 1234")]
 
 
-def test_command_response() -> None:
+def test_command_response_reads_are_decoded() -> None:
     rows = scans(0, 10)
     values = stream.encode_response(Packet(rows.ravel(), backlog=8), n_registers=255)
     assert len(values) == 510
@@ -264,7 +264,7 @@ def test_command_response() -> None:
 
 
 @pytest.mark.parametrize("values", [b"", bytes(7), struct.pack(">HHHH", 1, 0, 0, 0)])
-def test_command_response_that_promises_more_than_it_holds(values: bytes) -> None:
+def test_a_response_that_declares_too_many_samples_is_refused(values: bytes) -> None:
     with pytest.raises(RemoteProtocolError, match="bytes"):
         stream.decode_response(values)
 
@@ -291,13 +291,13 @@ def test_feedback_of_the_datasheet() -> None:
         (b"\x03\0\0\0\0", "3"),
     ],
 )
-def test_feedback_replies_that_are_none(pdu: bytes, said: str) -> None:
+def test_invalid_feedback_replies_are_refused(pdu: bytes, said: str) -> None:
     with pytest.raises(RemoteProtocolError, match=said):
         registers.feedback_values(pdu, 4)
 
 
 @pytest.mark.parametrize("step", [1, 5, 1000])
-def test_messages_cut_anywhere(step: int) -> None:
+def test_messages_cut_anywhere_are_decoded(step: int) -> None:
     sent = [Adu(i, 255, bytes((76, *range(i)))) for i in range(20)]
     line = b"".join(registers.encode_adu(adu) for adu in sent)
     finder = AduFinder()
@@ -307,7 +307,7 @@ def test_messages_cut_anywhere(step: int) -> None:
 
 
 @pytest.mark.parametrize("line", [b"GET / HTTP/1.1\r\n", b"\0\0\0\0\xff\xff\1", b"\0\0\0\0\0\1\1"])
-def test_what_is_no_modbus_is_named(line: bytes) -> None:
+def test_bytes_that_are_not_modbus_are_refused(line: bytes) -> None:
     with pytest.raises(RemoteProtocolError, match="not Modbus TCP"):
         AduFinder().receive(line)
 
@@ -349,7 +349,7 @@ def test_t8_calibration_of_the_datasheet() -> None:
         (1.0, 1.0000128),
     ],
 )
-def test_scan_rates_a_device_makes(wanted: float, actual: float) -> None:
+def test_actual_scan_rates_are_those_of_the_device(wanted: float, actual: float) -> None:
     assert registers.actual_scan_rate(wanted) == pytest.approx(actual, rel=1e-8)
 
 
@@ -358,7 +358,7 @@ def test_scan_rates_a_device_makes(wanted: float, actual: float) -> None:
 
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=200), max_size=6), st.booleans())
-def test_stream_survives_anything_and_resumes(pieces: list[bytes], timed: bool) -> None:
+def test_stream_decoding_continues_after_any_bytes(pieces: list[bytes], timed: bool) -> None:
     receiver = decoder(timed=timed)
     noise = b"".join(pieces)
     receiver.receive(noise, at(1))
@@ -390,7 +390,7 @@ def test_memory_stays_bounded() -> None:
 
 
 @pytest.mark.parametrize("timed", [True, False])
-def test_a_packet_number_that_host_time_does_not_allow(timed: bool) -> None:
+def test_a_packet_number_that_contradicts_host_time_is_ignored(timed: bool) -> None:
     """One packet comes twice, and one with a wrong number: neither is 65,000 packets lost."""
     width = 6 if timed else 4
     sent = packets(scans(0, 400, timed=timed), 10 * width)
@@ -408,7 +408,7 @@ def test_a_packet_number_that_host_time_does_not_allow(timed: bool) -> None:
 
 
 @pytest.mark.parametrize("timed", [True, False])
-def test_a_packet_that_lost_bytes_does_not_move_those_that_follow(timed: bool) -> None:
+def test_a_packet_with_lost_bytes_does_not_shift_later_ones(timed: bool) -> None:
     width = 6 if timed else 4
     sent = packets(scans(0, 200, timed=timed), 10 * width)
     cut = sent[5][:50] + sent[5][52:]
@@ -421,7 +421,7 @@ def test_a_packet_that_lost_bytes_does_not_move_those_that_follow(timed: bool) -
     assert starts == [0, 10, 20, 30, 40, 50, *range(70, 200, 10)]  # the next one pays for it
 
 
-def test_a_packet_that_comes_again_late_is_known_by_its_timer() -> None:
+def test_a_late_repeated_packet_is_recognised_by_its_timer() -> None:
     """Host time alone cannot tell it from a restart when the host was held up."""
     scan_list = [*stream.TIMER_ADDRESSES, 0]
     decoder = stream.StreamDecoder({"L": [0]}, scan_list=scan_list, scan_rate=200.0)
@@ -456,7 +456,7 @@ def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_a_packet_that_comes_again_and_again_is_taken_once(together: bool) -> None:
+def test_a_packet_repeated_several_times_is_decoded_once(together: bool) -> None:
     """After a pause of the host its number alone could be that of a device restarted."""
     line = packets(scans(0, 400), 120)
     receiver = decoder()

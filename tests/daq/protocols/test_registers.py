@@ -42,7 +42,9 @@ def as_array(registers: list[int]) -> NDArray[np.uint16]:
         ("int64", "little", [0xFFFF, 0, 0, 0], 65535),
     ],
 )
-def test_values(data_type: str, word_order: str, registers: list[int], value: float) -> None:
+def test_values_are_encoded_and_decoded(
+    data_type: str, word_order: str, registers: list[int], value: float
+) -> None:
     found = RegisterMap.of({"address": 7, "data_type": data_type, "word_order": word_order}, 1)
     assert found.reads() == ((7, len(registers)),)
     assert found.counts(as_array(registers)).tolist() == [[value]]
@@ -77,7 +79,7 @@ def test_labjack_inputs_are_floats_two_registers_apart() -> None:
         ({"addresses": (5, 5, 6), "counter_address": 3}, ((3, 4),), ((3, 1), (5, 2))),
     ],
 )
-def test_as_few_requests_as_can_be(
+def test_requests_are_as_few_as_possible(
     given_settings: dict[str, Any],
     together: tuple[tuple[int, int], ...],
     apart: tuple[tuple[int, int], ...] | None,
@@ -102,7 +104,7 @@ def test_a_value_is_never_split_between_two_replies() -> None:
     st.sampled_from(["witmotion", "uint32-s", "uint32-ms", "uint32-us", "uint64-ns"]),
     st.integers(1, 4),
 )
-def test_what_a_device_holds_is_what_is_read(
+def test_encoded_registers_are_decoded_equally(
     data_type: str, word_order: str, time_format: str, n_channels: int
 ) -> None:
     found = RegisterMap.of(
@@ -139,7 +141,7 @@ def test_what_a_device_holds_is_what_is_read(
         ({"address": 0, "time_format": "uint32-s"}, "expected with time_address only"),
     ],
 )
-def test_maps_that_cannot_be(given_settings: dict[str, Any], message: str) -> None:
+def test_impossible_maps_are_refused(given_settings: dict[str, Any], message: str) -> None:
     with pytest.raises(DeviceSettingError, match=message):
         RegisterMap.of(given_settings, 3)
 
@@ -161,7 +163,7 @@ def test_without_a_device_time_the_instant_is_halfway() -> None:
     assert (block.first_sample, block.flags) == (0, BlockFlag.CLOCK_RESTART)
 
 
-def test_what_waited_for_more_came_when_it_came() -> None:
+def test_collected_readings_keep_their_arrival() -> None:
     """Not when the device was given up: the length of a gap to the next session hangs on it."""
     one = decoder(rate=8.0)
     assert one.receive([5], host(100), host(104)) == []
@@ -170,7 +172,7 @@ def test_what_waited_for_more_came_when_it_came() -> None:
     assert block.received == host(104)
 
 
-def test_polls_without_a_reading_are_a_gap() -> None:
+def test_missing_readings_are_a_gap() -> None:
     one = decoder(rate=4.0)
     (first,) = one.receive([1], host(0), host(0))
     (later,) = one.receive([2], host(1000), host(1000))
@@ -181,7 +183,7 @@ def test_polls_without_a_reading_are_a_gap() -> None:
     assert later.reason == "3 polls without a reading"
 
 
-def test_the_same_reading_twice_is_one() -> None:
+def test_a_repeated_reading_is_dropped() -> None:
     one = decoder(rate=16.0, counter_address=1)
     found = []
     for k, counter in enumerate([65534, 65534, 65535, 0]):
@@ -192,7 +194,7 @@ def test_the_same_reading_twice_is_one() -> None:
     assert block.device_counter == 65534
 
 
-def test_the_device_time_gives_the_instant_whatever_the_latency() -> None:
+def test_device_time_gives_the_instant_for_any_latency() -> None:
     latency = np.random.default_rng(1).uniform(1, 8, 400)
     one = decoder(rate=100.0, time_address=1, time_format="uint32-ms")
     instants = []

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import pytest
 
 
-def test_bytes_that_are_no_packet_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_bytes_are_examined_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of these may begin a packet, and comes by itself."""
     n_decoded = 0
     decode = scream.decode_packet

@@ -79,7 +79,7 @@ def check(found: list[Block | Event], *, gaps: int = 0) -> list[Block]:
 # --- packets ---------------------------------------------------------------------------------
 
 
-def test_version_3_as_the_manual_has_it() -> None:
+def test_version_3_matches_the_manual() -> None:
     payload = record(0, 0)
     assert encode_packet(Packet(0x1A2B3C, payload), 3) == b"SL1A2B3C" + payload
     assert encode_packet(Packet(0x101A2B3C, payload), 3)[:8] == b"SL1A2B3C"  # 24 bits
@@ -87,7 +87,7 @@ def test_version_3_as_the_manual_has_it() -> None:
     assert [one.sequence for one in found] == [10, None]
 
 
-def test_version_4_as_the_specification_has_it() -> None:
+def test_version_4_matches_the_specification() -> None:
     """FDSN SeedLink 4: 'SE', format, subformat, length u32, sequence u64, id length, id."""
     payload = record(0, 0)
     line = b"SE2D" + struct.pack("<IQB", 512, 1 << 40, 6) + b"XX_STA" + payload
@@ -98,7 +98,7 @@ def test_version_4_as_the_specification_has_it() -> None:
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("step", [1, 7, 519, 100_000])
-def test_packets_cut_anywhere(version: Version, step: int) -> None:
+def test_packets_cut_anywhere_are_decoded(version: Version, step: int) -> None:
     line = turn(0, version) + turn(1, version)
     finder = PacketFinder(version)
     found = [p for i in range(0, len(line), step) for p in finder.receive(line[i : i + step])]
@@ -106,12 +106,12 @@ def test_packets_cut_anywhere(version: Version, step: int) -> None:
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_what_is_no_packet_is_named(version: Version) -> None:
+def test_bytes_that_are_no_packet_are_refused(version: Version) -> None:
     with pytest.raises(RemoteProtocolError, match=r"no SeedLink packet: 'HTTP"):
         PacketFinder(version).receive(b"HTTP/1.1 400 Bad Request\r\n")
 
 
-def test_commands() -> None:
+def test_commands_match_the_manual() -> None:
     assert packets.station_command(3, "GE", "WLF") == "STATION WLF GE"
     assert packets.station_command(4, "GE", "WLF") == "STATION GE_WLF"
     assert packets.select_command(3, "*", "HN?") == "SELECT HN?"
@@ -126,7 +126,7 @@ def test_commands() -> None:
     assert not packets.speaks_version_4("SeedLink v3.2 (2018.220) :: SLPROTO:3.1")
 
 
-def test_records_there_and_back() -> None:
+def test_records_survive_encoding_and_decoding() -> None:
     found = decode_record(record(3, 1))
     assert found is not None
     assert found.stream_id == "XX.STA.00.HNN"
@@ -153,7 +153,7 @@ def test_records_become_blocks_of_three_channels(
     assert receiver.last == {"XX_STA": (18, T0 + 5 * N * NS // RATE)}
 
 
-def test_a_channel_that_comes_late_is_waited_for() -> None:
+def test_a_late_channel_is_awaited() -> None:
     receiver = decoder()
     found: list[Block | Event] = []
     for k in range(20):
@@ -163,7 +163,7 @@ def test_a_channel_that_comes_late_is_waited_for() -> None:
     assert sum(block.n_samples for block in check(found)) == 17 * N
 
 
-def test_a_record_that_comes_late_fills_its_place() -> None:
+def test_a_late_record_fills_its_hole() -> None:
     """Record 5 of one channel comes three seconds after those that follow it."""
     receiver = decoder(hold=5.0)
     found: list[Block | Event] = []
@@ -175,7 +175,7 @@ def test_a_record_that_comes_late_fills_its_place() -> None:
     assert sum(block.n_samples for block in check(found)) == 20 * N
 
 
-def test_a_record_that_never_comes_is_a_gap_of_its_length() -> None:
+def test_a_missing_record_is_a_gap_of_its_length() -> None:
     receiver = decoder(hold=5.0)
     found: list[Block | Event] = []
     for k in range(40):
@@ -200,7 +200,7 @@ def test_a_backlog_behind_a_hole_is_kept() -> None:
     assert not [item for item in found if isinstance(item, Event)]
 
 
-def test_channels_that_come_one_after_the_other_are_joined() -> None:
+def test_channels_received_one_after_another_are_joined() -> None:
     """A digitizer sends its backlog channel by channel: a quarter of an hour of each."""
     receiver = decoder()
     found = [item for k in range(3) for item in receiver.receive(turn(k), at(k / 2))]
@@ -210,7 +210,7 @@ def test_channels_that_come_one_after_the_other_are_joined() -> None:
     assert sum(block.n_samples for block in check(found)) == 1803 * N
 
 
-def test_another_connection_goes_on_and_what_comes_twice_is_taken_once() -> None:
+def test_a_new_connection_continues_and_repeated_samples_are_dropped() -> None:
     receiver = decoder()
     found: list[Block | Event] = []
     for k in range(5):
@@ -222,7 +222,7 @@ def test_another_connection_goes_on_and_what_comes_twice_is_taken_once() -> None
     assert sum(block.n_samples for block in check(found)) == 10 * N
 
 
-def test_a_damaged_record_is_said_and_left_out() -> None:
+def test_a_damaged_record_is_reported_and_skipped() -> None:
     receiver = decoder(hold=1.0)
     found: list[Block | Event] = []
     for k in range(20):

@@ -47,7 +47,7 @@ def split(found: list[Block | Event]) -> tuple[list[int], list[list[float]], lis
 
 
 @pytest.mark.parametrize("step", [1, 5, 1000])
-def test_rows_cut_anywhere(step: int) -> None:
+def test_rows_cut_anywhere_are_decoded(step: int) -> None:
     line = b"1,2,3\r\n 4.5 , -5e1,6\n\n7,8,9\n10,1"
     decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
     found = [
@@ -63,14 +63,14 @@ def test_rows_cut_anywhere(step: int) -> None:
     assert first.counts.dtype == np.float64
 
 
-def test_a_device_that_sends_already_is_joined_at_a_message() -> None:
+def test_decoding_of_a_running_device_starts_at_a_message() -> None:
     decoder = TextDecoder("A", ROWS, sampling_rate=10.0, joins=True)
     found = decoder.receive(b"5,6\n1,2,3", at(1)) + decoder.receive(b"\n4,5,6\n", at(2))
     index, rows, events = split(found)
     assert (index, rows, events) == ([0, 1], [[1, 2, 3], [4, 5, 6]], [])
 
 
-def test_lily() -> None:
+def test_lily_rows_are_decoded() -> None:
     """The manual's line, padded as it is; seconds that do not come are a gap."""
     line = "LILY,2013/06/24 23:22:{:02d},-236.026,  25.666,194.25, 26.01,11.96,N9655\r\n"
     decoder = TextDecoder("A", LILY, sampling_rate=1.0)
@@ -88,7 +88,7 @@ def test_lily() -> None:
     assert gap.device_counter == 1_372_116_126 * 10**9  # 2013-06-24T23:22:06Z
 
 
-def test_raspberry_shake() -> None:
+def test_raspberry_shake_packets_are_decoded() -> None:
     """The packet of the manual: 25 counts, the time of the first."""
     counts = list(range(14168, 14193))
     packet = "{'EHZ', 1582315130.292, " + ", ".join(map(str, counts)) + "}"
@@ -136,7 +136,7 @@ def test_a_lost_packet_of_one_channel_is_a_gap_of_all() -> None:
     assert flags == [BlockFlag.DEVICE_UTC] * 2  # exact: the times are written to 1 ms
 
 
-def test_packets_that_come_twice_and_overtake_one_another() -> None:
+def test_repeated_and_reordered_packets_are_sorted() -> None:
     """In pairs the wrong way round, and many again later; one time on the way is damaged."""
     decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
     found: list[Block | Event] = []
@@ -198,7 +198,7 @@ def test_a_clock_that_drifts_and_times_that_jitter_lose_nothing() -> None:
 
 
 @pytest.mark.parametrize("written", ["{}", "{}.000"])
-def test_times_that_stand_for_many_rows(written: str) -> None:
+def test_one_time_may_belong_to_many_rows(written: str) -> None:
     """Ten rows a second with whole seconds, however they are written.
 
     That 23 of them are lost is noticed at the next second.
@@ -249,7 +249,7 @@ def test_a_leap_second_of_many_rows_is_a_gap() -> None:
     assert events[-1].kind == "reset"
 
 
-def test_a_tiltmeter_that_repeats_a_row() -> None:
+def test_a_repeated_row_of_a_tiltmeter_is_dropped() -> None:
     """Times as coarse as the rows: only what repeats to the letter is known already."""
     decoder = TextDecoder("A", LILY, sampling_rate=1.0)
     line = "LILY,2013/06/24 23:22:{:02d},{},25,194,26,11,N9655\r\n"
@@ -277,7 +277,7 @@ def test_one_damaged_time_is_one_row_lost() -> None:
 @pytest.mark.parametrize(
     ("step", "n_dropped"), [(90_000.0, 0), (30.0, 0), (-20.0, 20), (-1.0, 10), (-0.3, 3)]
 )
-def test_a_clock_that_is_set_begins_anew(step: float, n_dropped: int) -> None:
+def test_a_set_clock_is_a_reset(step: float, n_dropped: int) -> None:
     """Set back by less than an hour, it may be rows that come again: those of 2 s are dropped."""
     arrivals = [i / 10 for i in range(100)]
     times = [100_000 + t + (step if t >= 5 else 0) for t in arrivals]
@@ -317,7 +317,7 @@ def test_a_counter_makes_gaps_exact() -> None:
     assert {b.reason for b in found if isinstance(b, Block)} == {"", "counter"}
 
 
-def test_rows_that_cannot_be_read_are_counted() -> None:
+def test_unreadable_rows_are_counted() -> None:
     sent = b"1,2,3\n4,five,6\n7,8\n9,9,9\nnan,1,1\n1,1,1\n"
     found = TextDecoder("A", ROWS, sampling_rate=10.0).receive(sent, at(1))
     index, _, events = split(found)
@@ -365,20 +365,20 @@ def test_any_format(format_: TextFormat, line: bytes) -> None:
     "time",
     ["-1", "nan", "1e300", "9e9", "x", ""],
 )
-def test_times_that_are_none(time: str) -> None:
+def test_invalid_times_are_refused(time: str) -> None:
     decoder = TextDecoder("A", TextFormat(columns=(1,), time_column=0), sampling_rate=1.0)
     index, _, events = split(decoder.receive(f"{time},1\n0.000001,1\n".encode(), at(1)))
     assert index == [0]
     assert len(events) == 1
 
 
-def test_whole_numbers_stay_whole() -> None:
+def test_integers_remain_integers() -> None:
     decoder = TextDecoder("A", TextFormat(columns=(0,), whole=True), sampling_rate=1.0)
     sent = b"2147483647\n2147483648\n1.5\n1e300\n-1e300\n-2147483648\n"
     assert split(decoder.receive(sent, at(1)))[1] == [[2147483647], [-2147483648]]
 
 
-def test_times_are_written_as_finely_as_they_are_read() -> None:
+def test_times_keep_their_resolution() -> None:
     format_ = TextFormat(time_format="%Y-%m-%dT%H:%M:%S.%f")
     written = encode_time(1_795_219_200_123_456_789, format_)
     assert written == "2026-11-21T00:00:00.123456"
@@ -387,7 +387,7 @@ def test_times_are_written_as_finely_as_they_are_read() -> None:
 
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from([ROWS, COUNTED, SHAKE, LILY]))
-def test_survives_anything_and_resumes(pieces: list[bytes], format_: TextFormat) -> None:
+def test_decoding_continues_after_any_bytes(pieces: list[bytes], format_: TextFormat) -> None:
     decoder = TextDecoder("A", format_, sampling_rate=100.0)
     decoder.receive(b"".join(pieces) + format_.terminator.encode(), at(0))
     lines = {
@@ -406,7 +406,7 @@ def test_survives_anything_and_resumes(pieces: list[bytes], format_: TextFormat)
 
 @settings(max_examples=60)
 @given(st.lists(st.text(alphabet="0123456789.,-+eE{}' \n", max_size=60), max_size=10))
-def test_anything_that_looks_like_numbers(pieces: list[str]) -> None:
+def test_any_text_of_numbers_is_decoded_or_refused(pieces: list[str]) -> None:
     for format_ in (ROWS, COUNTED, SHAKE):
         decoder = TextDecoder("A", format_, sampling_rate=100.0)
         for piece in pieces:

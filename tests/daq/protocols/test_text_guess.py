@@ -82,7 +82,7 @@ def format_of(settings: dict[str, Any]) -> TextFormat:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_guess_reads_its_rows(name: str) -> None:
+def test_guessed_settings_decode_their_rows(name: str) -> None:
     rows, expected = CASES[name]
     settings = guess_settings([row.encode() for row in rows])
     assert settings is not None
@@ -103,7 +103,7 @@ def test_a_guess_reads_its_rows(name: str) -> None:
 @pytest.mark.parametrize(
     "rows", [[], [b"hello", b"world", b"again"], [b"\x80\x0d\xff"] * 5, [b"1,2", b"3", b"4,5,6"]]
 )
-def test_what_is_no_rows_gives_no_guess(rows: list[bytes]) -> None:
+def test_text_without_rows_gives_no_guess(rows: list[bytes]) -> None:
     assert guess_settings(rows) is None
 
 

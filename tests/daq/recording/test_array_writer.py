@@ -45,7 +45,7 @@ def written(path: Path, *pieces: int, **options: Any) -> NDArray[np.void]:  # no
         return np.array(sensor.blocks)
 
 
-def test_pieces_of_any_length_make_the_same_recording(tmp_path: Path) -> None:
+def test_the_recording_does_not_depend_on_the_length_of_pieces(tmp_path: Path) -> None:
     at_once = written(tmp_path / "1.h5", 1000, block_rows=50)
     in_pieces = written(tmp_path / "2.h5", 50, 400, 550, block_rows=50)
     np.testing.assert_array_equal(at_once, in_pieces)
@@ -92,7 +92,7 @@ def test_gaps_and_events_are_recorded(tmp_path: Path) -> None:
         assert recording.sensors[0].blocks["first_sample"].tolist() == [0, 500]
 
 
-def test_a_recording_is_not_there_before_it_is_complete(tmp_path: Path) -> None:
+def test_an_incomplete_recording_does_not_have_its_name(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     with ArrayWriter(path, sensors=[LAYOUT], created=CREATED) as writer:
         writer.samples("A", COUNTS)
@@ -132,7 +132,7 @@ def test_a_file_of_that_name_is_never_replaced(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
-def test_what_a_killed_process_left_does_not_stand_in_the_way(tmp_path: Path) -> None:
+def test_files_of_a_killed_process_do_not_block_a_new_recording(tmp_path: Path) -> None:
     leftover = tmp_path / ".r.h5.0123.new"
     leftover.write_bytes(b"half of it")
     os.utime(leftover, (0, 0))

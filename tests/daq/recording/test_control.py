@@ -21,9 +21,7 @@ from daq.recording.control import HOST, MAX_CONNECTIONS, Answer, Command, ask, s
         (70_000, "0" * 32),
     ],
 )
-def test_nothing_is_sent_to_an_address_that_is_not_of_a_recorder(
-    port: int | None, token: str
-) -> None:
+def test_no_bytes_are_sent_to_an_invalid_address(port: int | None, token: str) -> None:
     with socket.create_server((HOST, 0)) as listening:
         listening.settimeout(0)
         at = listening.getsockname()[1] if port is None else port
@@ -33,7 +31,7 @@ def test_nothing_is_sent_to_an_address_that_is_not_of_a_recorder(
             listening.accept()
 
 
-async def test_there_are_so_many_connections_at_a_time() -> None:
+async def test_the_number_of_connections_is_limited() -> None:
     async def answer(_command: Command, _text: str) -> Answer:
         return {"well": True}
 

@@ -95,7 +95,7 @@ def make(path: Path, n_rows: int = 250) -> np.ndarray[tuple[int, int], np.dtype[
 
 
 @pytest.mark.parametrize("n_lines", [3, 12, 31])
-def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
+def test_a_kill_loses_no_acknowledged_rows(tmp_path: Path, n_lines: int) -> None:
     path = tmp_path / "r.h5"
     acknowledged = killed(path, n_lines)
     before = verify(path)
@@ -121,7 +121,7 @@ def test_kill_loses_nothing_acknowledged(tmp_path: Path, n_lines: int) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
-def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) -> None:
+def test_repair_while_another_reader_lags_loses_nothing(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     with run_writer(path) as writer:
         assert writer.stdout is not None
@@ -137,7 +137,7 @@ def test_healing_beside_a_reader_that_lags_behind_loses_nothing(tmp_path: Path) 
         assert sensor.n_samples >= json.loads(lines[-1])[sensor.name] > 0
 
 
-def test_asking_who_writes_does_not_disturb_a_reader(tmp_path: Path) -> None:
+def test_is_being_written_does_not_disturb_a_reader(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     with run_writer(path) as writer:
         assert writer.stdout is not None
@@ -160,7 +160,7 @@ def test_asking_who_writes_does_not_disturb_a_reader(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])
-def test_a_killed_file_that_lost_its_end(tmp_path: Path, kept: float) -> None:
+def test_a_truncated_file_of_a_killed_recorder_is_handled(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "r.h5"
     killed(path, 40)
     with path.open("r+b") as raw:
@@ -175,7 +175,7 @@ def test_a_killed_file_that_lost_its_end(tmp_path: Path, kept: float) -> None:
             assert sensor.bad_blocks == tuple(range(sensor.bad_blocks[0], sensor.n_blocks))
 
 
-def test_full_disk_is_said_and_nothing_committed_is_lost(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_loses_no_committed_rows(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     with run_writer(path, 150_000) as writer:
         assert writer.stdout is not None
@@ -190,7 +190,7 @@ def test_full_disk_is_said_and_nothing_committed_is_lost(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="mounts a small disk")
-def test_small_disk(tmp_path: Path) -> None:
+def test_a_small_disk_loses_no_committed_rows(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
@@ -208,7 +208,7 @@ def test_small_disk(tmp_path: Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_being_written_is_not_healed(tmp_path: Path) -> None:
+def test_a_file_being_written_is_not_repaired(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     with run_writer(path) as writer:
         assert writer.stdout is not None
@@ -221,7 +221,7 @@ def test_being_written_is_not_healed(tmp_path: Path) -> None:
         writer.send_signal(signal.SIGKILL)
 
 
-def test_damage_is_found_and_said(tmp_path: Path) -> None:
+def test_damage_is_found_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     make(path)
     with h5py.File(path, "r") as file:
@@ -260,7 +260,7 @@ def test_results_replace_earlier_ones_and_leave_the_samples(tmp_path: Path) -> N
     assert verify(path).intact
 
 
-def test_results_that_cannot_be_written_leave_the_recording_as_it_was(tmp_path: Path) -> None:
+def test_results_that_cannot_be_written_do_not_change_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     make(path)
     before = path.read_bytes()

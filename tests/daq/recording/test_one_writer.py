@@ -40,7 +40,7 @@ def record(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_of_two_recorders_with_one_name_the_later_fails_and_destroys_nothing(
+def test_the_later_of_two_recorders_with_one_name_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other one records and closes after this one has found the name free."""
@@ -83,7 +83,7 @@ def test_a_recording_that_loses_its_name_ends(tmp_path: Path, *, replaced: bool)
         assert verify(path).closed
 
 
-def test_a_recording_is_its_owner_s_alone(tmp_path: Path) -> None:
+def test_a_recording_is_readable_only_by_its_owner(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = create(path)
     writer.append(Block("a", 0, COUNTS, NOW))
@@ -97,7 +97,7 @@ def test_a_recording_is_its_owner_s_alone(tmp_path: Path) -> None:
     assert not journal_path(path).exists()
 
 
-def test_a_file_that_says_closed_and_does_not_open_plainly_is_mended(tmp_path: Path) -> None:
+def test_a_file_marked_closed_that_does_not_open_is_repaired(tmp_path: Path) -> None:
     """The power failed between the last commit and the end of the close."""
     path = tmp_path / "r.h5"
     record(path)

@@ -123,7 +123,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (sensor_named_twice, "expected different names"),
     ],
 )
-def test_what_a_recording_never_holds_is_refused(
+def test_contents_that_recordings_never_have_are_refused(
     whole: Path, tmp_path: Path, change: Callable[[h5py.File], None], said: str
 ) -> None:
     path = tmp_path / "r.h5"
@@ -157,7 +157,7 @@ def test_control_address_of_another_type_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_is_refused_without_waiting(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "r.h5")
     with pytest.raises(NotARecordingError, match="not a huddle recording"):
         Recording.open(tmp_path / "r.h5")

@@ -22,7 +22,7 @@ def test_a_write_is_repeated_until_it_succeeds(n_failures: int) -> None:
     assert slept == list(PAUSES[:n_failures])
 
 
-def test_one_that_stays_is_raised() -> None:
+def test_a_persistent_error_is_raised() -> None:
     def write() -> None:
         raise OSError(5, "Input/output error")
 

@@ -120,7 +120,7 @@ def test_round_trip(tmp_path: Path) -> None:
             b.instants_ns()
 
 
-def test_plain_h5py_reads_it(tmp_path: Path) -> None:
+def test_plain_h5py_reads_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
     writer.append(block("a", 0, 250))
@@ -135,7 +135,7 @@ def test_plain_h5py_reads_it(tmp_path: Path) -> None:
         np.testing.assert_array_equal(dataset[...], samples(0, 250))
 
 
-def test_only_whole_chunks_and_whole_blocks_are_committed(tmp_path: Path) -> None:
+def test_only_complete_chunks_and_blocks_are_committed(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
     for first in range(0, 195, 15):
@@ -196,7 +196,7 @@ with Recording.open(sys.argv[1]) as recording:
 """
 
 
-def test_another_process_follows(tmp_path: Path) -> None:
+def test_another_process_follows_a_growing_recording(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
     command = [sys.executable, "-c", FOLLOWER, str(path)]
@@ -227,7 +227,7 @@ def test_another_process_follows(tmp_path: Path) -> None:
         assert ask() == [True, 307, int(samples(0, 307).sum()), True, 3]
 
 
-def test_it_can_be_followed_within_one_process(tmp_path: Path) -> None:
+def test_a_growing_recording_is_followed_in_the_same_process(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     writer = RecordingWriter.create(path, sensors=[layout("a")], created=NOW)
     with Recording.open(path) as recording:
@@ -254,7 +254,7 @@ def test_two_readers_of_a_file_at_rest_do_not_disturb_each_other(tmp_path: Path)
                 np.testing.assert_array_equal(first_reader.sensors[0].counts(0), samples(0, 60_000))
 
 
-def test_refuses_to_overwrite(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     path.write_text("precious", encoding="utf-8")
     with pytest.raises(RecordingError, match="exists already"):
@@ -287,30 +287,30 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-def test_refuses_text(tmp_path: Path) -> None:
+def test_a_text_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t.h5").write_text("hello", encoding="utf-8")
     assert "expected an HDF5 file" in refusal(tmp_path / "t.h5")
 
 
-def test_refuses_absent(tmp_path: Path) -> None:
+def test_an_absent_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No such file"):
         Recording.open(tmp_path / "none.h5")
 
 
-def test_refuses_foreign(tmp_path: Path) -> None:
+def test_another_hdf5_file_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "f.h5", "w") as file:
         file["data"] = [1, 2, 3]
     assert "it has no attribute format" in refusal(tmp_path / "f.h5")
 
 
-def test_refuses_newer(closed: Path) -> None:
+def test_a_newer_format_is_refused(closed: Path) -> None:
     with h5py.File(closed, "r+") as file:
         file.attrs["format_version"] = 99
     assert "written by a newer version of huddle (format 99)" in refusal(closed)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.001, 0.01, 0.5, 0.99])
-def test_refuses_truncated(closed: Path, kept: float) -> None:
+def test_a_truncated_file_is_refused(closed: Path, kept: float) -> None:
     size = closed.stat().st_size
     with closed.open("r+b") as file:
         file.truncate(int(kept * size))

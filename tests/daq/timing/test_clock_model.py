@@ -58,7 +58,7 @@ def test_the_supporting_line_is_the_highest_under_all_points() -> None:
 
 
 @pytest.mark.parametrize("ppm", [0.0, 20.0, -20.0, 10_000.0])
-def test_one_sided_latency_and_outliers_leave_the_clock_where_it_is(ppm: float) -> None:
+def test_one_sided_latency_and_outliers_do_not_shift_the_clock(ppm: float) -> None:
     rng = np.random.default_rng(2)
     taken = last_samples(6000, ppm)  # ten minutes
     late = 4e-4 + rng.exponential(1e-3, 6000)
@@ -75,7 +75,7 @@ def test_one_sided_latency_and_outliers_leave_the_clock_where_it_is(ppm: float) 
     assert np.allclose(clock.position(clock.at(index)), index, atol=1e-6)
 
 
-def test_taken_piece_by_piece_it_is_the_same_clock() -> None:
+def test_the_clock_does_not_depend_on_the_division_of_blocks() -> None:
     rng = np.random.default_rng(3)
     rows = block_rows(last_samples(3000, 15.0) + rng.exponential(1e-3, 3000))
     index = np.arange(0.0, 60_000.0, 100.0)
@@ -83,7 +83,7 @@ def test_taken_piece_by_piece_it_is_the_same_clock() -> None:
     assert np.abs(difference).max() < 1e-6
 
 
-def test_a_rate_that_wanders_and_steps_is_followed() -> None:
+def test_a_wandering_and_stepping_rate_is_tracked() -> None:
     rng = np.random.default_rng(4)
     seconds = np.arange(0, 3600, BLOCK / RATE)
     rate = np.cumsum(0.2e-6 / 60 * np.sqrt(0.1) * rng.standard_normal(len(seconds)))
@@ -97,7 +97,7 @@ def test_a_rate_that_wanders_and_steps_is_followed() -> None:
     assert clock.state.wander_ppm == pytest.approx(np.std(rate) * 1e6, rel=0.1)
 
 
-def test_restarts_begin_anew_and_keep_the_rate() -> None:
+def test_restarts_begin_an_epoch_and_keep_the_rate() -> None:
     rng = np.random.default_rng(5)
     flags = np.zeros(6000, np.int32)
     flags[[0, 3000, 5950]] = BlockFlag.CLOCK_RESTART
@@ -112,7 +112,7 @@ def test_restarts_begin_anew_and_keep_the_rate() -> None:
     assert np.abs(clock.at(index) - expected).max() < 20e-6
 
 
-def test_a_late_block_that_begins_an_epoch_does_not_pin_it() -> None:
+def test_a_late_first_block_does_not_fix_its_epoch() -> None:
     # Of the second epoch, that block alone lies before a multiple of ten seconds.
     rng = np.random.default_rng(5)
     flags = np.zeros(6000, np.int32)
@@ -127,7 +127,7 @@ def test_a_late_block_that_begins_an_epoch_does_not_pin_it() -> None:
 
 
 @pytest.mark.parametrize("n_late", [1, 3, 10])
-def test_a_few_blocks_that_are_seconds_late_tell_nothing_of_the_others(n_late: int) -> None:
+def test_a_few_blocks_seconds_late_do_not_affect_the_others(n_late: int) -> None:
     rng = np.random.default_rng(13)
     taken = last_samples(6000, 12.0)
     late = 4e-4 + rng.exponential(1e-3, 6000)
@@ -139,7 +139,7 @@ def test_a_few_blocks_that_are_seconds_late_tell_nothing_of_the_others(n_late: i
     assert clock.state.residual < 1.5 * usual
 
 
-def test_a_host_that_slept_does_not_bend_the_clock() -> None:
+def test_suspension_of_the_host_does_not_change_the_clock() -> None:
     rng = np.random.default_rng(6)
     taken = last_samples(6000, -12.0)
     arrivals = taken + rng.exponential(5e-4, 6000)
@@ -153,7 +153,7 @@ def test_a_host_that_slept_does_not_bend_the_clock() -> None:
 
 
 @pytest.mark.parametrize("pieces", [1, 17])
-def test_late_in_a_recording_a_short_sleep_is_one_and_a_minute_of_delay_is_not(pieces: int) -> None:
+def test_a_short_suspension_is_distinguished_from_a_minute_of_delay(pieces: int) -> None:
     rng = np.random.default_rng(6)
     arrivals = last_samples(12_000, -12.0) + rng.exponential(5e-4, 12_000)
     arrivals[4000:4600] = arrivals[4600]  # held up
@@ -171,7 +171,7 @@ def test_utc_stepped_by_ntp_or_a_leap_second_changes_nothing() -> None:
     assert np.array_equal(solved(rows).at(index), solved(stepped).at(index))
 
 
-def test_device_utc_is_the_clock_exactly_where_it_keeps_its_rate() -> None:
+def test_device_utc_at_a_constant_rate_is_the_clock_exactly() -> None:
     rows = block_rows(np.zeros(600))
     rows["flags"] = BlockFlag.DEVICE_UTC
     rows["device_counter"] = np.round(0.0055e9 + rows["first_sample"] / RATE * 1e9)
@@ -244,7 +244,7 @@ def test_the_smoother_states_its_own_error() -> None:
 
 @pytest.mark.parametrize("block", [1, 5, 20, 200])
 @pytest.mark.parametrize("ppm", [0.0, 15.0, -20.0])
-def test_polls_show_in_the_latencies(block: int, ppm: float) -> None:
+def test_polling_is_detected_in_the_latencies(block: int, ppm: float) -> None:
     rng = np.random.default_rng(10)
     index = block * np.arange(1.0, 3001.0) - 1
     taken = index / (RATE * (1 + ppm * 1e-6)) + 0.0421
@@ -264,7 +264,7 @@ def test_polls_show_in_the_latencies(block: int, ppm: float) -> None:
 
 
 @pytest.mark.parametrize("n_blocks", [1800, 6000, 36_000])
-def test_what_polls_hide_of_a_clock_is_not_claimed(n_blocks: int) -> None:
+def test_errors_include_the_uncertainty_due_to_polling(n_blocks: int) -> None:
     covered = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -279,7 +279,7 @@ def test_what_polls_hide_of_a_clock_is_not_claimed(n_blocks: int) -> None:
     assert np.mean(covered) >= 0.9
 
 
-def test_over_whole_beats_polls_hide_nothing() -> None:
+def test_over_full_beats_polling_adds_no_uncertainty() -> None:
     left, stated = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -302,7 +302,7 @@ def error_over_stated(rows: np.ndarray, taken: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seconds", [30, 120, 300])
-def test_what_is_stated_is_what_is_left_neither_much_more_nor_less(seconds: int) -> None:
+def test_stated_errors_match_the_actual_errors(seconds: int) -> None:
     rng = np.random.default_rng(12 + seconds)
     left, stated, off, known_to = [], [], [], []
     for _ in range(30):
@@ -320,7 +320,7 @@ def test_what_is_stated_is_what_is_left_neither_much_more_nor_less(seconds: int)
     assert 0.8 < np.sqrt(np.mean(known_to) / np.mean(off)) < 3.5
 
 
-def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_does() -> None:
+def test_a_wandering_shortest_latency_is_not_attributed_to_the_clock() -> None:
     rng = np.random.default_rng(10)
     taken = last_samples(9000, 10.0)  # a quarter of an hour
     ratios, quiet = [], []
@@ -339,7 +339,7 @@ def test_a_host_whose_shortest_latency_wanders_is_not_taken_for_a_clock_that_doe
 
 @pytest.mark.parametrize("seconds", [5, 10, 20, 60])
 @pytest.mark.parametrize("polled", [False, True])
-def test_the_first_seconds_do_not_state_what_they_cannot_know(seconds: int, polled: bool) -> None:
+def test_errors_are_large_in_the_first_seconds(seconds: int, polled: bool) -> None:
     rng = np.random.default_rng(11 + seconds)
     ratios = []
     for _ in range(40):

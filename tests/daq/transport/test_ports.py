@@ -168,7 +168,7 @@ async def test_a_port_without_descriptor_is_read_by_a_thread(loop_port: str) -> 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-async def test_it_wakes_when_as_many_bytes_are_there_as_were_expected(kind: str) -> None:
+async def test_a_read_returns_when_the_expected_bytes_are_available(kind: str) -> None:
     async with KINDS[kind]() as (port, far), open_port(port, SystemClock()) as stream:
         await stream.write(b"?")
         await far.arrived(1)
@@ -187,7 +187,7 @@ async def test_it_wakes_when_as_many_bytes_are_there_as_were_expected(kind: str)
             await reading
 
 
-async def test_a_terminal_that_cannot_count_so_far_wakes_at_the_end_of_a_frame() -> None:
+async def test_a_terminal_with_a_limited_count_wakes_at_the_end_of_a_frame() -> None:
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         await stream.write(b"?")
         await far.arrived(1)
@@ -200,7 +200,7 @@ async def test_a_terminal_that_cannot_count_so_far_wakes_at_the_end_of_a_frame()
         assert len((await reading)[0]) == 200
 
 
-async def test_what_came_of_a_frame_already_is_not_waited_for_again() -> None:
+async def test_pending_bytes_of_a_frame_are_not_awaited_again() -> None:
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         await stream.write(b"?")
         await far.arrived(1)
@@ -213,7 +213,7 @@ async def test_what_came_of_a_frame_already_is_not_waited_for_again() -> None:
         assert len((await reading)[0]) == 170
 
 
-async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() -> None:
+async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
     """Else every block's time is late by most of a sample period, until the host is late once."""
     channels = tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz")
     sensor = Sensor(name="A", driver="epson", port="x", sampling_rate=50.0, channels=channels)
@@ -248,7 +248,7 @@ async def test_an_epson_read_amid_a_frame_is_read_at_the_ends_of_frames_again() 
         assert (second.first_sample, second.n_samples, decoder.n_pending) == (4, 5, 0)
 
 
-async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience(
+async def test_a_reading_thread_takes_the_time_of_the_last_byte(
     loop_port: str,
 ) -> None:
     async with open_port(loop_port, SystemClock()) as stream:
@@ -262,7 +262,7 @@ async def test_a_thread_takes_the_time_of_the_last_byte_not_of_its_patience(
         assert len((await reading)[0]) == 10
 
 
-async def test_discard_forgets_what_was_not_read() -> None:
+async def test_discard_drops_unread_bytes() -> None:
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         stream.feed(b"old")
         assert stream.discard() == 3
@@ -287,20 +287,20 @@ async def test_a_busy_port_is_named() -> None:
         ("nonsense://x", "nonsense"),
     ],
 )
-async def test_why_a_port_does_not_open(port: str, reason: str) -> None:
+async def test_errors_of_opening_name_cause_and_remedy(port: str, reason: str) -> None:
     with pytest.raises(NotConnectedError, match=reason) as caught:
         async with open_port(port, SystemClock(), label="sensor A"):
             pass
     assert str(caught.value).startswith("sensor A: ")
 
 
-def test_addresses() -> None:
+def test_addresses_are_parsed() -> None:
     assert host_and_port("socket://[::1]:502") == ("::1", 502)
     with pytest.raises(ValueError, match="expected modbus-tcp://host:port"):
         host_and_port("modbus-tcp://somewhere:many")
 
 
-def test_an_unknown_driver_is_told_which_there_are() -> None:
+def test_an_unknown_driver_is_refused_with_the_known_names() -> None:
     with pytest.raises(ValueError, match=r"'seismo'; expected one of .*epson"):
         driver_type("seismo")
 

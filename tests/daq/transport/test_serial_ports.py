@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def test_the_lasting_name_of_a_port(tmp_path: Path) -> None:
+def test_the_constant_name_of_a_port_is_found(tmp_path: Path) -> None:
     folder, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
     folder.mkdir()
     device.touch()

@@ -109,7 +109,7 @@ def test_a_sensor_on_another_floor_is_named(n_sensors: int, n: int) -> None:
         assert not kinds & {AdviceKind.MOTION_LEFT_IN, AdviceKind.WEAK_MOTION}
 
 
-def test_sensors_that_share_little_or_none_are_not_called_strangers() -> None:
+def test_weakly_coherent_sensors_are_not_reported_without_common_motion() -> None:
     """Where no two agree, where all do, and where one shares a part of the motion."""
     weak = bench(np.eye(3), np.eye(3), np.eye(3), motion=0.05 * np.eye(3))
     assert advice_of(NoSharedMotion, of(averages(weak))) == []
@@ -121,7 +121,7 @@ def test_sensors_that_share_little_or_none_are_not_called_strangers() -> None:
     assert advice_of(NoSharedMotion, found) == []  # who of the two pairs is elsewhere?
 
 
-def test_a_sensor_that_shares_low_frequencies_alone_is_named_above() -> None:
+def test_a_sensor_coherent_only_at_low_frequencies_is_reported_above_them() -> None:
     together, apart = (averages(each) for each in (elsewhere(9), elsewhere(1)))
     csm = np.where((FREQUENCY < 5)[:, None, None], together, apart)
     (advice,) = advice_of(NoSharedMotion, of(csm))
@@ -172,7 +172,7 @@ def test_channels_that_are_not_orthogonal(angle_deg: float, level: Level) -> Non
     assert skewed[0].level is level
 
 
-def test_swapped_channels_are_told_from_a_turned_sensor() -> None:
+def test_swapped_channels_are_distinguished_from_a_rotated_sensor() -> None:
     near = Rotation.from_euler("z", 7, degrees=True).as_matrix()
     found = of(averages(bench(np.eye(3), near[[1, 0, 2]], np.eye(3))))
     swapped = advice_of(SwappedChannels, found)
@@ -186,7 +186,7 @@ def test_swapped_channels_are_told_from_a_turned_sensor() -> None:
     assert advice_of(Rotated, other)[0].angle_deg == pytest.approx(90, abs=0.1)
 
 
-def test_incoherence_is_a_problem_where_it_is() -> None:
+def test_incoherence_is_reported_in_its_band() -> None:
     csm = plane_waves(FREQUENCY, pentagon()[:3], snr=400.0)
     found = of(averages(csm))
     (problem,) = [advice for advice in found.advice if advice.level is Level.PROBLEM]
@@ -207,7 +207,7 @@ def test_incoherence_is_a_problem_where_it_is() -> None:
     assert misfit.largest_error == 2 * misfit.error  # five bound it closer
 
 
-def test_planar_sensors_in_motion_of_three_dimensions_are_told_why() -> None:
+def test_planar_sensors_in_motion_of_three_dimensions_get_advice() -> None:
     tilted = Rotation.from_euler("x", 10, degrees=True).as_matrix()
     two = [tilted[:2], np.eye(3)[:2], tilted.T[:2]]
     found = of(averages(bench(*two)), dims=(2, 2, 2))
@@ -218,7 +218,7 @@ def test_planar_sensors_in_motion_of_three_dimensions_are_told_why() -> None:
     assert misfit.error >= 0.5
 
 
-def test_a_missing_dimension_is_seen() -> None:
+def test_a_missing_dimension_is_reported() -> None:
     flat = np.diag([100.0, 150.0, 0.0])
     turned = Rotation.from_euler("y", 30, degrees=True).as_matrix()
     found = of(averages(bench(np.eye(3), turned, np.eye(3), motion=flat)))
@@ -228,7 +228,7 @@ def test_a_missing_dimension_is_seen() -> None:
     assert missing.condition > np.sqrt(1080)
 
 
-def test_noise_alone_is_said_to_be_so() -> None:
+def test_noise_without_motion_is_reported() -> None:
     rng = np.random.default_rng(3)
     csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
     found = of(averages(csm))
@@ -256,7 +256,7 @@ def test_motion_left_in_by_few_averages_is_no_silent_bias(d: int, snr: float) ->
     assert bias - 3 * error < said[0].share < 2 * bias
 
 
-def test_a_lagging_sensor() -> None:
+def test_a_lagging_sensor_is_reported_with_its_delay() -> None:
     phase = np.exp(-2j * np.pi * FREQUENCY[:, None] * np.repeat([0, 0.02, 0], 3))
     csm = phase[:, :, None] * (bench(*[np.eye(3)] * 3) - np.eye(9)) * phase[:, None].conj()
     found = of(averages(csm + np.eye(9)))
@@ -291,7 +291,7 @@ def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
     assert {(r.first, r.second) for r in found.responses} == {(0, 2), (0, 3), (2, 3)}
 
 
-def test_a_signal_wired_twice_is_named_with_its_twin() -> None:
+def test_a_signal_connected_twice_is_reported_with_its_copy() -> None:
     csm = averages(bench(*[np.eye(3)] * 3))
     csm[:, 4, :] = csm[:, 1, :]
     csm[:, :, 4] = csm[:, :, 1]
@@ -306,7 +306,7 @@ def test_a_signal_wired_twice_is_named_with_its_twin() -> None:
 
 
 @pytest.mark.parametrize("how", ["dead", "copied"])
-def test_two_sensors_that_are_left_are_told_what_can_still_be_said(how: str) -> None:
+def test_two_remaining_sensors_get_the_possible_advice(how: str) -> None:
     csm = averages(bench(*[np.eye(3)] * 3))
     if how == "dead":
         csm[:, 6:, :] = csm[:, :, 6:] = 0
@@ -328,7 +328,7 @@ def test_two_sensors_that_are_left_are_told_what_can_still_be_said(how: str) -> 
     assert np.all(found.dimension == 3)
 
 
-def test_nothing_alive_is_said_too() -> None:
+def test_a_bench_without_signal_is_reported() -> None:
     found = of(np.zeros((96, 9, 9), np.complex128))
     (left,) = advice_of(TooFewSensors, found)
     assert left.sensors == ()
@@ -336,7 +336,7 @@ def test_nothing_alive_is_said_too() -> None:
     assert found.responses == ()
 
 
-def test_a_small_certain_misfit_is_graded_by_what_it_does() -> None:
+def test_a_small_significant_misfit_is_graded_by_its_effect() -> None:
     """Noise shared by all channels, about one per cent of it: too many pairs to be named."""
     turned = [Rotation.from_rotvec(v).as_matrix() for v in ([1, 2, -1], [-0.5, 0.4, 1], [0, 1, 2])]
     csm = bench(*turned)
@@ -355,7 +355,7 @@ def test_a_small_certain_misfit_is_graded_by_what_it_does() -> None:
     assert not misfit.is_wrong
 
 
-def test_a_good_test_is_seldom_said_to_fail_in_any_band() -> None:
+def test_a_sound_test_seldom_fails_in_any_band() -> None:
     """One in a hundred, however many bands are tested: with one in a hundred each, 8 of these."""
     rng = np.random.default_rng(11)
     csm = np.broadcast_to(bench(*[np.eye(2)] * 3, motion=np.diag([100.0, 150])), (96, 6, 6))
@@ -365,7 +365,7 @@ def test_a_good_test_is_seldom_said_to_fail_in_any_band() -> None:
     assert failing <= 5  # Poisson of mean 1: more in one of a thousand
 
 
-def test_what_waves_do_stays_within_what_is_said() -> None:
+def test_the_effect_of_waves_is_within_the_stated_bound() -> None:
     csm = plane_waves(FREQUENCY, pentagon()[:3], snr=100.0)
     found = of(averages(csm, n=8000), n=8000)
     off = np.abs(maximise(csm[-1:], 3).psi - 1).max()
@@ -373,7 +373,7 @@ def test_what_waves_do_stays_within_what_is_said() -> None:
 
 
 @pytest.mark.parametrize("d", [1, 2])
-def test_sensors_of_fewer_channels_are_told_what_their_sensor_space_asks(d: int) -> None:
+def test_sensors_of_fewer_channels_get_advice_on_their_sensor_space(d: int) -> None:
     """Section 5: the motion's dimension against the sensors'."""
     motion = np.diag([100.0, 150.0])[:d, :d]
     found = of(averages(bench(*[np.eye(d)] * 3, motion=motion)), dims=(d,) * 3)
@@ -392,7 +392,7 @@ def test_sensors_of_fewer_channels_are_told_what_their_sensor_space_asks(d: int)
         ((3, 3, 2, 3), []),
     ],
 )
-def test_sensors_of_unequal_channels_are_told_which_of_them_are_compared(
+def test_sensors_of_unequal_channels_get_advice_on_the_compared_channels(
     dims: tuple[int, ...], concerned: list[tuple[int, tuple[int, ...], tuple[int, ...]]]
 ) -> None:
     """As `three_sensor` does: with the two other sensors that have most channels."""
@@ -404,7 +404,7 @@ def test_sensors_of_unequal_channels_are_told_which_of_them_are_compared(
 
 
 @pytest.mark.parametrize("dims", [(3, 2, 1), (3, 3, 1), (2, 2, 1)])
-def test_a_good_bench_of_unequal_sensors_is_seldom_said_to_fail(dims: tuple[int, ...]) -> None:
+def test_a_sound_bench_of_unequal_sensors_seldom_fails(dims: tuple[int, ...]) -> None:
     """Two channels alone feel a dimension: their noise is divided anyhow, and fits no better."""
     n, n_freqs = 1080, 600  # a degree less of 2 to 6 at each is then 5 to 9 standard deviations
     directions = [
@@ -418,7 +418,7 @@ def test_a_good_bench_of_unequal_sensors_is_seldom_said_to_fail(dims: tuple[int,
     assert np.mean(model.p_value < 0.01) < 0.01 + 4 * np.sqrt(0.01 / n_freqs)
 
 
-def test_a_model_of_fewer_dimensions_than_the_motion_fails_in_its_own_name() -> None:
+def test_a_model_of_too_few_dimensions_has_its_own_advice() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
     for q in (0, 1, 3):
         found = diagnose(
@@ -464,7 +464,7 @@ def test_early_averages_leave_the_model_open() -> None:
     assert len(found.responses) == 3
 
 
-def test_why_there_is_no_model_test() -> None:
+def test_the_reason_for_a_missing_model_test_is_reported() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
     for q in (6, 7):  # nothing is left for the test; more than can be told from the noise
         many = diagnose(csm, FREQUENCY, dims=THREE, n_effective=1080, n_factors=q)
@@ -478,7 +478,7 @@ def test_why_there_is_no_model_test() -> None:
     assert np.isnan(found.model.p_value).all()
 
 
-def test_refusals() -> None:
+def test_invalid_arguments_are_refused() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
     with pytest.raises(InvalidMatrixError, match="frequency"):
         diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=100)
@@ -491,7 +491,7 @@ def test_refusals() -> None:
             diagnose(csm, FREQUENCY, dims=THREE, n_effective=n)
 
 
-def test_lists_do_as_well_as_arrays() -> None:
+def test_lists_are_accepted_like_arrays() -> None:
     csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))[:12]
     array = diagnose(csm, FREQUENCY[:12], dims=THREE, n_effective=100)
     lists = diagnose(csm.tolist(), FREQUENCY[:12].tolist(), dims=THREE, n_effective=100)

@@ -41,7 +41,7 @@ def bench(
     return np.asarray(csm, np.complex128)
 
 
-def test_rotation_gains_and_delay_come_back() -> None:
+def test_rotation_gains_and_delay_are_recovered() -> None:
     turned = Rotation.from_rotvec(np.deg2rad(4.1) * np.array([0.6, 0, 0.8])).as_matrix().T
     gains = np.array([1.02, 0.97, 1.0])
     csm = bench([np.eye(3), gains[:, None] * turned, np.eye(3)], delays=(0, 3e-3, -1e-3))
@@ -95,7 +95,7 @@ def test_a_delay_is_found_at_frequencies_that_are_not_evenly_spaced() -> None:
     assert found.delay == pytest.approx(0.31, rel=1e-6)
 
 
-def test_frequencies_count_by_their_signal_to_noise_ratio() -> None:
+def test_frequencies_are_weighted_by_signal_to_noise_ratio() -> None:
     """Half the band at SNR 1e4, half at 8, as strong: as good as the good half alone."""
     good = np.arange(200) % 2 == 0
     level = np.where(good, 1.0, 1e6)[:, None, None]  # the weak half has the larger spectra
@@ -136,7 +136,7 @@ def test_reversed_polarity_is_named() -> None:
     assert found.delay == pytest.approx(2e-3, rel=1e-3)
 
 
-def test_noise_drops_out_and_the_error_is_honest() -> None:
+def test_noise_causes_no_bias_and_the_error_covers() -> None:
     """SNR 10: a plain regression would shorten the gains by a tenth."""
     turned = Rotation.from_euler("z", 3, degrees=True).as_matrix()
     csm = bench([np.eye(3), turned, np.eye(3)], snr=10)
@@ -167,7 +167,7 @@ def test_coherence_of_like_channels() -> None:
     np.testing.assert_allclose(matched_coherence(csm, (2, 2, 2), 0, 2)[0], expected)
 
 
-def test_coherence_by_direction_does_not_see_orientation() -> None:
+def test_canonical_coherence_does_not_depend_on_orientation() -> None:
     turned = Rotation.from_rotvec([1.0, 2.0, -1.5]).as_matrix()
     plain, other = bench([np.eye(3)] * 3, snr=10), bench([np.eye(3), turned, turned.T], snr=10)
     one, two = (CanonicalCoherence(csm).between(range(3), range(3, 6)) for csm in (plain, other))
@@ -185,7 +185,7 @@ def test_any_rotation_is_found() -> None:
     np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
 
 
-def test_what_cannot_be_compared() -> None:
+def test_sensors_that_are_not_comparable_are_refused() -> None:
     csm = bench([np.eye(3), np.eye(3)[:2], np.eye(3)])
     with pytest.raises(InsufficientDataError, match="3 and 2 channels"):
         relative_response(csm, FREQUENCY, dims=(3, 2, 3), first=0, second=1)

@@ -53,7 +53,7 @@ def found_in(csm: np.ndarray, dims: tuple[int, ...] = DIMS) -> list[SharedNoise]
     ],
     ids=["one pair", "opposite", "within a sensor", "one digitizer"],
 )
-def test_pairs_are_named_with_their_amount(
+def test_pairs_are_reported_with_their_amount(
     pairs: tuple[tuple[int, int], ...], amount: float, sensors: tuple[int, ...]
 ) -> None:
     rng = np.random.default_rng(5)
@@ -87,7 +87,7 @@ def test_the_effect_on_the_estimates_is_that_of_the_true_matrices() -> None:
     assert advice.maximum_likelihood != 0
 
 
-def test_named_noise_is_no_further_misfit() -> None:
+def test_reported_shared_noise_is_no_further_misfit() -> None:
     """A quarter of the noise in common fails the model test by far: what is known explains it."""
     csm = averages(np.random.default_rng(2), ((0, 3),), 0.25)
     found = diagnose(csm, FREQUENCY, dims=DIMS, n_effective=N, neighbours=INDEPENDENT)
@@ -97,7 +97,7 @@ def test_named_noise_is_no_further_misfit() -> None:
     assert not [each for each in found.advice if isinstance(each, ModelMisfit)]
 
 
-def test_noise_shared_in_one_band_is_named_there() -> None:
+def test_noise_shared_in_one_band_is_reported_there() -> None:
     rng = np.random.default_rng(4)
     sound, shared = averages(rng, (), 0.0), averages(np.random.default_rng(4), ((0, 3),), 0.3)
     csm = np.where((FREQUENCY > 20)[:, None, None], sound, shared)
@@ -108,13 +108,13 @@ def test_noise_shared_in_one_band_is_named_there() -> None:
     assert advice.amounts[0] == pytest.approx(0.3, abs=0.08)
 
 
-def test_waves_across_the_bench_are_not_called_shared_noise() -> None:
+def test_waves_across_the_bench_are_not_reported_as_shared_noise() -> None:
     waves = plane_waves(FREQUENCY, pentagon(), snr=400.0)
     drawn = np.asarray(wishart(waves, N, np.random.default_rng(3))[0])
     assert not found_in(drawn, (3,) * 5)
 
 
-def test_sound_tests_are_seldom_accused() -> None:
+def test_sound_tests_seldom_report_shared_noise() -> None:
     """At 1 % for all pairs together, more than three of forty happen once in 3000 such tests."""
     rng = np.random.default_rng(11)
     scores = []

@@ -84,7 +84,7 @@ def test_disturbed_segments_are_named() -> None:
     assert 2 < advice.excess < 9
 
 
-def test_noise_that_changes_breaks_no_test() -> None:
+def test_changing_noise_causes_no_false_alarms() -> None:
     """Products of noise with half the time four times the power have 1.36 times the variance."""
     found = diagnosed(3, change=4.0)
     assert found.stability is not None

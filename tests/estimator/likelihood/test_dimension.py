@@ -93,7 +93,7 @@ def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:
     assert covered.mean() > 0.9
 
 
-def test_known_ratios_spare_factors() -> None:
+def test_known_ratios_of_noise_require_fewer_factors() -> None:
     """A prior of equal noise would ask for ten to explain noise a hundred times apart."""
     noise_psd = np.repeat([1, 0.2, 5, 1, 20.0], 3)
     frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 10 * np.linspace(0.95, 1.05, 40)])
@@ -123,7 +123,7 @@ def test_ratios_come_from_the_nearest_frequencies() -> None:
     np.testing.assert_array_equal(expected_noise(noise_psd, usual & False, kind), 1)
 
 
-def test_three_sensors_have_no_room_and_say_so() -> None:
+def test_three_sensors_cannot_fit_further_dimensions_and_are_flagged() -> None:
     frequency = np.linspace(18, 22, 20)
     csm = wishart(plane_waves(frequency, pentagon()[:3]), 1080, np.random.default_rng(2))[0]
     n_factors, (choice,) = choose_dimension(
@@ -134,7 +134,7 @@ def test_three_sensors_have_no_room_and_say_so() -> None:
     assert choice.is_biased
 
 
-def test_four_sensors_fit_further_dimensions_but_are_never_sure() -> None:
+def test_four_sensors_fit_further_dimensions_but_remain_undetermined() -> None:
     """The test does not reject the model, and the noise is far from true."""
     frequency = np.linspace(18, 22, 20)
     csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
@@ -148,7 +148,7 @@ def test_four_sensors_fit_further_dimensions_but_are_never_sure() -> None:
     assert np.abs(found.noise_psd.mean(axis=0) - 1).max() > 0.2
 
 
-def test_a_missing_dimension_is_left_out_and_precision_gained() -> None:
+def test_a_missing_dimension_is_excluded_and_improves_precision() -> None:
     """Horizontal motion only, triaxial sensors at random orientations."""
     rng = np.random.default_rng(3)
     directions = np.concatenate([rotation(rng, 3) for _ in range(3)])[:, :2]
@@ -170,7 +170,7 @@ def test_a_missing_dimension_is_left_out_and_precision_gained() -> None:
 
 
 @pytest.mark.parametrize("snr", [0.0, 1.0, 1e4])
-def test_the_full_motion_is_left_alone(snr: float) -> None:
+def test_the_full_motion_keeps_its_dimension(snr: float) -> None:
     """The fewest dimensions that explain noise alone are none."""
     rng = np.random.default_rng(4)
     csm = random_bench(rng, dims=THREE, snr=snr, noise_psd=np.ones(9))
@@ -182,7 +182,7 @@ def test_the_full_motion_is_left_alone(snr: float) -> None:
     assert choices[0].accepted
 
 
-def test_a_singular_frequency_does_not_spoil_its_band() -> None:
+def test_a_singular_frequency_does_not_affect_its_band() -> None:
     rng = np.random.default_rng(5)
     averages = wishart(
         random_bench(rng, dims=THREE, snr=1e3, noise_psd=np.ones(9)), 500, rng, n_draws=20
@@ -195,7 +195,7 @@ def test_a_singular_frequency_does_not_spoil_its_band() -> None:
     assert choice.test.n_frequencies == 19
 
 
-def test_a_dead_sensor_is_none() -> None:
+def test_a_dead_sensor_does_not_count() -> None:
     """Four sensors of which one is dead are three: no room for further factors; two are refused."""
     frequency = np.linspace(18, 22, 20)
     csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
@@ -214,7 +214,7 @@ def test_a_dead_sensor_is_none() -> None:
         choose_dimension(csm, frequency, dims=(3,) * 4, n_effective=1080)
 
 
-def test_channels_stay_with_their_like_when_one_is_dead() -> None:
+def test_channels_keep_their_kind_if_one_is_dead() -> None:
     """Channels x are twelve times noisier than y: who compares one sensor's y with x is misled."""
     frequency = np.concatenate([np.linspace(0.95, 1.05, 24), 20 * np.linspace(0.95, 1.05, 24)])
     band = np.repeat([0, 1], 24)
@@ -248,7 +248,7 @@ def test_bands_are_third_octaves_of_enough_frequencies() -> None:
     assert bands(np.array([0.0, 1.0])).tolist() == [0, 0]
 
 
-def test_refusals() -> None:
+def test_invalid_arguments_are_refused() -> None:
     rng = np.random.default_rng(6)
     averages = wishart(random_bench(rng, dims=THREE, snr=1, noise_psd=np.ones(9)), 50, rng)
     with pytest.raises(InvalidMatrixError, match="frequency"):

@@ -42,7 +42,7 @@ def test_the_bound_is_that_of_the_whole_fisher_matrix() -> None:
     np.testing.assert_allclose(bound[0], bound_by_definition(A, noise_psd, 50), rtol=1e-6)
 
 
-def test_figures_of_method_md() -> None:
+def test_the_bound_has_the_figures_of_method_md() -> None:
     ones = np.ones((1, 6))
     turned = common_motion(planar_sensors(60, channel_angle_deg=30), ones[0], snr=1e3)[None]
     bound = fisher.cramer_rao_cov(turned, ones, n_effective=1080)
@@ -58,7 +58,7 @@ def test_figures_of_method_md() -> None:
     np.testing.assert_allclose(bound, 0.0382, atol=2e-4)
 
 
-def test_what_cannot_be_identified_has_no_bound() -> None:
+def test_an_unidentifiable_model_has_no_bound() -> None:
     """A channel that alone carries one dimension of the motion, and a model without room."""
     A = np.vstack([np.ones((4, 1)) * [1.0, 0.0], [[0.0, 1.0]]])
     csm = (A @ A.T + np.eye(5))[None].astype(np.complex128)
@@ -89,7 +89,7 @@ def test_interval_in_the_logarithm_and_at_zero() -> None:
     assert np.isnan(high[4])
 
 
-def test_scatter_is_taken_off_the_eigenvalues() -> None:
+def test_eigenvalues_are_corrected_for_scatter() -> None:
     """One factor in noise: the largest eigenvalue of the averages is above the true one."""
     rng = np.random.default_rng(2)
     csm = np.eye(40, dtype=np.complex128)
@@ -104,7 +104,7 @@ def test_scatter_is_taken_off_the_eigenvalues() -> None:
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [1.0, 1e6])
-def test_the_bias_is_the_one_of_first_order(d: int, snr: float) -> None:
+def test_the_bias_is_of_first_order(d: int, snr: float) -> None:
     """With n = 100, terms of second order are below (2 q / n)**2."""
     rng = np.random.default_rng(3)
     n_draws, p = 2500, 3 * d

@@ -33,7 +33,7 @@ def bench(dims: tuple[int, ...], *, snr: float = 1e3) -> ComplexArray:
     ("dims", "degrees"), [((1,) * 3, 1), ((2,) * 3, 10), ((3,) * 3, 27), ((3,) * 5, 129)]
 )
 @pytest.mark.parametrize("n_averages", [20, 100, 1080])
-def test_false_alarms_at_the_one_percent_level(
+def test_false_alarms_occur_at_the_one_percent_level(
     dims: tuple[int, ...], degrees: int, n_averages: int
 ) -> None:
     n_draws = 1500 if len(dims) == 3 else 500
@@ -49,7 +49,7 @@ def test_false_alarms_at_the_one_percent_level(
 
 
 @pytest.mark.parametrize("n_averages", [4, 6])
-def test_what_estimated_noise_takes_from_the_statistic(n_averages: int) -> None:
+def test_estimated_noise_lowers_the_statistic_as_predicted(n_averages: int) -> None:
     """Without motion psi is the diagonal, and Bartlett's factor exact to order 1/n**3.
 
     Its term 1 / (6 n) is 2 and 1.4 % of the mean here, the error of the mean 0.25 %.
@@ -114,7 +114,7 @@ def three_sensor_bias(csm: ComplexArray) -> float:
     return float(np.mean(left)) - 1
 
 
-def test_incoherence_that_biases_by_half_is_seen_over_an_octave() -> None:
+def test_incoherence_with_half_the_noise_as_bias_is_detected_in_an_octave() -> None:
     """Ten-second segments: 50 bins from 5 to 10 Hz, Hann at 50 % overlap."""
     positions = pentagon()[:3]
 
@@ -135,14 +135,14 @@ def test_incoherence_that_biases_by_half_is_seen_over_an_octave() -> None:
     assert seen >= 0.99 * n_octaves
 
 
-def test_a_gross_violation_is_seen_at_one_frequency() -> None:
+def test_a_gross_violation_is_detected_at_one_frequency() -> None:
     csm = plane_waves(np.array([20.0]), pentagon()[:3], snr=1e3)[0]
     assert three_sensor_bias(csm) > 1.9
     draws = wishart(csm, 1080, np.random.default_rng(6), n_draws=200)
     assert np.all(model_test(maximise(draws, 3), n_effective=1080).p_value < 0.01)
 
 
-def test_an_unusable_frequency_is_left_out_of_the_pool() -> None:
+def test_an_unusable_frequency_is_not_pooled() -> None:
     test = ModelTest(np.array([10.0, np.nan, 12.0]), np.full(3, 10.0), np.array([0.5, np.nan, 0.4]))
     band = pool(test, np.ones(3, np.bool_))
     assert band.n_frequencies == 2
@@ -159,7 +159,7 @@ def test_pooling_allows_for_correlated_neighbours() -> None:
     assert band.p_value == pytest.approx(stats.chi2.sf(130 / spread, 100 / spread))
 
 
-def test_refuses_a_model_with_nothing_left_to_test() -> None:
+def test_a_model_without_degrees_of_freedom_is_refused() -> None:
     draws = wishart(bench((3, 3, 3)), 50, np.random.default_rng(7))
     with pytest.raises(InsufficientDataError, match="no freedom left"):
         model_test(maximise(draws, 6), n_effective=50)

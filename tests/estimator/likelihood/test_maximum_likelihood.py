@@ -68,7 +68,7 @@ def test_permuting_the_channels_permutes_the_noise() -> None:
     np.testing.assert_allclose(maximise(permuted, 3).psi, maximise(csm, 3).psi[:, order], rtol=1e-5)
 
 
-def test_nothing_nearby_explains_the_matrix_better() -> None:
+def test_the_likelihood_has_a_local_maximum() -> None:
     rng = np.random.default_rng(7)
     csm = wishart(equal_noise(7, dims=(2, 2, 2), snr=10), 30, rng)
     found = maximise(csm, 2)
@@ -96,7 +96,9 @@ def test_nothing_nearby_explains_the_matrix_better() -> None:
     ],
     ids=["SNR 0.01", "SNR 1e6", "noise 100x and 100x", "one quiet sensor", "11 of 15 factors"],
 )
-def test_arrives_where_fixed_points_crawl(csm: ComplexArray, n_factors: int) -> None:
+def test_newton_converges_where_fixed_point_iterations_are_slow(
+    csm: ComplexArray, n_factors: int
+) -> None:
     draws = wishart(csm, 1080, np.random.default_rng(8), n_draws=50)
     found = maximise(draws, n_factors)
     assert found.converged.all()
@@ -104,7 +106,7 @@ def test_arrives_where_fixed_points_crawl(csm: ComplexArray, n_factors: int) -> 
     assert found.gradient_norm.max() < 1e-3
 
 
-def test_arrives_wherever_it_starts_from() -> None:
+def test_newton_converges_from_any_start() -> None:
     """Three to five sensors, SNR 0.01 to 1e6, noise 1e4 apart, few averages, any factors."""
     rng = np.random.default_rng(5)
     for _ in range(40):
@@ -123,7 +125,7 @@ def test_arrives_wherever_it_starts_from() -> None:
         assert found.iterations.max() < 150
 
 
-def test_second_order_means_few_iterations() -> None:
+def test_newton_takes_few_iterations() -> None:
     draws = wishart(
         equal_noise(9, dims=(3, 3, 3), snr=1e3), 1080, np.random.default_rng(9), n_draws=100
     )
@@ -146,7 +148,7 @@ def test_the_last_step_does_not_leave_the_maximum() -> None:
 
 
 @pytest.mark.parametrize(("n_factors", "most"), [(0, 1), (1, 8), (3, 10)])
-def test_noise_that_falls_to_zero_takes_few_iterations(n_factors: int, most: int) -> None:
+def test_noise_that_tends_to_zero_takes_few_iterations(n_factors: int, most: int) -> None:
     """Weak motion and few averages: nearly every frequency has such a channel, or several."""
     draws = wishart(
         equal_noise(9, dims=(3, 3, 3), snr=0.1), 20, np.random.default_rng(9), n_draws=200
@@ -202,7 +204,9 @@ GEOMETRIES = {
 
 @pytest.mark.parametrize("geometry", GEOMETRIES)
 @pytest.mark.parametrize("n_averages", [100, 1080])
-def test_precise_as_the_bound_unbiased_and_sure_of_it(geometry: str, n_averages: int) -> None:
+def test_the_estimate_is_unbiased_with_the_scatter_of_the_bound(
+    geometry: str, n_averages: int
+) -> None:
     """The three claims in one draw: c.o.v. against Cramér-Rao, bias, coverage, per channel.
 
     Where a neighbour's bound exceeds 1 its likelihood often ends at zero noise, and this
@@ -241,7 +245,7 @@ def test_five_triaxial_sensors_reach_four_percent() -> None:
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [10.0, 1e6])
-def test_no_bias_from_twenty_averages(d: int, snr: float) -> None:
+def test_the_estimate_is_unbiased_from_twenty_averages_on(d: int, snr: float) -> None:
     n_draws = 1000
     rng = np.random.default_rng(16)
     csm = equal_noise(17, dims=(d,) * 3, snr=snr)
@@ -270,7 +274,7 @@ def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
 
 @pytest.mark.parametrize("dims", [(1,) * 3, (3,) * 3, (2,) * 4])
 @pytest.mark.parametrize("snr", [0.1, 0.3, 1.0])
-def test_motion_that_the_averages_cannot_find_costs_a_few_percent(
+def test_unresolved_motion_causes_a_bias_of_a_few_percent(
     dims: tuple[int, ...], snr: float
 ) -> None:
     """No estimate is unbiased there (decision 10); factors fitted to scatter cost 16 to 23 %."""
@@ -288,7 +292,7 @@ def test_motion_that_the_averages_cannot_find_costs_a_few_percent(
     assert unresolved.mean() > (0.5 if snr == 0.1 else -1)
 
 
-def test_a_dimension_that_the_motion_lacks_is_not_taken_from_the_noise() -> None:
+def test_a_missing_dimension_does_not_remove_noise() -> None:
     """Three sensors upside down and askew, motion in a plane: a third factor finds scatter only."""
     rng = np.random.default_rng(28)
     directions = np.concatenate([rotation(rng, 3) for _ in range(3)])[:, :2]
@@ -303,7 +307,7 @@ def test_a_dimension_that_the_motion_lacks_is_not_taken_from_the_noise() -> None
         assert found.noise_psd.std() < 1.05 * raw.noise_psd.std() / (1 - 3 / n)
 
 
-def test_where_all_motion_is_found_nothing_is_left_out() -> None:
+def test_resolved_factors_are_not_excluded() -> None:
     csm = equal_noise(18, dims=(3, 3, 3), snr=10.0)
     draws = wishart(csm, 100, np.random.default_rng(29), n_draws=100)
     found = maximum_likelihood(draws, dims=(3, 3, 3), n_effective=100)
@@ -312,7 +316,7 @@ def test_where_all_motion_is_found_nothing_is_left_out() -> None:
     np.testing.assert_allclose(found.noise_psd, raw.noise_psd / (1 - 3 / 100), rtol=0.02)
 
 
-def test_one_bad_frequency_costs_the_others_nothing() -> None:
+def test_an_invalid_frequency_does_not_affect_the_others() -> None:
     rng = np.random.default_rng(20)
     csm = wishart(equal_noise(21, dims=(3, 3, 3), snr=1e2), 200, rng, n_draws=6)
     good = maximum_likelihood(csm, dims=(3, 3, 3), n_effective=200)
@@ -337,7 +341,7 @@ def test_a_singular_frequency_is_flagged() -> None:
     assert not found.flags[[0, 2]].any()
 
 
-def test_dead_and_copied_channels_cost_the_others_nothing() -> None:
+def test_dead_and_copied_channels_do_not_affect_the_others() -> None:
     rng = np.random.default_rng(23)
     csm = wishart(equal_noise(21, dims=(3, 3, 3), snr=1e2), 200, rng, n_draws=2)
     rest = [0, 1, 2, 3, 5, 6, 7, 8]
@@ -361,7 +365,7 @@ def test_dead_and_copied_channels_cost_the_others_nothing() -> None:
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
-def test_a_channel_left_alone_has_no_noise_to_tell(d: int) -> None:
+def test_a_channel_without_counterpart_has_no_estimate(d: int) -> None:
     rng = np.random.default_rng(25)
     csm = wishart(equal_noise(21, dims=(d,) * 3, snr=1e2), 200, rng, n_draws=2)
     csm[:1, 1:] = csm[:1, :, 1:] = 0
@@ -382,7 +386,7 @@ def test_a_channel_left_alone_has_no_noise_to_tell(d: int) -> None:
     ],
 )
 @pytest.mark.parametrize("n_averages", [100, 1080])
-def test_motion_that_one_channel_alone_feels_is_not_called_its_noise(
+def test_motion_measured_by_one_channel_is_not_reported_as_its_noise(
     dims: tuple[int, ...], tilt: float, alone: list[int], n_averages: int
 ) -> None:
     """Aligned, or planes tilted a little: nothing else tells what that channel's noise is."""
@@ -401,7 +405,7 @@ def test_motion_that_one_channel_alone_feels_is_not_called_its_noise(
     assert np.all(covered[:, others].mean(axis=0) > 0.9)
 
 
-def test_no_single_frequency_of_such_a_channel_stands_for_its_band() -> None:
+def test_no_single_frequency_of_an_unchecked_channel_has_an_estimate() -> None:
     """By chance one in a thousand would look known."""
     csm = common_motion(np.concatenate([np.eye(3)[:k] for k in (3, 2, 2)]), np.ones(7), snr=1e3)
     drawn = wishart(csm, 20, np.random.default_rng(2), n_draws=2000)
@@ -410,7 +414,7 @@ def test_no_single_frequency_of_such_a_channel_stands_for_its_band() -> None:
 
 
 @pytest.mark.parametrize("dims", [(3, 2, 2), (3, 2, 1), (3, 3, 3)])
-def test_others_that_point_many_ways_tell_the_noise_of_a_channel_without_its_like(
+def test_sensors_of_many_orientations_determine_a_channel_without_counterpart(
     dims: tuple[int, ...],
 ) -> None:
     csm = random_bench(np.random.default_rng(4), dims=dims, snr=1e3, noise_psd=np.ones(sum(dims)))
@@ -424,7 +428,7 @@ def test_others_that_point_many_ways_tell_the_noise_of_a_channel_without_its_lik
     assert np.all(covered > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 300))
 
 
-def test_a_channel_whose_like_ones_are_dead_is_known_where_they_live() -> None:
+def test_a_channel_has_estimates_at_frequencies_with_live_counterparts() -> None:
     rng = np.random.default_rng(43)
     csm = common_motion(np.tile(np.eye(3), (3, 1)), np.ones(9), snr=1e3)
     csm = wishart(csm, 200, rng, n_draws=2)
@@ -435,7 +439,7 @@ def test_a_channel_whose_like_ones_are_dead_is_known_where_they_live() -> None:
     assert not found.flags[1].any()
 
 
-def test_noise_that_the_matrix_leaves_open_is_flagged() -> None:
+def test_undetermined_noise_is_flagged() -> None:
     """Without any motion the factors may lie anywhere."""
     rng = np.random.default_rng(26)
     csm = wishart(equal_noise(21, dims=(2, 2, 2), snr=1e2), 200, rng, n_draws=2)
@@ -450,7 +454,7 @@ def test_noise_that_the_matrix_leaves_open_is_flagged() -> None:
     np.testing.assert_allclose(found.noise_psd[0], 1)
 
 
-def test_refuses_what_cannot_be_known() -> None:
+def test_invalid_arguments_are_refused() -> None:
     csm = np.eye(9)[None].astype(np.complex128)
     with pytest.raises(InsufficientDataError, match="at most 6"):
         maximise(csm, 7)
@@ -482,7 +486,7 @@ def test_a_matrix_that_is_not_hermitian_has_no_maximum() -> None:
 
 
 @pytest.mark.parametrize(("n_channels", "most"), [(3, 1), (6, 3), (9, 6), (12, 8), (15, 11)])
-def test_identifiable_factors(n_channels: int, most: int) -> None:
+def test_the_number_of_identifiable_factors_is_known(n_channels: int, most: int) -> None:
     assert max_factors(n_channels) == most
 
 

@@ -33,7 +33,7 @@ def drawn(rng: np.random.Generator, terms: FloatArray, n: float) -> tuple[FloatA
 
 
 @pytest.mark.parametrize("n", [20, 400])
-def test_terms_are_unbiased_and_their_errors_cover(n: int) -> None:
+def test_terms_are_unbiased_and_their_errors_cover_the_truth(n: int) -> None:
     rng = np.random.default_rng(1)
     found = [fit(FREQUENCY, *drawn(rng, TERMS, n), INDEPENDENT) for _ in range(60)]
     values = np.array([each.values for each in found])
@@ -47,7 +47,7 @@ def test_terms_are_unbiased_and_their_errors_cover(n: int) -> None:
     assert chi_square == pytest.approx(1.0, abs=0.04 if n == 20 else 0.015)
 
 
-def test_a_term_that_is_not_there_comes_out_as_zero_within_its_error() -> None:
+def test_an_absent_term_is_zero_within_its_error() -> None:
     rng = np.random.default_rng(2)
     white = np.array([0, 0, 1e-12, 0])
     found = [fit(FREQUENCY, *drawn(rng, white, 100), INDEPENDENT) for _ in range(50)]
@@ -72,7 +72,7 @@ def true_deviation(tau: FloatArray, high: float) -> FloatArray:
     return np.asarray(np.sqrt(np.trapezoid(2 * (terms_at(f) @ TERMS) * np.sin(x) ** 4 / x**2, f)))
 
 
-def test_from_samples_of_three_sensors_on_a_strong_motion() -> None:
+def test_terms_are_recovered_from_samples_with_strong_motion() -> None:
     """Motion taken out, windows, neighbouring frequencies correlated: terms and Allan deviation."""
     rate, settings = 50.0, WelchSettings(50.0, 1000)
     correlation = bin_correlation(get_window("hann", 512), 256)
@@ -113,7 +113,7 @@ def test_from_samples_of_three_sensors_on_a_strong_motion() -> None:
     assert np.mean(inside) == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / (len(terms) / 3)))
 
 
-def test_lines_are_left_out_and_counted() -> None:
+def test_lines_are_excluded_and_counted() -> None:
     rng = np.random.default_rng(4)
     psd, cov = drawn(rng, TERMS, 200)
     plain = fit(FREQUENCY, psd, cov, INDEPENDENT)
@@ -124,7 +124,7 @@ def test_lines_are_left_out_and_counted() -> None:
     assert np.all(np.abs(found.values - plain.values) < 0.5 * plain.errors)
 
 
-def test_noise_that_is_no_sum_of_these_terms_is_named_where_it_is_not() -> None:
+def test_a_misfit_of_the_terms_is_reported_with_its_band() -> None:
     rng = np.random.default_rng(5)
     psd, cov = drawn(rng, TERMS, 200)
     good = fit(FREQUENCY, psd, cov, INDEPENDENT)

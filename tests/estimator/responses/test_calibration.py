@@ -101,7 +101,7 @@ def test_weak_motion_does_not_lower_gains() -> None:
     assert np.mean(scores) == pytest.approx(0.0, abs=0.35)
 
 
-def test_a_response_that_varies_over_the_band_is_seen() -> None:
+def test_a_response_that_varies_over_the_band_is_detected() -> None:
     spectra = averaged(3, noise=0.02)
     csm = spectra.csm()
     rising = np.ones((len(csm), 9))

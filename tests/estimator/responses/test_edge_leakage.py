@@ -58,7 +58,7 @@ def test_a_delay_of_one_sample_under_a_rectangular_window() -> None:
     assert factor * (2 * np.pi / 200) ** 2 * 1e4 == pytest.approx(10.7, rel=0.1)
 
 
-def test_responses_are_found_whatever_way_sensors_point() -> None:
+def test_responses_are_found_for_any_orientation() -> None:
     csm, _ = exact()
     found = channel_responses(csm, FREQUENCY, dims=DIMS)
     inside = slice(10, 990)
@@ -70,7 +70,7 @@ def test_responses_are_found_whatever_way_sensors_point() -> None:
     assert np.isnan(found.ratio[:, 3, 1]).all()
 
 
-def test_leakage_is_predicted_as_the_three_sensor_estimate_has_it() -> None:
+def test_predicted_leakage_is_that_of_the_three_sensor_estimate() -> None:
     csm, slope = exact()
     noise = self_noise("three-sensor", csm, dims=DIMS, n_effective=1e9).noise_psd
     motion = np.einsum("fpp->fp", csm).real - noise

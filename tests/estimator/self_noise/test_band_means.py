@@ -21,7 +21,7 @@ from tui.output.results import result_table, result_title
 
 
 @pytest.mark.parametrize(("name", "overlap"), [("hann", 0.5), ("rectangular", 0.0), ("hann", 0.75)])
-def test_cov_of_a_band_mean_is_that_of_simulated_periodograms(name: str, overlap: float) -> None:
+def test_cov_of_a_band_mean_agrees_with_simulated_periodograms(name: str, overlap: float) -> None:
     rng = np.random.default_rng(5)
     length, n_segments, n_runs = 64, 40, 1500
     hop = round(length * (1 - overlap))
@@ -47,7 +47,7 @@ def test_hann_bins_are_correlated_as_in_theory() -> None:
     )
 
 
-def test_bins_without_a_number_are_left_out_and_negative_means_stay_negative() -> None:
+def test_bins_with_nan_are_ignored_and_negative_means_remain_negative() -> None:
     psd = np.array([1.0, np.nan, 3.0, -2.0, -4.0, np.nan])
     cov = np.where(np.isfinite(psd), 0.1, np.nan)
     uncorrelated = np.array([1.0, 0.0])
@@ -59,7 +59,7 @@ def test_bins_without_a_number_are_left_out_and_negative_means_stay_negative() -
     assert np.isnan(found.high[2])
 
 
-def test_bands_leave_zero_frequency_and_nyquist_out() -> None:
+def test_bands_exclude_zero_frequency_and_nyquist() -> None:
     frequency = np.linspace(0, 100, 1001)
     assert band_edges(frequency, (0.01, 1000)).tolist() == [1, 1000]
     assert frequency[slice(*band_edges(frequency, (1.0, 20.0)))][[0, -1]].tolist() == [1.0, 20.0]
@@ -72,7 +72,7 @@ def test_bands_leave_zero_frequency_and_nyquist_out() -> None:
 
 
 @pytest.mark.parametrize("asked", [(10.0, 98.0), None])
-def test_a_band_ends_where_nothing_can_be_said(asked: tuple[float, float] | None) -> None:
+def test_a_band_without_estimates_is_nan(asked: tuple[float, float] | None) -> None:
     snapshot, settings = made_snapshot(), replace(SETTINGS, band=asked)
     snapshot.csm[snapshot.frequency > 80] = np.nan  # resampled
     assert band_of(settings, snapshot)[1] == 80
@@ -82,13 +82,13 @@ def test_a_band_ends_where_nothing_can_be_said(asked: tuple[float, float] | None
     assert "?" not in list(result_table(snapshot, settings).columns[2].cells)
 
 
-def test_a_band_of_which_nothing_is_known_stays_what_it_is() -> None:
+def test_a_band_without_deviations_keeps_its_mean() -> None:
     snapshot = made_snapshot()
     snapshot.csm[snapshot.frequency > 80] = np.nan
     assert band_of(replace(SETTINGS, band=(85.0, 95.0)), snapshot) == (85.0, 95.0)
 
 
-def test_median_of_columns_is_that_of_numpy() -> None:
+def test_median_of_columns_agrees_with_numpy() -> None:
     rng = np.random.default_rng(2)
     for n_rows in (1, 2, 7, 8):
         values = rng.normal(size=(n_rows, 5))

@@ -26,7 +26,7 @@ def unit(degrees: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("theta", "fraction"), [(10, 0.0445), (5, 0.0113)])
-def test_the_known_answers(theta: float, fraction: float) -> None:
+def test_the_bias_has_known_values(theta: float, fraction: float) -> None:
     for level in (10, 100, 1000):
         c = motion_csm(unit([0, theta, theta]), level * PLANE)
         bias = three_channel_bias(c, np.ones(3), dims=(1, 1, 1))
@@ -34,7 +34,7 @@ def test_the_known_answers(theta: float, fraction: float) -> None:
         assert snr(c, np.ones(3))[0] == pytest.approx(level)
 
 
-def test_the_three_exempt_cases() -> None:
+def test_the_three_unbiased_cases_have_no_bias() -> None:
     dims, ones = (1, 1, 1), np.ones(3)
     # (i) low SNR
     c = motion_csm(unit([10, 20, 40]), 1e-6 * PLANE)
@@ -49,7 +49,7 @@ def test_the_three_exempt_cases() -> None:
     assert bias[2] > 100
 
 
-def test_three_sensor_is_blind_to_orientation_and_to_one_incoherent_sensor() -> None:
+def test_three_sensor_has_no_bias_by_orientation_or_one_incoherent_sensor() -> None:
     rng = np.random.default_rng(0)
     H = np.stack([rotation(rng, 3) for _ in range(3)])
     motion = np.diag([1.0, 1.5, 0.8]) * 1e4
@@ -63,7 +63,7 @@ def test_three_sensor_is_blind_to_orientation_and_to_one_incoherent_sensor() -> 
     assert bias[6:].min() > 100
 
 
-def test_equal_coherency_biases_by_snr_times_what_is_missing() -> None:
+def test_equal_coherency_biases_by_snr_times_the_incoherence() -> None:
     # (30) with S_ZiZj = g S_Z: gamma (1 - g g / g)
     H = np.broadcast_to(np.eye(2), (3, 2, 2))
     g = 0.99
@@ -79,7 +79,7 @@ def test_equal_coherency_biases_by_snr_times_what_is_missing() -> None:
     [("three-channel", three_channel_bias), ("three-sensor", three_sensor_bias)],
 )
 @pytest.mark.parametrize("n_sensors", [3, 5])
-def test_the_estimators_do_what_the_theory_says(
+def test_the_bias_of_the_estimators_agrees_with_the_theory(
     method: str, theory: object, n_sensors: int
 ) -> None:
     rng = np.random.default_rng(1)
@@ -102,14 +102,14 @@ def test_the_estimators_do_what_the_theory_says(
     )
 
 
-def test_motion_that_lacks_a_dimension_biases_nobody_who_feels_it_alike() -> None:
+def test_motion_that_lacks_a_dimension_causes_no_bias_for_parallel_sensors() -> None:
     rng = np.random.default_rng(2)
     H = np.stack([rotation(rng, 2) for _ in range(60)]).reshape(20, 3, 2, 2)
     c = motion_csm(H, np.diag([1e4, 0.0]))
     np.testing.assert_allclose(three_sensor_bias(c, np.ones(6), dims=(2, 2, 2)), 0, atol=1e-8)
 
 
-def test_what_the_theory_does_not_cover_is_refused() -> None:
+def test_unequal_sensors_are_refused() -> None:
     c = motion_csm(unit([0, 5, 10]), PLANE)
     with pytest.raises(EstimatorError, match="expected equal numbers"):
         three_sensor_bias(c, np.ones(4), dims=(1, 1, 2))
@@ -117,7 +117,7 @@ def test_what_the_theory_does_not_cover_is_refused() -> None:
         motion_csm(unit([0, 5, 10]), np.eye(3))
 
 
-def test_a_channel_that_feels_none_of_the_motion_has_no_bias() -> None:
+def test_a_channel_without_motion_has_no_bias() -> None:
     response = np.zeros((3, 2, 2))
     response[:, 0] = [[1, 0], [np.cos(0.1), np.sin(0.1)], [1, 0]]
     motion = motion_csm(response, np.eye(2))

@@ -22,7 +22,7 @@ def two_poor_sensors(ratio: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("ratio", "snr"), [(10.0, 1e3), (100.0, 1e3), (1000.0, 1e4)])
 @pytest.mark.parametrize("n", [30, 200])
-def test_two_poor_sensors_cost_the_good_ones_little(ratio: float, snr: float, n: int) -> None:
+def test_two_poor_sensors_hardly_affect_the_others(ratio: float, snr: float, n: int) -> None:
     """Scatter within 10 % of maximum likelihood; no bias; the interval is that of these weights."""
     noise_psd = two_poor_sensors(ratio)
     rng = np.random.default_rng(4)
@@ -42,7 +42,7 @@ def test_two_poor_sensors_cost_the_good_ones_little(ratio: float, snr: float, n:
     assert 0.93 < covers.mean() < 0.97
 
 
-def test_equal_sensors_keep_the_plain_mean() -> None:
+def test_equal_sensors_have_equal_weights() -> None:
     rng = np.random.default_rng(2)
     for n, dims in ((30, FIVE), (200, (1,) * 4), (200, FIVE)):
         noise_psd = np.ones(sum(dims))
@@ -78,7 +78,7 @@ def test_weights_follow_a_sensor_that_is_poor_at_some_frequencies_only() -> None
     assert relative[poor].std() == pytest.approx(np.sqrt(2.5 / n), rel=0.1)  # the good pair
 
 
-def test_a_pair_without_a_matrix_at_some_frequencies_does_not_upset_the_others() -> None:
+def test_an_unusable_pair_does_not_affect_the_others() -> None:
     noise_psd = two_poor_sensors(100.0)
     rng = np.random.default_rng(6)
     csm = random_bench(rng, dims=FIVE, snr=1e3, noise_psd=noise_psd)

@@ -25,7 +25,7 @@ RATIO = 1000.0
         ((3,) * 5, 226, 0.1, 64),
     ],
 )
-def test_the_interval_covers_and_the_estimate_is_unbiased(
+def test_the_interval_covers_the_truth_and_the_estimate_is_unbiased(
     dims: tuple[int, ...], n: int, snr: float, n_freqs: int
 ) -> None:
     """`snr` is that of the noisy sensors; 200 draws of as many orientations."""
@@ -48,7 +48,7 @@ def test_the_interval_covers_and_the_estimate_is_unbiased(
     assert abs((noise < 1).mean() - 0.5) < 4 * np.sqrt(0.25 / (200 * d))
 
 
-def test_units_of_channels_make_no_difference_and_bad_frequencies_are_left_out() -> None:
+def test_units_have_no_effect_and_invalid_frequencies_are_ignored() -> None:
     rng = np.random.default_rng(1)
     noise_psd = np.repeat([1.0, 100, 100], 2)
     csm = random_bench(rng, dims=(2, 2, 2), snr=1000.0, noise_psd=noise_psd)
@@ -65,7 +65,7 @@ def test_units_of_channels_make_no_difference_and_bad_frequencies_are_left_out()
         np.testing.assert_allclose(other, value * 1e-18, rtol=1e-9)
 
 
-def test_neighbouring_frequencies_that_scatter_together_widen_the_interval() -> None:
+def test_correlated_frequencies_widen_the_interval() -> None:
     rng = np.random.default_rng(1)
     csm = random_bench(rng, dims=(1, 1, 1), snr=100.0, noise_psd=np.array([1.0, 100, 100]))
     sample = wishart(np.broadcast_to(csm, (100, 3, 3)), 100, rng)[0]
@@ -77,7 +77,7 @@ def test_neighbouring_frequencies_that_scatter_together_widen_the_interval() -> 
     assert width[1] / width[0] == pytest.approx(np.sqrt(1 + 2 * 0.5 * 0.99), rel=0.02)
 
 
-def test_where_nothing_can_be_said_there_is_no_number() -> None:
+def test_undetermined_noise_is_nan() -> None:
     csm = np.eye(4, dtype=np.complex128)[None].repeat(5, axis=0)
     for dims in ((2, 2), (4,)):
         found = quiet_sensor_noise(
@@ -102,7 +102,7 @@ def test_where_nothing_can_be_said_there_is_no_number() -> None:
         )
 
 
-def test_a_sensor_that_is_no_quieter_than_its_partners_is_left_to_other_estimates() -> None:
+def test_a_sensor_as_noisy_as_its_partners_has_no_estimate() -> None:
     rng = np.random.default_rng(3)
     csm = random_bench(rng, dims=(3, 3, 3), snr=100.0, noise_psd=np.ones(9))
     sample = wishart(np.broadcast_to(csm, (64, 9, 9)), 100, rng)[0]

@@ -54,7 +54,7 @@ def test_eq_26_term_by_term() -> None:
         )
 
 
-def test_one_channel_a_sensor_is_the_three_channel_method() -> None:
+def test_with_one_channel_per_sensor_it_is_the_three_channel_method() -> None:
     csm, _ = bench((1, 1, 1), 100)
     sample = wishart(csm, 30, np.random.default_rng(1), n_draws=50)
     one = three_channel(sample, dims=(1,) * 3, n_effective=30)
@@ -75,7 +75,7 @@ def test_three_channel_is_sleeman_and_takes_the_same_channel_of_each_sensor() ->
 
 
 @pytest.mark.parametrize("method", ["three-channel", "three-sensor"])
-def test_units_and_order_of_sensors_make_no_difference(method: str) -> None:
+def test_units_and_order_of_sensors_have_no_effect(method: str) -> None:
     csm, _ = bench((3, 3, 3, 3), 100)
     sample = wishart(csm, 40, np.random.default_rng(1), n_draws=20)
     rng = np.random.default_rng(2)
@@ -237,7 +237,7 @@ def test_intervals_hold_where_estimates_come_out_negative() -> None:
         assert 0.93 < covers[:, 0].mean() < (0.97 if n >= 100 else 0.98)
 
 
-def test_mixed_sensors_use_what_the_others_share() -> None:
+def test_mixed_sensors_use_the_channels_shared_by_the_others() -> None:
     csm, noise_psd = bench((3, 3, 3, 1), 1e4)
     found = three_sensor(csm[None], dims=(3, 3, 3, 1), n_effective=100, correct=False)
     np.testing.assert_allclose(found.noise_psd[0], noise_psd, rtol=1e-9)
@@ -296,7 +296,7 @@ def spoilt(fault: str) -> ComplexArray:
         ("singular, tiny", Flag.SINGULAR),
     ],
 )
-def test_one_bad_frequency_is_flagged_and_the_others_stand(
+def test_an_invalid_frequency_is_flagged_and_does_not_affect_the_others(
     method: str, fault: str, flag: Flag
 ) -> None:
     csm = spoilt(fault)
@@ -310,7 +310,7 @@ def test_one_bad_frequency_is_flagged_and_the_others_stand(
         np.testing.assert_array_equal(np.isnan(values[3]), (found.flags[3] & ~Flag.NEGATIVE) != 0)
 
 
-def test_a_dead_sensor_among_five_spoils_only_its_own_triads() -> None:
+def test_a_dead_sensor_affects_only_its_own_triads() -> None:
     csm, noise_psd = bench((3,) * 5, 100)
     csm = csm.copy()
     csm[3:6] = csm[:, 3:6] = 0
@@ -329,7 +329,7 @@ def test_sensors_without_noise_give_no_warning(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_one_frequency_that_is_no_cross_spectral_matrix_does_not_stop_the_others(
+def test_an_invalid_matrix_at_one_frequency_does_not_affect_the_others(
     method: str,
 ) -> None:
     good = np.tile(spoilt("nan")[4:], (2, 1, 1))
@@ -347,7 +347,7 @@ def test_one_frequency_that_is_no_cross_spectral_matrix_does_not_stop_the_others
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_makes_no_sense_is_refused(method: str) -> None:
+def test_invalid_arguments_are_refused(method: str) -> None:
     good = spoilt("nan")[:3]
 
     def estimate(
@@ -390,12 +390,12 @@ def test_what_makes_no_sense_is_refused(method: str) -> None:
             estimate(good, n_effective=n_effective)
 
 
-def test_an_unknown_method_is_named_with_those_there_are() -> None:
+def test_an_unknown_method_is_refused_with_the_known_names() -> None:
     with pytest.raises(UnknownMethodError, match=r"'magic'.*three-sensor"):
         self_noise("magic", spoilt("nan"), dims=(3, 3, 3), n_effective=60)
 
 
-def test_blocks_on_two_threads_give_what_one_block_gives() -> None:
+def test_two_threads_give_the_result_of_one() -> None:
     """The same bits each time, no warning, and an error comes through from a block's thread."""
     dims = (3,) * 3  # of more sensors, neighbours share the weights of pairs
     csm = wishart(bench(dims, 10)[0], 40, np.random.default_rng(6), n_draws=300)

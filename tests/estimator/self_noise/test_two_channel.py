@@ -18,7 +18,7 @@ def aligned(snr: float, n_sensors: int = 2) -> tuple[np.ndarray, np.ndarray]:
     return common_motion(np.tile(np.eye(3), (n_sensors, 1)), noise_psd, snr=snr), noise_psd
 
 
-def test_the_true_matrix_gives_the_true_noise_whatever_the_known_gains() -> None:
+def test_the_true_matrix_gives_the_true_noise_for_any_known_gains() -> None:
     csm, noise_psd = aligned(1e3)
     gain = 10.0 ** np.linspace(-3, 3, 6) * np.exp(1j * np.arange(6))
     csm = gain[:, None] * csm * gain.conj()
@@ -29,7 +29,7 @@ def test_the_true_matrix_gives_the_true_noise_whatever_the_known_gains() -> None
     np.testing.assert_array_equal(again.noise_psd, found.noise_psd)
 
 
-def test_its_formula_for_two_sensors() -> None:
+def test_the_formula_holds_for_two_sensors() -> None:
     csm, _ = aligned(10)
     S = wishart(csm, 30, np.random.default_rng(1), n_draws=4)
     found = two_channel(S, dims=(3, 3), n_effective=30)
@@ -88,7 +88,7 @@ def test_mixed_and_dead_channels_are_flagged() -> None:
 
 
 @pytest.mark.parametrize("response", [np.ones(5), np.zeros(6), np.full(6, np.nan)])
-def test_a_response_that_means_nothing_is_refused(response: np.ndarray) -> None:
+def test_an_invalid_response_is_refused(response: np.ndarray) -> None:
     csm, _ = aligned(1)
     with pytest.raises(EstimatorError, match="response"):
         two_channel(csm[None], dims=(3, 3), n_effective=9, response=response.astype(complex))

@@ -14,14 +14,14 @@ from tests.estimator.csm_models import common_motion
 
 
 @pytest.mark.parametrize("n", [10, 20, 100, 1080])
-def test_of_a_mere_psd_it_is_the_chi_squared_interval(n: int) -> None:
+def test_the_interval_of_a_psd_is_chi_squared(n: int) -> None:
     """Either end by itself, to second order of Cornish and Fisher's expansion, 1 / n."""
     low, high = score_interval(np.ones(1), np.ones((3, 1)), averages=n)
     exact = 2 * n / stats.chi2.ppf([0.975, 0.025], 2 * n)
     np.testing.assert_allclose([low[0], high[0]], exact, rtol=0.15 / n)
 
 
-def test_where_the_scatter_is_estimated_the_interval_is_student_s() -> None:
+def test_an_estimated_scatter_gives_the_interval_of_student() -> None:
     """Cross-spectrum of two independent channels: symmetric, of n degrees of freedom."""
     n = 30
     traces = np.array([[0.5], [0.0], [0.125]])  # eigenvalues +- 1/2 of omega G
@@ -34,14 +34,14 @@ def test_where_the_scatter_is_estimated_the_interval_is_student_s() -> None:
 
 
 @pytest.mark.parametrize("averages", [0.2, 0.5, 1.0])
-def test_too_few_averages_leave_it_open_above(averages: float) -> None:
+def test_too_few_averages_give_an_infinite_upper_end(averages: float) -> None:
     low, high = score_interval(np.ones(1), np.ones((3, 1)), averages=averages)
     assert 0 < low[0] < 1
     assert np.isinf(high[0])
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_where_spectra_are_real_they_scatter_twice_as_much(method: str) -> None:
+def test_real_spectra_have_twice_the_variance(method: str) -> None:
     """Averages of squares of real amplitudes, as at 0 Hz and the Nyquist frequency."""
     n, n_draws = 100, 3000
     csm = common_motion(np.tile(np.eye(2), (3, 1)), np.ones(6), snr=1e3).real
@@ -64,7 +64,7 @@ def test_where_spectra_are_real_they_scatter_twice_as_much(method: str) -> None:
     assert np.all(np.abs(found.noise_psd.mean(axis=0) - 1) < 4 * error)
 
 
-def test_a_real_spectrum_widens_an_interval_that_reaches_below_zero_too() -> None:
+def test_a_real_spectrum_also_widens_an_interval_below_zero() -> None:
     csm = np.full((2, 3, 3), 0.5, dtype=np.complex128)
     csm += 0.5 * np.eye(3)
     csm[:, 0, 1:] = csm[:, 1:, 0] = 0.68
@@ -81,7 +81,7 @@ def test_a_real_spectrum_widens_an_interval_that_reaches_below_zero_too() -> Non
     assert np.all(open_above.low < open_above.noise_psd)
 
 
-def test_an_interval_that_is_all_but_boundless_stays_a_number_and_never_shrinks() -> None:
+def test_a_very_wide_interval_remains_finite_and_never_shrinks() -> None:
     one = np.ones((1, 1))
     found = SelfNoise(
         "maximum-likelihood", one, 300 * one, 1e-260 * one, 1e270 * one, np.zeros((1, 1), np.int64)

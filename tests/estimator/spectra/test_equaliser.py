@@ -38,7 +38,7 @@ def test_samples_are_convolved_with_the_taps(n_samples: int) -> None:
         np.testing.assert_allclose(found[:, channel], direct, atol=1e-12)
 
 
-def test_pieces_give_the_same_as_the_whole() -> None:
+def test_pieces_give_the_result_of_the_whole() -> None:
     filters = made()
     samples = np.random.default_rng(2).standard_normal((500, 3))
     pieces = [filters.apply(samples[first : first + 100 + 14]) for first in range(0, 486, 100)]
@@ -58,7 +58,7 @@ def test_the_response_is_that_of_the_taps(frequency: np.ndarray) -> None:
     np.testing.assert_allclose(filters.response(frequency), direct, atol=1e-9)
 
 
-def test_filters_one_after_the_other_multiply() -> None:
+def test_responses_of_cascaded_filters_multiply() -> None:
     one, two = made(1), made(2, reach=3)
     both = one.then(two)
     assert both.filtered == (0, 2)
@@ -66,7 +66,7 @@ def test_filters_one_after_the_other_multiply() -> None:
     np.testing.assert_allclose(both.response(GRID), expected, atol=1e-9)
 
 
-def test_a_wanted_response_is_met_by_as_few_taps_as_it_has() -> None:
+def test_a_response_with_few_taps_is_met_by_these_taps() -> None:
     wanted = np.ones((len(GRID), 2), dtype=np.complex128)
     wanted[:, 1] = (1 + 0.5 * np.cos(2 * np.pi * GRID / RATE)) * np.exp(-2j * np.pi * GRID * 0.02)
     filters = design(wanted, RATE, longest=LENGTH // 2 - 1)
@@ -75,7 +75,7 @@ def test_a_wanted_response_is_met_by_as_few_taps_as_it_has() -> None:
     np.testing.assert_allclose(filters.response(GRID), wanted, atol=1e-9)
 
 
-def test_the_value_at_0_hz_is_set_by_the_taps_far_off() -> None:
+def test_the_value_at_0_hz_follows_from_the_outer_taps() -> None:
     wanted = (1.5 + np.cos(2 * np.pi * GRID * 0.02)).astype(np.complex128)[:, None]
     disturbed = wanted.copy()
     disturbed[0] += 0.4
@@ -93,7 +93,7 @@ def test_a_delay_of_half_a_sample_takes_few_taps(sign: int) -> None:
     assert short < 0.02 * ringing
 
 
-def test_a_response_that_no_short_filter_has_costs_more() -> None:
+def test_a_response_without_short_filter_has_more_tail_leakage() -> None:
     resonance = 1 / (1 - (GRID / 10) ** 2 + 1j * GRID / 10 / 50)
     snr = np.full((len(GRID), 1), 1e5)
     to_imitate, to_undo = (
@@ -113,7 +113,7 @@ def test_amplification_is_bounded() -> None:
     np.testing.assert_allclose(found[1:], 1.0)
 
 
-def test_smoothing_keeps_what_is_certain_and_bridges_what_is_not() -> None:
+def test_smoothing_keeps_values_of_large_weight_and_bridges_others() -> None:
     x = np.linspace(0, 1, 51)
     truth = 1 + x**2 + 1j * x
     values, weight = truth.copy(), np.full(51, 1e6)

@@ -29,7 +29,7 @@ def test_the_window_is_zero_in_gaps_and_one_away_from_them() -> None:
 
 
 @pytest.mark.parametrize("detrend", ["constant", "linear"])
-def test_trends_are_those_of_the_samples_that_are_there(detrend: str) -> None:
+def test_trends_are_fitted_to_present_samples(detrend: str) -> None:
     usable = np.ones(200, dtype=np.bool_)
     usable[50:80] = False
     line = 3.0 + (0.1 * np.arange(200.0) if detrend == "linear" else 0.0)
@@ -39,7 +39,7 @@ def test_trends_are_those_of_the_samples_that_are_there(detrend: str) -> None:
     np.testing.assert_allclose(left, 0, atol=1e-12)
 
 
-def test_blocks_missing_all_over_bias_nothing() -> None:
+def test_many_missing_blocks_cause_no_bias() -> None:
     """5 % of the blocks of each of three sensors, so that no segment is whole."""
     rng = np.random.default_rng(3)
     n = LENGTH * 60
@@ -67,7 +67,7 @@ def test_blocks_missing_all_over_bias_nothing() -> None:
     assert np.abs(leakage.bias(found.noise_psd)).mean() < 0.05
 
 
-def test_what_is_brought_in_is_known() -> None:
+def test_the_leakage_is_computed() -> None:
     """Noise that falls by 40 dB: in its quiet half much of it comes from the loud half."""
     rng = np.random.default_rng(5)
     frequency = np.fft.rfftfreq(LENGTH, 0.5)

@@ -52,7 +52,7 @@ def test_white_noise_is_flat_and_keeps_its_phase_relations() -> None:
         np.testing.assert_allclose(phase, 2 * np.pi * band.frequencies[1:-1] / 100, atol=0.02)
 
 
-def test_a_strong_high_frequency_does_not_fold_down() -> None:
+def test_a_strong_high_frequency_does_not_alias() -> None:
     t = np.arange(400_000) / 100
     for frequency in (30.1, 44.7, 16.3, 8.9):
         samples = np.cos(2 * np.pi * frequency * t)[:, None]
@@ -65,7 +65,7 @@ def test_a_strong_high_frequency_does_not_fold_down() -> None:
                 assert p < 1e-9
 
 
-def test_the_top_band_is_welch_and_pieces_make_no_difference() -> None:
+def test_the_top_band_equals_welch_for_any_division_of_samples() -> None:
     samples = noise(8000)
     whole = ladder(samples).bands()
     welch = CrossSpectra(SETTINGS, 2)
@@ -78,7 +78,7 @@ def test_the_top_band_is_welch_and_pieces_make_no_difference() -> None:
             np.testing.assert_allclose(one.csm, other.csm, rtol=1e-9, atol=1e-15)
 
 
-def test_a_gap_costs_the_segments_and_filter_lengths_it_touches() -> None:
+def test_a_gap_excludes_the_segments_and_filter_lengths_it_touches() -> None:
     samples = noise(60_000)
     complete = np.ones(len(samples), dtype=bool)
     complete[30_000:30_010] = False
@@ -113,7 +113,7 @@ def test_self_noise_over_three_decades() -> None:
         assert covered.mean() > 0.88
 
 
-def test_before_the_longest_segments_are_full_shorter_ones_stand_in() -> None:
+def test_shorter_segments_are_used_before_the_longest_are_complete() -> None:
     spectra = ladder(noise(1000), 6)
     bands = spectra.bands()
     assert len(bands) < 6
@@ -124,7 +124,7 @@ def test_before_the_longest_segments_are_full_shorter_ones_stand_in() -> None:
         ladder(noise(100)).bands()
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(EstimatorError, match="stages"):
         MultiResolution(SETTINGS, 2, n_stages=0)
     with pytest.raises(EstimatorError, match="octave"):
@@ -149,7 +149,7 @@ def knocked(n_pieces: int = 1) -> MultiResolution:
     return spectra
 
 
-def test_what_disturbs_an_octave_costs_its_own_segments_only() -> None:
+def test_a_disturbance_of_an_octave_excludes_only_its_segments() -> None:
     bands = knocked().bands()
     quiet = ladder(noise(60_000)).bands()
     assert all(not band.left_out.total() for band in quiet)
@@ -164,7 +164,7 @@ def test_what_disturbs_an_octave_costs_its_own_segments_only() -> None:
     assert knocked().n_segments == bands[-1].n_segments
 
 
-def test_undisturbed_octaves_are_the_same_however_samples_arrive_and_add() -> None:
+def test_undisturbed_octaves_do_not_depend_on_the_division_of_samples() -> None:
     once, pieces = knocked(), knocked(37)
     for one, other in zip(once.bands(), pieces.bands(), strict=True):
         assert one.left_out == other.left_out

@@ -39,7 +39,7 @@ def bump(samples: np.ndarray, row: int, channel: int, frequency: float) -> None:
     samples[row : row + 60, channel] += 30 * np.exp(-3 * t) * np.sin(2 * np.pi * frequency * t)
 
 
-def test_quiet_motion_loses_nothing() -> None:
+def test_quiet_motion_loses_no_segments() -> None:
     samples, starts = quiet(3000)
     spectra = selected(samples, starts)
     assert spectra.n_segments == 3000
@@ -50,7 +50,7 @@ def test_quiet_motion_loses_nothing() -> None:
 
 @pytest.mark.parametrize("frequency", [1.0, 5.0, 20.0])
 @pytest.mark.parametrize("row", [350, 5050])
-def test_a_transient_costs_the_segments_it_touches(frequency: float, row: int) -> None:
+def test_a_transient_excludes_the_segments_it_touches(frequency: float, row: int) -> None:
     samples, starts = quiet(100)
     clean = samples.copy()
     bump(samples, row, 2, frequency)  # at row 350 it falls into the start-up set
@@ -70,14 +70,14 @@ def test_a_transient_costs_the_segments_it_touches(frequency: float, row: int) -
 
 
 @pytest.mark.parametrize("into_segment", [2, 20, 97])
-def test_a_spike_is_seen_where_the_window_hides_it(into_segment: int) -> None:
+def test_a_spike_attenuated_by_the_window_is_detected(into_segment: int) -> None:
     samples, starts = quiet(100)
     samples[starts[60] + into_segment, 1] += 12 * samples[:, 1].std()
     spectra = selected(samples, starts)
     assert [(r.segment, r.channel) for r in spectra.rejected] == [(59, 1), (60, 1)]
 
 
-def test_gaps_and_clipping_are_told_apart() -> None:
+def test_gaps_and_clipping_are_distinguished() -> None:
     samples, starts = quiet(60)
     complete = np.ones(len(samples), dtype=bool)
     complete[2550] = False
@@ -96,7 +96,7 @@ def test_gaps_and_clipping_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("row", [550, 5050])
-def test_nan_is_a_gap_whatever_is_said_of_it(row: int) -> None:
+def test_nan_is_always_a_gap(row: int) -> None:
     samples, starts = quiet(60)
     samples[row, 2] = np.nan
     spectra = selected(samples, starts)
@@ -104,7 +104,7 @@ def test_nan_is_a_gap_whatever_is_said_of_it(row: int) -> None:
     assert np.isfinite(spectra.spectra().csm()).all()
 
 
-def test_a_decision_knows_nothing_of_what_comes_later_nor_of_how_samples_arrive() -> None:
+def test_decisions_do_not_depend_on_later_samples_or_their_division() -> None:
     samples, starts = quiet(200)
     for row in np.random.default_rng(1).integers(0, len(samples) - 60, 12):
         bump(samples, row, 1, 8.0)
@@ -122,7 +122,7 @@ def test_a_decision_knows_nothing_of_what_comes_later_nor_of_how_samples_arrive(
     np.testing.assert_allclose(live.spectra().csm(), whole.spectra().csm(), rtol=1e-11, atol=1e-14)
 
 
-def test_a_lasting_change_of_level_becomes_the_new_normal() -> None:
+def test_a_lasting_change_of_level_is_accepted() -> None:
     samples, starts = quiet(150)
     samples[8000:] *= 30
     spectra = selected(samples, starts)
@@ -133,7 +133,7 @@ def test_a_lasting_change_of_level_becomes_the_new_normal() -> None:
     assert spectra.spectra().n_segments == 150 - start_up
 
 
-def test_before_the_start_up_is_over_there_is_a_result_already() -> None:
+def test_a_result_is_available_during_start_up() -> None:
     samples, starts = quiet(9)
     bump(samples, 480, 0, 5.0)
     spectra = selected(samples, starts)
@@ -142,7 +142,7 @@ def test_before_the_start_up_is_over_there_is_a_result_already() -> None:
     assert selected(samples, starts[:2]).spectra().n_segments == 2
 
 
-def test_turned_off_it_takes_everything() -> None:
+def test_an_infinite_threshold_accepts_all_segments() -> None:
     samples, starts = quiet(40)
     bump(samples, 2000, 0, 5.0)
     samples[3000:3060, 1] = 0.0
@@ -162,7 +162,7 @@ def test_a_dead_channel_rejects_nothing() -> None:
     assert not selected(samples, starts).counts
 
 
-def test_settings_and_segments_that_mean_nothing_are_refused() -> None:
+def test_invalid_settings_and_segments_are_refused() -> None:
     for wrong in ({"threshold": 0.0}, {"start_up": 2}, {"memory": 3}, {"renewal": 0}):
         with pytest.raises(EstimatorError, match="rejection"):
             RejectionSettings(**wrong)
@@ -176,7 +176,7 @@ def test_settings_and_segments_that_mean_nothing_are_refused() -> None:
 
 
 @pytest.mark.parametrize("level", [0.0, 3.0])
-def test_a_channel_that_was_dead_for_a_moment_costs_the_segments_it_touches(level: float) -> None:
+def test_a_briefly_dead_channel_excludes_the_segments_it_touches(level: float) -> None:
     """A fifth of a segment hides in the scatter of its power."""
     samples, starts = quiet(100)
     clean = samples.copy()
@@ -199,14 +199,14 @@ def coarse(scale: float, n_segments: int = 300) -> tuple[np.ndarray, np.ndarray]
 
 
 @pytest.mark.parametrize("scale", [0.3, 0.22])
-def test_noise_below_a_count_is_no_reason_to_leave_out_every_segment(scale: float) -> None:
+def test_noise_below_one_count_does_not_exclude_every_segment(scale: float) -> None:
     samples, starts = coarse(scale)
     moving = np.flatnonzero(np.diff(samples[:, 1]))
     assert np.diff(moving).max() > 32  # longer than any channel stands still by chance
     assert sum(selected(samples, starts).counts.values()) <= 0.03 * len(starts)
 
 
-def test_a_channel_of_few_values_is_dead_only_where_it_used_to_move() -> None:
+def test_a_channel_with_few_values_is_dead_only_if_it_changed_before() -> None:
     samples, starts = coarse(0.3)
     samples[20_000:20_400, 1] = 0.0
     spectra = selected(samples, starts)

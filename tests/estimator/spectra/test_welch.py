@@ -29,7 +29,7 @@ def noise(n_samples: int, n_channels: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("detrend", ["none", "constant", "linear"])
 @pytest.mark.parametrize("window", ["hann", "rectangular", ("kaiser", 5.0)])
 @pytest.mark.parametrize("length", [100, 81])
-def test_it_is_the_transpose_of_scipy_csd(
+def test_the_matrix_is_the_transpose_of_scipy_csd(
     detrend: str, window: str | tuple[str, float], length: int
 ) -> None:
     samples = noise(5000, 3) + [3.0, -1.0, 0.1] + np.linspace(0, 5, 5000)[:, None]
@@ -74,13 +74,13 @@ def test_white_noise_has_its_variance_as_area_and_a_sine_its_power() -> None:
     assert csm[:, 0, 0].real.sum() * RATE / 500 == pytest.approx(4.5, rel=1e-9)
 
 
-def test_it_is_hermitian_and_positive() -> None:
+def test_the_matrix_is_hermitian_and_positive() -> None:
     csm = accumulated(noise(4000, 5), WelchSettings(RATE, 128)).csm()
     np.testing.assert_array_equal(csm, csm.conj().swapaxes(1, 2))
     assert np.linalg.eigvalsh(csm).min() > -1e-15
 
 
-def test_however_the_samples_are_cut_the_result_is_the_same() -> None:
+def test_the_result_does_not_depend_on_the_division_of_samples() -> None:
     samples = noise(20_000, 4)
     settings = WelchSettings(RATE, 100)
     whole = accumulated(samples, settings)
@@ -97,7 +97,7 @@ def test_however_the_samples_are_cut_the_result_is_the_same() -> None:
 
 
 @pytest.mark.parametrize("window", ["hann", "rectangular"])
-def test_segments_may_lie_anywhere_in_any_order(window: str) -> None:
+def test_segments_may_be_anywhere_in_any_order(window: str) -> None:
     samples = noise(5000, 3)
     settings = WelchSettings(RATE, 100, window=window)
     even, anywhere = CrossSpectra(settings, 3), CrossSpectra(settings, 3)
@@ -107,7 +107,7 @@ def test_segments_may_lie_anywhere_in_any_order(window: str) -> None:
     np.testing.assert_allclose(anywhere.csm(), even.csm(), rtol=1e-11, atol=1e-15)
 
 
-def test_accumulators_add_and_survive_the_journey() -> None:
+def test_accumulators_add_and_survive_serialisation() -> None:
     samples = noise(6000, 3)
     settings = WelchSettings(RATE, 100, window=("kaiser", 5.0))
     whole = CrossSpectra(settings, 3)
@@ -123,7 +123,7 @@ def test_accumulators_add_and_survive_the_journey() -> None:
     np.testing.assert_array_equal(parts[0].csm(), total.csm())
 
 
-def test_what_is_no_accumulator_is_refused() -> None:
+def test_invalid_bytes_of_accumulators_are_refused() -> None:
     settings = WelchSettings(RATE, 100)
     good = CrossSpectra(settings, 3)
     for content in (b"", b"rubbish", good.to_bytes()[:200], b"PK\x03\x04" + bytes(100)):
@@ -146,7 +146,7 @@ def test_what_is_no_accumulator_is_refused() -> None:
         (np.zeros(300), np.array([0])),
     ],
 )
-def test_segments_that_are_not_there_are_refused(samples: np.ndarray, starts: np.ndarray) -> None:
+def test_segments_outside_the_samples_are_refused(samples: np.ndarray, starts: np.ndarray) -> None:
     good = CrossSpectra(WelchSettings(RATE, 100), 3)
     with pytest.raises(EstimatorError, match="expected"):
         good.add(samples, starts)
@@ -166,7 +166,7 @@ def test_segments_that_are_not_there_are_refused(samples: np.ndarray, starts: np
         {"detrend": "quadratic"},
     ],
 )
-def test_settings_that_mean_nothing_are_refused(settings: dict[str, object]) -> None:
+def test_invalid_settings_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(EstimatorError):
         WelchSettings(**{"sampling_rate": RATE, "segment_length": 100, **settings})  # type: ignore[arg-type]  # from the parameters
 

@@ -12,7 +12,7 @@ from estimator.spectra.windows import effective_averages, get_window
 
 @pytest.mark.parametrize("name", ["hann", "boxcar", "blackmanharris"])
 @pytest.mark.parametrize("length", [2, 7, 2000])
-def test_windows_are_those_of_scipy(name: str, length: int) -> None:
+def test_windows_agree_with_scipy(name: str, length: int) -> None:
     np.testing.assert_allclose(
         get_window(name, length), signal.get_window(name, length), atol=1e-15
     )
@@ -31,7 +31,7 @@ def test_rectangular_is_boxcar_and_samples_pass_through() -> None:
     "window",
     ["hat", "kaiser", "kaiser,x", "hann,1", np.ones(3), np.zeros(4), np.array([1, np.nan, 1, 1])],
 )
-def test_a_window_that_is_none_is_refused(window: str | np.ndarray) -> None:
+def test_an_invalid_window_is_refused(window: str | np.ndarray) -> None:
     with pytest.raises(EstimatorError, match="window"):
         get_window(window, 4)
 
@@ -40,7 +40,7 @@ def test_a_window_that_is_none_is_refused(window: str | np.ndarray) -> None:
     ("overlap", "worth"),
     [(0.0, 1.0), (0.5, 1 / (1 + 2 / 36)), (0.75, 1 / (1 + 2 * (0.6592**2 + 1 / 36 + 0.0075**2)))],
 )
-def test_a_long_run_of_hann_segments_is_worth_what_the_books_say(
+def test_effective_averages_of_hann_segments_agree_with_the_literature(
     overlap: float, worth: float
 ) -> None:
     # Overlap correlations of the Hann window: Harris (1978), table 1: 65.9 % at 75 %,
@@ -52,7 +52,7 @@ def test_a_long_run_of_hann_segments_is_worth_what_the_books_say(
     )
 
 
-def test_few_segments_are_worth_no_more_than_their_number() -> None:
+def test_effective_averages_do_not_exceed_the_number_of_segments() -> None:
     window = get_window("hann", 100)
     assert effective_averages(window, 25, 0) == 0
     assert effective_averages(window, 25, 1) == 1

@@ -58,7 +58,7 @@ def running() -> Iterator[tuple[RunningDevice, ...]]:
         yield devices
 
 
-async def test_a_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
+async def test_probe_reads_one_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
     (check,) = await probe(sensors(running[0], TABLES[0]), CLOCK)
     assert check.information.serial_number == "A0000007"
     assert check.n_samples >= 200
@@ -89,7 +89,7 @@ async def test_a_second_of_samples(running: tuple[RunningDevice, ...]) -> None:
         ([0.0, 0.125, 0.25], None),
     ],
 )
-def test_rate_is_told_only_where_blocks_came_evenly(
+def test_rate_is_measured_only_if_blocks_arrive_evenly(
     came: Sequence[float], rate: float | None
 ) -> None:
     instants = (HostTime(round(at * 1e9), 0) for at in came)
@@ -98,7 +98,9 @@ def test_rate_is_told_only_where_blocks_came_evenly(
     assert found == (None if rate is None else pytest.approx(rate, rel=0.003))
 
 
-async def test_polling_leaves_so_much_bandwidth(running: tuple[RunningDevice, ...]) -> None:
+async def test_bandwidth_of_polled_sensors_follows_from_the_longest_interval(
+    running: tuple[RunningDevice, ...],
+) -> None:
     chosen = sensors(running[1], TABLES[1], settings={"preset": "witmotion"})
     (check,) = await probe(chosen, CLOCK, duration=2.0)
     assert check.bandwidth is not None
@@ -108,7 +110,7 @@ async def test_polling_leaves_so_much_bandwidth(running: tuple[RunningDevice, ..
     assert check.signal_to_noise_db is not None
 
 
-async def test_ports_in_trouble_do_not_hide_the_others(running: tuple[RunningDevice, ...]) -> None:
+async def test_failing_ports_do_not_hide_the_others(running: tuple[RunningDevice, ...]) -> None:
     bench = parse(
         f"""
         name = "bench"
@@ -133,7 +135,7 @@ async def test_ports_in_trouble_do_not_hide_the_others(running: tuple[RunningDev
     assert ["'B' on /dev/ttyNotThere" in str(error) for error in errors] == [True]
 
 
-async def test_what_is_on_a_port(running: tuple[RunningDevice, ...]) -> None:
+async def test_devices_on_a_port_are_discovered(running: tuple[RunningDevice, ...]) -> None:
     (accelerometer,) = await discover(running[0].port, CLOCK)
     assert (accelerometer.driver, accelerometer.settings) == ("epson", {"baud_rate": 460800})
     assert accelerometer.information is not None
@@ -145,7 +147,7 @@ async def test_what_is_on_a_port(running: tuple[RunningDevice, ...]) -> None:
         await discover("/dev/ttyNotThere", CLOCK)
 
 
-async def test_who_is_silent_or_another_does_not_hide_the_others_on_its_port(
+async def test_silent_or_wrong_devices_do_not_hide_others_on_their_port(
     running: tuple[RunningDevice, ...],
 ) -> None:
     port, names = running[1].port, ("P", "Q")
@@ -179,7 +181,7 @@ async def test_who_is_silent_or_another_does_not_hide_the_others_on_its_port(
     assert "'Q': expected registers 48 to 52 of device 81" in said[1]
 
 
-def test_where_is_looked_is_said() -> None:
+def test_the_search_is_described() -> None:
     said = search_description("/dev/ttyUSB0")
     assert all(str(each) in said for each in (*MODBUS_DEVICES, *MODBUS_BAUD_RATES, 460800))
     assert "Epson" not in search_description("modbus-tcp://10.0.0.9:502")

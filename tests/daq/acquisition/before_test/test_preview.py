@@ -20,7 +20,7 @@ SPEED, RATE = 4.0, 200.0
 TABLES = [device("A", serial_number="A0000007"), device("B", serial_number="B0000001")]
 
 
-async def test_samples_and_identities_come_and_a_port_that_fails_says_why() -> None:
+async def test_preview_has_samples_identities_and_causes_of_failures() -> None:
     ended = threading.Event()
     seen: list[tuple[SensorPreview, ...]] = []
 

@@ -48,7 +48,7 @@ def test_a_table_is_indexed_like_an_array(dataset: h5py.Dataset) -> None:
     assert sum(int(row["n_samples"]) for row in table) == table.n_samples == 900_000
 
 
-def test_only_blocks_whose_samples_are_there_count(dataset: h5py.Dataset) -> None:
+def test_only_blocks_with_committed_samples_count(dataset: h5py.Dataset) -> None:
     table = BlockTable(dataset)
     for n_rows, n_samples, whole in ((5, 29, 2), (5, 30, 3), (40_000, 399_999, 39_999)):
         table.extend(n_rows, n_samples)
@@ -57,7 +57,7 @@ def test_only_blocks_whose_samples_are_there_count(dataset: h5py.Dataset) -> Non
         table.extend(N_BLOCKS + 1, LENGTH * (N_BLOCKS + 1))
 
 
-def test_what_is_clipped_is_known_without_reading_again(dataset: h5py.Dataset) -> None:
+def test_clipped_stretches_are_cached(dataset: h5py.Dataset) -> None:
     table = BlockTable(dataset)
     assert table.clipped.shape == (0, 2)
     for n_rows in (105, N_BLOCKS):

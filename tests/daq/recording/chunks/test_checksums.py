@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     st.lists(st.integers(0, 10**6), max_size=3),
     st.integers(0, 2**32 - 1),
 )
-def test_the_blocks_that_are_damaged_are_named(
-    lengths: list[int], flipped: list[int], seed: int
-) -> None:
+def test_damaged_blocks_are_identified(lengths: list[int], flipped: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     counts = rng.integers(-(2**31), 2**31, (sum(lengths), 3)).astype("<i4")
     blocks = np.zeros(len(lengths), BLOCK_DTYPE)
@@ -50,7 +48,7 @@ def test_the_blocks_that_are_damaged_are_named(
     assert intact_blocks(blocks, counts).tolist() == expected.tolist()
 
 
-def test_a_damaged_chunk_costs_its_blocks_alone(tmp_path: Path) -> None:
+def test_a_damaged_chunk_loses_only_its_blocks(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     make_recording(path)
     with Recording.open(path) as recording:
@@ -77,7 +75,7 @@ def test_a_damaged_chunk_costs_its_blocks_alone(tmp_path: Path) -> None:
     assert len(verify(path).sensors[0].bad_blocks) == n_damaged == len(damaged)
 
 
-def test_damaged_gaps_and_events_are_named_and_the_rest_is_read(
+def test_damaged_gaps_and_events_are_reported_and_the_rest_is_read(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "r.h5"

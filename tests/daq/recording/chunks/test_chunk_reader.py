@@ -46,7 +46,7 @@ def ramp(dtype: str, n_columns: int | None) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize(
     ("dtype", "n_columns"), [("<i4", 3), ("<i2", 6), ("<f8", 1), ("<i8", None)]
 )
-def test_rows_are_those_of_hdf5(tmp_path: Path, dtype: str, n_columns: int | None) -> None:
+def test_rows_equal_those_read_by_hdf5(tmp_path: Path, dtype: str, n_columns: int | None) -> None:
     rows = ramp(dtype, n_columns)
     write(tmp_path / "f.h5", rows)
     with h5py.File(tmp_path / "f.h5", "r") as file:
@@ -58,7 +58,7 @@ def test_rows_are_those_of_hdf5(tmp_path: Path, dtype: str, n_columns: int | Non
 
 
 @pytest.mark.parametrize("options", [{"shuffle": False}, {"compression_opts": 9}, {"shape": None}])
-def test_other_filters(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_datasets_with_other_filters_are_read(tmp_path: Path, options: dict[str, Any]) -> None:
     rows = ramp("<i4", 3)
     if "shape" in options:  # cannot be compressed: HDF5 leaves gzip out, chunk by chunk
         rows[100:] = np.random.default_rng(0).integers(-(2**31), 2**31, (157, 3))
@@ -68,7 +68,7 @@ def test_other_filters(tmp_path: Path, options: dict[str, Any]) -> None:
         np.testing.assert_array_equal(ChunkedRows(file["rows"]).read(3, 250), rows[3:250])
 
 
-def test_no_damaged_byte_gives_wrong_rows(tmp_path: Path) -> None:
+def test_a_damaged_byte_is_always_detected(tmp_path: Path) -> None:
     path = tmp_path / "f.h5"
     rows = ramp("<i4", 3)
     write(path, rows)
@@ -91,7 +91,7 @@ def test_no_damaged_byte_gives_wrong_rows(tmp_path: Path) -> None:
     assert refused == chunk.size - 4
 
 
-def test_rows_read_again_come_from_memory_and_no_further_ones(tmp_path: Path) -> None:
+def test_repeated_reads_use_a_bounded_cache(tmp_path: Path) -> None:
     rows = ramp("<i4", 3)
     write(tmp_path / "f.h5", rows[:135])  # ends within a chunk, and grows
     with h5py.File(tmp_path / "f.h5", "r+") as file:
