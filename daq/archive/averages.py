@@ -18,9 +18,8 @@ from daq.estimation.noise_estimates import (
     responses,
     up_to,
 )
-from daq.estimation.snapshot import (
-    ChannelLabel,
-    Snapshot,
+from daq.estimation.snapshot import ChannelLabel, Snapshot
+from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
     added,

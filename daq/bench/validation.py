@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from daq.bench.driver_rules import Checking
 from daq.bench.durations import format_duration
-from daq.bench.estimate_settings import OPTIONS, EstimateSettings, misfits, shortest_duration
+from daq.bench.estimate_settings import OPTIONS, EstimateSettings
 from daq.bench.field_faults import field_faults, one_of
 from daq.bench.model import (
     Limit,
@@ -18,6 +18,7 @@ from daq.bench.model import (
     estimate_settings,
     valid_rate,
 )
+from daq.bench.option_fit import misfits, shortest_duration
 from daq.errors import BenchFileError, FileFault, WrongSettingError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.noise_estimates import neighbours
-from daq.estimation.snapshot import (
+from daq.estimation.snapshot_diagnostics import (
     Diagnosis,
     EdgeLeakage,
     FrequencyDiagnosis,

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.noise_estimates import responses
-from daq.estimation.snapshot import EdgeLeakage
+from daq.estimation.snapshot_diagnostics import (
+    EdgeLeakage,
+)
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor

@@ -58,6 +58,8 @@ from daq.estimation.snapshot import (
     Octave,
     SensorTotals,
     Snapshot,
+)
+from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     added,
 )

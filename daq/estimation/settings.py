@@ -7,7 +7,8 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import parse_duration
-from daq.bench.estimate_settings import EstimateSettings, misfits
+from daq.bench.estimate_settings import EstimateSettings
+from daq.bench.option_fit import misfits
 from daq.errors import WrongSettingError
 from estimator.errors import EstimatorError
 from estimator.spectra.windows import get_window

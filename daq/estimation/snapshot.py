@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, added, added_by_clocks
 from daq.recording.sensor_state import STATE_AFTER
-from estimator.diagnostics.kinds import Untested
 from estimator.errors import InsufficientDataError
 
 if TYPE_CHECKING:
@@ -19,25 +19,12 @@ if TYPE_CHECKING:
     from daq.protocols.block import Event
     from daq.recording.interface import ReadableSensor
     from daq.timing.clock_model import ClockState
-    from estimator.diagnostics.advice import Advice
-    from estimator.diagnostics.band import BandDiagnosis
-    from estimator.diagnostics.relative_response import RelativeResponse
-    from estimator.diagnostics.stability import Stability
-    from estimator.likelihood.dimension import BandDimension
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
     from estimator.spectra.segment_rejection import Reason
 
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
-
-
-MOST_ADDED = 4.0
-"""What clocks add goes with the square of what is left between them: twice its rms is allowed."""
-
-
-PREDICTED_WITHIN = 1.2
-"""Leakage at the edges of segments is predicted within 20 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,168 +105,6 @@ class Octave:
             n_effective=band.n_effective,
             left_out=dict(band.left_out),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Synchronisation:
-    """What is left between the clocks, and its effect on the noise.
-
-    Attributes
-    ----------
-    residual : mapping of str to float
-        Seconds rms, by sensor.
-    noise_bias : float64, shape (n_freqs, n_channels), or None
-        What it is expected to add to the noise PSD, as a fraction of it; None where there is no
-        estimate.
-    """
-
-    residual: Mapping[str, float] = field(default_factory=dict)
-    noise_bias: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeLeakage:
-    """What unequal responses of sensors leak into the noise at the edges of segments.
-
-    Attributes
-    ----------
-    left : float64, shape (n_freqs, n_channels)
-        Expected in the noise PSD, in unit**2/Hz; may be negative.
-    whole : float64, shape (n_freqs, n_channels)
-        The same without equalisation.
-    unseen : float64, shape (n_freqs, n_channels)
-        What equalisation may have left that averages do not show; likewise.
-    share, whole_share : float64, shape (n_freqs, n_channels)
-        What the first two are at least, over the noise estimate, in bands of third octaves.
-    sources : tuple of str
-        Where the responses come from that are equalised: "known" (the bench file) and
-        "estimated"; empty where nothing is.
-    """
-
-    left: FloatArray
-    whole: FloatArray
-    unseen: FloatArray
-    share: FloatArray
-    whole_share: FloatArray
-    sources: tuple[str, ...] = ()
-
-    @property
-    def most(self) -> FloatArray:
-        """What may be in the noise PSD at most, shape (n_freqs, n_channels)."""
-        found = PREDICTED_WITHIN * np.maximum(self.left, 0.0) + self.unseen
-        return np.where(np.isfinite(found), found, 0.0)
-
-
-def added_by_clocks(
-    synchronisation: Synchronisation, results: Mapping[str, SelfNoise]
-) -> FloatArray | None:
-    """Return `Snapshot.added_by_clocks`."""
-    share = synchronisation.noise_bias
-    if share is None or not results:
-        return None
-    psd = np.abs(next(iter(results.values())).noise_psd)
-    added = MOST_ADDED * share * psd
-    return np.where(np.isfinite(added), np.clip(added, 0.0, psd), 0.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrequencyDiagnosis:
-    """The diagnosis at every frequency of a snapshot.
-
-    Attributes
-    ----------
-    coherence, condition : float64, shape (n_freqs, n_pairs)
-        As in `estimator.diagnostics.diagnose.Diagnostics`, and so are `dimension` and `snr`.
-    dimension : float64, shape (n_freqs,)
-    snr : float64, shape (n_freqs, n_channels)
-    statistic, degrees, p_value : float64, shape (n_freqs,)
-        Of the model test: `estimator.likelihood.goodness_of_fit.ModelTest`.
-    """
-
-    coherence: FloatArray
-    condition: FloatArray
-    dimension: FloatArray
-    snr: FloatArray
-    statistic: FloatArray
-    degrees: FloatArray
-    p_value: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Diagnosis:
-    """What the averages show of the test.
-
-    Attributes
-    ----------
-    n_factors : int
-        Dimensions of the motion in the model tested.
-    pairs : tuple of (int, int)
-        Pairs of sensors, from 0.
-    bands : tuple of BandDiagnosis
-        Rising.
-    responses : tuple of RelativeResponse
-        Where each octave has its own segments, of the octave in which sensors are most coherent.
-    advice : tuple of Advice
-        Worst first within each octave.
-    per_frequency : FrequencyDiagnosis
-    stability : Stability or None
-        None with too few segments, where each octave has its own, or with rejection.
-    """
-
-    n_factors: int
-    pairs: tuple[tuple[int, int], ...]
-    bands: tuple[BandDiagnosis, ...]
-    responses: tuple[RelativeResponse, ...]
-    advice: tuple[Advice, ...]
-    per_frequency: FrequencyDiagnosis
-    stability: Stability | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SnapshotDiagnostics:
-    """What is known of the test itself.
-
-    Attributes
-    ----------
-    synchronisation : Synchronisation
-    dimensions : tuple of BandDimension
-        Where the dimension of the motion was chosen by band; rising.
-    clipped : mapping of int to float
-        Share of samples at the end of the range, by column of the channel; without channels that
-        have none.
-    stood_still : mapping of int to float
-        Seconds for which a channel had a constant count though it has a signal otherwise; likewise.
-    diagnosis : Diagnosis or None
-        None where there is too little to diagnose. While a recording grows it may be that of some
-        segments before: it takes too long to be made for every snapshot.
-    untested : Untested or None
-        Why the model of one common motion was tested in no band; None where it was.
-    edge_leakage : EdgeLeakage or None
-        None where it is not known.
-    """
-
-    synchronisation: Synchronisation = field(default_factory=Synchronisation)
-    dimensions: tuple[BandDimension, ...] = ()
-    clipped: Mapping[int, float] = field(default_factory=dict)
-    stood_still: Mapping[int, float] = field(default_factory=dict)
-    diagnosis: Diagnosis | None = None
-    untested: Untested | None = Untested.UNFINISHED
-    edge_leakage: EdgeLeakage | None = None
-
-    @property
-    def advice(self) -> tuple[Advice, ...]:
-        """Advice on the test; none before it is diagnosed."""
-        return () if self.diagnosis is None else self.diagnosis.advice
-
-
-def added(diagnostics: SnapshotDiagnostics, results: Mapping[str, SelfNoise]) -> FloatArray | None:
-    """Return `Snapshot.added`."""
-    clocks, edges = added_by_clocks(diagnostics.synchronisation, results), diagnostics.edge_leakage
-    if edges is None or not results:
-        return clocks
-    psd = np.abs(next(iter(results.values())).noise_psd)
-    known = np.where(np.isfinite(psd), psd, 0.0)
-    return np.minimum(edges.most + (0.0 if clocks is None else clocks), known)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.bench.estimate_settings import EstimateSettings, misfits
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Channel, Sensor
+from daq.bench.option_fit import misfits
 from daq.bench.tables.fields import check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError, WrongSettingError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from daq.bench.estimate_settings import EstimateSettings
     from daq.formats.foreign_sensor import ForeignSensor, Stretch
     from daq.formats.response import Responses
     from daq.formats.sources import Selection

@@ -13,12 +13,10 @@ from daq.acquisition.before_test.device_check import DiscoveredDevice
 from daq.drivers.bench_file import parse
 from daq.drivers.interface import DeviceInformation
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import (
-    ChannelLabel,
+from daq.estimation.snapshot import ChannelLabel, SensorTotals, Snapshot
+from daq.estimation.snapshot_diagnostics import (
     Diagnosis,
     FrequencyDiagnosis,
-    SensorTotals,
-    Snapshot,
     SnapshotDiagnostics,
     Synchronisation,
 )

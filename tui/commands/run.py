@@ -12,7 +12,7 @@ import typer
 from rich.progress import BarColumn, TextColumn
 
 from daq.bench.durations import format_duration
-from daq.bench.estimate_settings import shortest_duration
+from daq.bench.option_fit import shortest_duration
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError, RecordingError
 from daq.estimation.estimation import estimate

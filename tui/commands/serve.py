@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from daq.acquisition.clock_trust import ClockTrust
 from daq.acquisition.schedule import all_due, utc_now
 from daq.bench.durations import format_duration
-from daq.bench.estimate_settings import shortest_duration
+from daq.bench.option_fit import shortest_duration
 from daq.drivers.bench_file import load
 from daq.errors import BenchFileError, FileFault, HuddleError
 from daq.estimation.settings import Settings

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import ChannelLabel, Snapshot, SnapshotDiagnostics
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from daq.estimation.snapshot_diagnostics import (
+        SnapshotDiagnostics,
+    )
     from estimator.self_noise.result import SelfNoise
     from estimator.types import ComplexArray, FloatArray, IntArray
 

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Diagnosis, Snapshot
+    from daq.estimation.snapshot import Snapshot
+    from daq.estimation.snapshot_diagnostics import (
+        Diagnosis,
+    )
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelNoise
     from daq.results.sources import Source

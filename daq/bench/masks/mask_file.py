@@ -12,8 +12,8 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daq.bench.estimate_settings import one_of
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
+from daq.bench.option_values import one_of
 from daq.bench.units import DensityUnit
 from daq.errors import FileFault, HuddleError, WrongSettingError
 

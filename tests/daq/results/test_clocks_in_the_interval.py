@@ -9,7 +9,9 @@ import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import MOST_ADDED
+from daq.estimation.snapshot_diagnostics import (
+    MOST_ADDED,
+)
 from daq.results.band_summary import channel_means
 from daq.results.clock_effect import added_in_bands
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot

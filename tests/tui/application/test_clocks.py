@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from daq.drivers.bench_file import parse
-from daq.estimation.snapshot import SnapshotDiagnostics, Synchronisation
+from daq.estimation.snapshot_diagnostics import (
+    SnapshotDiagnostics,
+    Synchronisation,
+)
 from daq.results.clock_effect import effect, effect_by_sensor
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.application.test_view.clocks import clock_line, drift_lines, drift_title

@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 
 from daq.bench import loading
 from daq.bench.estimate_settings import (
-    METHODS,
     OPTIONS,
     EstimateSettings,
-    max_dimension,
     table_keys,
     to_arguments,
     to_table,
 )
+from daq.bench.option_fit import max_dimension
+from daq.bench.option_values import METHODS
 from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from daq.estimation.snapshot import Diagnosis, Snapshot
+    from daq.estimation.snapshot import Snapshot
+    from daq.estimation.snapshot_diagnostics import (
+        Diagnosis,
+    )
     from estimator.diagnostics.stability import Stability
     from estimator.likelihood.dimension import BandDimension
 

@@ -13,7 +13,10 @@ import pytest
 from rich.console import Console
 from scipy.linalg import block_diag
 
-from daq.estimation.snapshot import Octave, SnapshotDiagnostics
+from daq.estimation.snapshot import Octave
+from daq.estimation.snapshot_diagnostics import (
+    SnapshotDiagnostics,
+)
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level, Untested
 from estimator.self_noise.result import Flag

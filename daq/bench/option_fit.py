@@ -1,0 +1,85 @@
+"""Whether the options of an estimate fit the sensors of a bench or recording."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from daq.bench.durations import format_duration
+from daq.bench.estimate_settings import EstimateSettings
+from daq.bench.option_values import one_of
+
+MIN_SEGMENT_SAMPLES = 4
+"""Samples of a segment, for one frequency between 0 and half the sampling rate."""
+
+
+class _Channel(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def auxiliary(self) -> bool: ...
+
+
+class _Sensor(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def sampling_rate(self) -> float: ...
+    @property
+    def channels(self) -> Sequence[_Channel]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """An option that does not fit the sensors: its value, and what was expected."""
+
+    name: str
+    value: str
+    expected: str
+
+
+def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[Misfit]:
+    """Yield the options that do not fit the sensors."""
+    channels = [
+        f"{sensor.name}.{channel.name}"
+        for sensor in sensors
+        for channel in sensor.channels
+        if not channel.auxiliary
+    ]
+    rate = min(sensor.sampling_rate for sensor in sensors)
+    if round(settings.segment * rate) < MIN_SEGMENT_SAMPLES:
+        yield Misfit(
+            "segment",
+            format_duration(settings.segment),
+            f"expected at least {format_duration(MIN_SEGMENT_SAMPLES / rate)},"
+            f" {MIN_SEGMENT_SAMPLES} samples at {rate:g} Hz",
+        )
+    most = max_dimension(len(channels))
+    by_factors = {"maximum-likelihood", "all"} & set(settings.methods)
+    if by_factors and isinstance(settings.dimension, int) and settings.dimension > most:
+        yield Misfit(
+            "dimension",
+            f"{settings.dimension}",
+            f"expected at most {most}: {len(channels)} channels cannot separate more dimensions of"
+            " motion from noise",
+        )
+    known = (*(sensor.name for sensor in sensors), *channels)
+    for name, gain in settings.gains.items():
+        try:
+            one_of(name, known)
+        except ValueError as error:
+            yield Misfit("gains", f"{name}={gain:g}", str(error))
+
+
+def max_dimension(n_channels: int) -> int:
+    """Return the largest dimension q of motion that p channels identify: (p - q)² ≥ p."""
+    return math.floor(n_channels - math.sqrt(n_channels) + 1e-12)
+
+
+def shortest_duration(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> tuple[int, float]:
+    """Return the minimum number of segments of an estimate, and their duration in seconds.
+
+    An estimate needs more averages than a sensor has channels.
+    """
+    fewest = 1 + max(sum(not c.auxiliary for c in sensor.channels) for sensor in sensors)
+    return fewest, settings.segment * (1 + (fewest - 1) * (1 - settings.overlap))

@@ -1,0 +1,201 @@
+"""Values of the options of an estimate: what is accepted, and how texts are read.
+
+A check takes a value of the bench file and returns the value of the setting. What begins with
+``to_`` takes the text of the command line and returns a value as of the bench file. Each raises
+`ValueError` with what was expected.
+"""
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+
+METHODS = ("two-channel", "three-channel", "three-sensor", "maximum-likelihood", "all")
+CLOCKS = ("refined", "arrivals", "nominal")
+EQUALISATIONS = ("auto", "known", "estimated", "off")
+TRENDS = ("none", "constant", "linear")
+WINDOWS = (
+    "rectangular",
+    "boxcar",
+    "bartlett",
+    "barthann",
+    "blackman",
+    "blackmanharris",
+    "bohman",
+    "cosine",
+    "flattop",
+    "hamming",
+    "hann",
+    "lanczos",
+    "nuttall",
+    "parzen",
+    "taylor",
+    "triang",
+)
+PARAMETRIC_WINDOWS = (
+    "chebwin",
+    "dpss",
+    "exponential",
+    "gaussian",
+    "general_hamming",
+    "kaiser",
+    "tukey",
+)
+"""Of one parameter each, as in ``kaiser,8``."""
+_MAX_DIMENSION = 999
+
+
+def number(value: object) -> float:
+    """Return a finite number."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    raise ValueError("expected a number")
+
+
+def to_number(text: str) -> float:
+    """Return the number that a text says."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError("expected a number") from None
+
+
+def share(value: object) -> float:
+    """Return a fraction from 0 to less than 1."""
+    found = number(value)
+    if 0 <= found < 1:
+        return found
+    raise ValueError("expected a fraction from 0 to less than 1")
+
+
+def cov(value: object) -> float:
+    """Return a number between 0 and 1."""
+    found = number(value)
+    if 0 < found < 1:
+        return found
+    raise ValueError("expected a number between 0 and 1, such as 0.05")
+
+
+def yes_or_no(value: object) -> bool:
+    """Return true or false."""
+    if isinstance(value, bool):
+        return value
+    raise ValueError("expected true or false")
+
+
+def one_of(value: object, known: Sequence[str]) -> str:
+    """Return the value if it is one of the known names.
+
+    Raises
+    ------
+    ValueError
+        With the known names, and the closest one.
+    """
+    if isinstance(value, str) and value in known:
+        return value
+    close = difflib.get_close_matches(str(value).lower(), known, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise ValueError(f"expected one of {', '.join(known)}{hint}")
+
+
+def methods(value: object) -> tuple[str, ...]:
+    """Return names of methods, each once."""
+    names = value if isinstance(value, (list, tuple)) and value else [value]
+    return tuple(dict.fromkeys(one_of(name, METHODS) for name in names))
+
+
+def method_or_methods(value: tuple[str, ...]) -> object:
+    """Return one name, or a list of several."""
+    return value[0] if len(value) == 1 else list(value)
+
+
+def clocks(value: object) -> str:
+    """Return a source of sample times."""
+    return one_of(value, CLOCKS)
+
+
+def equalisation(value: object) -> str:
+    """Return a mode of equalisation."""
+    return one_of(value, EQUALISATIONS)
+
+
+def trend(value: object) -> str:
+    """Return a trend to remove."""
+    return one_of(value, TRENDS)
+
+
+def window(value: object) -> str:
+    """Return the name of a window, with its parameter."""
+    name, _, parameter = str(value).partition(",")
+    if not isinstance(value, str) or name not in PARAMETRIC_WINDOWS:
+        return one_of(value, WINDOWS)
+    try:
+        positive = 0 < float(parameter) < math.inf
+    except ValueError:
+        positive = False
+    if not positive:
+        raise ValueError(f"expected the window with a parameter above 0, such as {name},0.5")
+    return value
+
+
+def unit(value: object) -> str:
+    """Return a unit."""
+    if isinstance(value, str) and value.strip():
+        return value
+    raise ValueError("expected a unit, such as m/s²")
+
+
+def band(value: object) -> tuple[float, float]:
+    """Return two increasing frequencies in Hz."""
+    if isinstance(value, (list, tuple)) and len(value) == 2:
+        low, high = map(number, value)
+        if 0 < low < high:
+            return low, high
+    raise ValueError("expected two increasing frequencies in Hz, such as 1 and 20")
+
+
+def to_band(text: str) -> list[float]:
+    """Return the frequencies that a text says."""
+    try:
+        return [float(part) for part in text.split(":")]
+    except ValueError:
+        raise ValueError("expected two frequencies in Hz such as 1:20") from None
+
+
+def dimension(value: object) -> object:
+    """Return a number of dimensions, or auto."""
+    if value == "auto":
+        return value
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_DIMENSION:
+        return value
+    raise ValueError('expected "auto", or a number of dimensions such as 3')
+
+
+def to_dimension(text: str) -> object:
+    """Return the dimensions that a text says."""
+    return int(text) if text.isdecimal() and len(text) <= len(str(_MAX_DIMENSION)) else text
+
+
+def gains(value: object) -> dict[str, float]:
+    """Return gains by sensor or channel."""
+    if not isinstance(value, Mapping):
+        raise ValueError('expected gains by sensor or channel, such as {B = 1.02, "C.X" = 0.99}')  # noqa: TRY004 - as other values
+    for name, gain in value.items():
+        if isinstance(gain, bool) or not isinstance(gain, (int, float)) or not gain:
+            raise ValueError(f"expected a number other than 0, such as 1.02, for {name}")
+    return {str(name): number(gain) for name, gain in value.items()}
+
+
+def to_gains(texts: Sequence[str]) -> dict[str, float]:
+    """Return the gains that texts such as B=1.02 say."""
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, number = text.rpartition("=")
+        if not name:
+            raise ValueError("expected a sensor and a number as in B=1.02")
+        if name in found:
+            raise ValueError(f"{name} is given twice; expected it once")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            raise ValueError("expected a sensor and a number as in B=1.02") from None
+    return found
