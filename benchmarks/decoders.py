@@ -17,8 +17,9 @@ from daq.protocols.epson.burst import BurstDecoder
 from daq.protocols.epson.commands import BurstFormat
 from daq.protocols.guralp import brp, gcf
 from daq.protocols.guralp.decoders import SerialDecoder
-from daq.protocols.labjack import stream
-from daq.protocols.labjack.stream import Packet, StreamDecoder
+from daq.protocols.labjack import packets, stream
+from daq.protocols.labjack.packets import Packet
+from daq.protocols.labjack.stream import StreamDecoder
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import FifoDecoder
 from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
@@ -113,7 +114,7 @@ def _labjack() -> bytes:
     rows[:, 0], rows[:, 1] = timer & 0xFFFF, timer >> 16 & 0xFFFF
     samples = rows.ravel()
     packets = [
-        stream.encode_packet(Packet(samples[start : start + 506], transaction=k))
+        packets.encode_packet(Packet(samples[start : start + 506], transaction=k))
         for k, start in enumerate(range(0, samples.size, 506))
     ]
     return b"".join(packets)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.protocols.labjack import registers as reg
+from daq.protocols.labjack.packets import Packet
 from daq.protocols.labjack.stream import (
     AUTO_RECOVER_ACTIVE,
     AUTO_RECOVER_END,
     AUTO_RECOVER_OVERFLOW,
     BURST_COMPLETE,
     DUMMY,
-    Packet,
 )
 from sim_devices.devices.interface import NEVER
 from sim_devices.devices.sampling import whole

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 FAMILIES = {
     "epson": "sim_devices.devices.epson:create",
     "registers": "sim_devices.devices.registers:create",
-    "labjack": "sim_devices.devices.labjack:create",
+    "labjack": "sim_devices.devices.labjack_ports:create",
     "guralp": "sim_devices.devices.guralp:create",
     "fifo": "sim_devices.devices.fifo:create",
     "text": "sim_devices.devices.text:create",

@@ -21,9 +21,10 @@ from daq.protocols.epson.commands import BurstFormat, CommandDecoder, Read
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.guralp import brp, gcf, scream
 from daq.protocols.guralp.decoders import ScreamDecoder, SerialDecoder
-from daq.protocols.labjack import stream
+from daq.protocols.labjack import packets
+from daq.protocols.labjack.packets import Packet
 from daq.protocols.labjack.registers import AduFinder
-from daq.protocols.labjack.stream import Packet, StreamDecoder
+from daq.protocols.labjack.stream import StreamDecoder
 from daq.protocols.modbus import rtu
 from daq.protocols.modbus.fifo import FifoDecoder
 from daq.protocols.modbus.registers import RegisterDecoder, RegisterMap
@@ -169,7 +170,7 @@ def scream_udp(fuzzed: bytes) -> None:
 
 
 PACKETS = b"".join(
-    stream.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
+    packets.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
 )
 
 
@@ -186,7 +187,7 @@ def labjack_registers(fuzzed: bytes) -> None:
         with contextlib.suppress(RemoteProtocolError):
             list(finder.receive(read))
     with contextlib.suppress(RemoteProtocolError):
-        stream.decode_response(fuzzed)
+        packets.decode_response(fuzzed)
 
 
 def fifo(fuzzed: bytes) -> None:

@@ -16,6 +16,7 @@ from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceErro
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers as reg
 from daq.protocols.labjack import stream as labjack
+from daq.protocols.labjack.packets import MAX_SAMPLES
 from daq.protocols.labjack.registers import Adu, AduFinder, Calibration, Read, Write
 from daq.protocols.sample_counter import CLOCK_TOLERANCE, SLACK
 from daq.transport.address import host_and_port
@@ -279,7 +280,7 @@ def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: fl
         expected = f"{len(scan_list)} addresses to scan; expected at most 128"
         raise BenchFileError(FileFault("sensors", expected))
     n_columns = len(scan_list)
-    scans = max(1, min(labjack.MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
+    scans = max(1, min(MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
     return StreamPlan(scan_list, rate, settings.samples_per_packet or scans * n_columns)
 
 

@@ -33,6 +33,7 @@ from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers as reg
 from daq.protocols.labjack import stream as labjack
+from daq.protocols.labjack.packets import MAX_CR_SAMPLES, decode_response
 from daq.protocols.labjack.registers import Read
 from daq.protocols.labjack.stream import StreamDecoder
 from daq.transport.ports import open_port
@@ -147,7 +148,7 @@ class LabJackSession:
 
     async def _by_command(self) -> AsyncGenerator[list[Block | Event]]:
         await self._start()
-        read = Read(reg.STREAM_DATA_CR, 4 + labjack.MAX_CR_SAMPLES)
+        read = Read(reg.STREAM_DATA_CR, 4 + MAX_CR_SAMPLES)
         while True:
             try:
                 # No time limit: the samples in a late reply are not sent again.
@@ -157,9 +158,9 @@ class LabJackSession:
                 raise DeviceError(
                     f"{self._registers.label}: reading the stream: {error}{reason}"
                 ) from error
-            packet = labjack.decode_response(values)
+            packet = decode_response(values)
             yield self.decoder.receive_response(packet, at)
-            if len(packet.samples) < labjack.MAX_CR_SAMPLES:
+            if len(packet.samples) < MAX_CR_SAMPLES:
                 await asyncio.sleep(POLL_INTERVAL)
 
 

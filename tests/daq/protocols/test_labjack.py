@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers, stream
+from daq.protocols.labjack.packets import (
+    Packet,
+    PacketFinder,
+    decode_response,
+    encode_packet,
+    encode_response,
+)
 from daq.protocols.labjack.registers import Adu, AduFinder, Calibration, Read, Write
-from daq.protocols.labjack.stream import Packet, StreamDecoder, encode_packet
+from daq.protocols.labjack.stream import StreamDecoder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -254,10 +261,10 @@ def test_unknown_statuses_are_reported() -> None:
 
 def test_command_response_reads_are_decoded() -> None:
     rows = scans(0, 10)
-    values = stream.encode_response(Packet(rows.ravel(), backlog=8), n_registers=255)
+    values = encode_response(Packet(rows.ravel(), backlog=8), n_registers=255)
     assert len(values) == 510
     assert values[:8] == struct.pack(">HHHH", 60, 8, 0, 0)
-    packet = stream.decode_response(values)
+    packet = decode_response(values)
     assert packet.backlog == 8
     found = decoder().receive_response(packet, at(1))
     np.testing.assert_array_equal(of("A", found)[0], rows[:, 2:5])
@@ -266,7 +273,7 @@ def test_command_response_reads_are_decoded() -> None:
 @pytest.mark.parametrize("values", [b"", bytes(7), struct.pack(">HHHH", 1, 0, 0, 0)])
 def test_a_response_that_declares_too_many_samples_is_refused(values: bytes) -> None:
     with pytest.raises(RemoteProtocolError, match="bytes"):
-        stream.decode_response(values)
+        decode_response(values)
 
 
 # --- registers -------------------------------------------------------------------------------
@@ -374,7 +381,7 @@ def test_stream_decoding_continues_after_any_bytes(pieces: list[bytes], timed: b
 @settings(max_examples=100)
 @given(st.binary(max_size=600))
 def test_any_feedback(pdu: bytes) -> None:
-    for parse in (registers.decode_feedback, AduFinder().receive, stream.decode_response):
+    for parse in (registers.decode_feedback, AduFinder().receive, decode_response):
         try:
             parse(pdu)
         except RemoteProtocolError:
@@ -382,7 +389,7 @@ def test_any_feedback(pdu: bytes) -> None:
 
 
 def test_memory_stays_bounded() -> None:
-    receiver = stream.PacketFinder()
+    receiver = PacketFinder()
     receiver.receive(encode_packet(Packet(np.zeros(512, np.uint16)))[:-1])
     for _ in range(100):
         receiver.receive(b"\x4c\x10" * 5000)
@@ -429,9 +436,9 @@ def test_a_late_repeated_packet_is_recognised_by_its_timer() -> None:
     for number, seconds in ((0, 0.1), (1, 0.2), (1, 3.0), (1, 3.0), (2, 3.1)):
         timer = (np.arange(20) + 20 * number) * 200_000
         rows = np.column_stack([timer & 0xFFFF, timer >> 16, np.full(20, number)])
-        packet = stream.Packet(rows.astype(np.uint16).ravel(), transaction=number)
+        packet = Packet(rows.astype(np.uint16).ravel(), transaction=number)
         at = HostTime(round(seconds * 1e9), 0)
-        found = decoder.receive(stream.encode_packet(packet), at)
+        found = decoder.receive(encode_packet(packet), at)
         blocks += [item for item in found if isinstance(item, Block)]
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 20), (20, 20), (40, 20)]
 

@@ -13,7 +13,8 @@ from estimator.diagnostics.advice import (
     ReversedPolarity,
     SwappedChannels,
 )
-from tui.output.advice.sentences import explain, followers, opposite, where
+from tui.output.advice.differences import followers, opposite
+from tui.output.advice.sentences import explain, where
 from tui.output.formatting import listed, percent
 
 if TYPE_CHECKING:

@@ -18,17 +18,19 @@ from estimator.diagnostics.advice import (
     SwappedChannels,
     TooFewDimensions,
 )
-from tui.output.advice.sentences import (
+from tui.output.advice.differences import (
     EFFECT_OF_DELAY,
-    EFFECT_OF_FEW_DIMENSIONS,
     EFFECT_OF_ROTATION,
     EFFECT_OF_SKEW,
+    followers,
+    opposite,
+)
+from tui.output.advice.sentences import (
+    EFFECT_OF_FEW_DIMENSIONS,
     Names,
     effect_of_misfit,
     explain,
-    followers,
     model,
-    opposite,
     where,
 )
 from tui.output.formatting import degrees, signed, span
