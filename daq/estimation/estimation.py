@@ -79,7 +79,7 @@ _LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are t
 _REVIEW = 1.25  # growth after which that is looked at
 _FIRST_REVIEW = 8  # segments
 _RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
-DIAGNOSIS_SHARE = 0.02
+DIAGNOSIS_SHARE = 0.01
 """Share of the time that diagnoses of a growing recording may take."""
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
 _MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
