@@ -6,6 +6,7 @@ slow line is read no faster than it carries: 960 bytes a second at 9600 baud.
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import fcntl
 import os
@@ -70,19 +71,14 @@ class Terminal:
         self._reader.start()
 
     def _read(self) -> None:
-        rest = b""
+        decoder = codecs.getincrementaldecoder("utf-8")()
         with contextlib.suppress(OSError):
             while received := os.read(self._master, 96 if self._baud else 65536):
                 if self._baud:  # a line takes its time
                     time.sleep(len(received) * 10 / self._baud)
-                rest += received
-                text = rest.decode(errors="ignore")
-                rest = b"" if text.encode() == rest else rest
-                if rest:
-                    continue
                 with self._changed:
                     self.n_bytes += len(received)
-                    self._screen.feed(text)
+                    self._screen.feed(decoder.decode(received))
                     self._changed.notify_all()
 
     def press(self, keys: str) -> None:

@@ -100,9 +100,9 @@ class Form(ModalScreen[Result | None], Generic[Result]):
         """Return what has been typed into a field."""
         return self.query_one(f"#{name}", Input).value.strip()
 
-    def explain(self, name: str) -> None:
-        """Say what a field means, or what is wrong with it."""
-        problem = self.problem(name)
+    def explain(self, name: str, *, is_refused: bool = False) -> None:
+        """Say what a field means, or what is wrong with it; one to be filled in is not wrong."""
+        problem = self.problem(name) if is_refused or self.value(name) else ""
         self.query_one(f"#{name}", Input).set_class(bool(problem), "-wrong")
         self.tell(problem or self.hint(name), is_wrong=bool(problem))
 
@@ -126,7 +126,7 @@ class Form(ModalScreen[Result | None], Generic[Result]):
         for field in self._fields:
             if self.problem(field.name):
                 self.query_one(f"#{field.name}", Input).focus()
-                self.explain(field.name)
+                self.explain(field.name, is_refused=True)
                 return
         self.submit()
 
