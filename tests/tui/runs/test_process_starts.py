@@ -135,7 +135,7 @@ def test_no_process_of_python_is_started_in_any_other_way() -> None:
     # Each has its own test above: simulated devices, the recorder, archives, runs of a service.
     starts = {name for name, text in sources.items() if STARTS.search(text)}
     users = {  # run what the bench file or --on-event says
-        str(Path("tui", "commands", "tui.py")),
+        str(Path("tui", "commands", "tui_controls.py")),
         str(Path("tui", "service", "hooks.py")),
     }
     assert starts == users | {
