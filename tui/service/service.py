@@ -93,6 +93,7 @@ class Service:
         self._unsaved: dict[str, Run] = {}
         self._windows: asyncio.Queue[Run] = asyncio.Queue()
         self._estimates: asyncio.Queue[Run] = asyncio.Queue()
+        self._repeats: set[asyncio.Task[None]] = set()
         self.recording: Run | None = None
         self.window: Window | None = None
 
@@ -114,7 +115,7 @@ class Service:
     @property
     def waiting(self) -> tuple[int, int]:
         """Numbers of runs that wait to be recorded, and to be estimated."""
-        return self._windows.qsize(), self._estimates.qsize()
+        return self._windows.qsize(), self._estimates.qsize() + len(self._repeats)
 
     def free(self) -> int | None:
         """Return the bytes of free space for recordings; None if that cannot be told."""
@@ -141,6 +142,7 @@ class Service:
             for task in done:
                 task.result()
         finally:
+            workers.extend(self._repeats)
             for task in workers:
                 task.cancel()
             await asyncio.gather(*workers, return_exceptions=True)
@@ -273,9 +275,9 @@ class Service:
 
     async def _estimate_runs(self) -> None:
         while True:
-            run = await self._estimates.get()
-            while run.state is RunState.ESTIMATING:
-                run = await self._estimated(run)
+            run = await self._estimated(await self._estimates.get())
+            if run.state is RunState.ESTIMATING:  # repeated after a while; others go first
+                continue
             self._note(run)
             for part in run.parts:
                 self._steps.release(part)
@@ -300,13 +302,11 @@ class Service:
             raise
         except (HuddleError, OSError) as error:
             _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
-            await self._clock.sleep(RETRY * 2**run.attempts, self.stop)
-            return run.because(str(error))
+            return self._repeated(run.because(str(error)), RETRY * 2**run.attempts)
         run = replace(run, parts=outcome.parts or run.parts)
         if outcome.refused and run.attempts < MAX_ATTEMPTS:
             _LOGGER.error("run %s: %s", run.name, "; ".join([*outcome.notes, outcome.error]))
-            await self._clock.sleep(RETRY * DISK_RETRY**run.attempts, self.stop)
-            return run.because(REFUSED)
+            return self._repeated(run.because(REFUSED), RETRY * DISK_RETRY**run.attempts)
         for note in outcome.notes:
             run = run.because(note)
         if outcome.error:
@@ -314,6 +314,19 @@ class Service:
         return run.to(
             RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=self._clock.now()
         )
+
+    def _repeated(self, run: Run, delay: float) -> Run:
+        """Queue the estimate of a run again after a delay in seconds."""
+
+        async def repeat() -> None:
+            await self._clock.sleep(delay, self.stop)
+            if not self.stop.is_set():
+                self._estimates.put_nowait(run)
+
+        task = asyncio.create_task(repeat())
+        self._repeats.add(task)
+        task.add_done_callback(self._repeats.discard)
+        return run
 
     def _failed(self, run: Run, reason: str) -> Run:
         return run.because(reason).to(RunState.FAILED, ended=self._clock.now())

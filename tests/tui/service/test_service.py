@@ -169,6 +169,15 @@ async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -
     assert len(place.steps.finished) == 3
 
 
+async def test_an_estimate_that_is_repeated_holds_up_no_other(tmp_path: Path) -> None:
+    place = Place(tmp_path)
+    place.steps.outcomes = [Outcome(error="cannot be rewritten", refused=True)] * 4
+    await place.serve(2.2 * HOUR)  # the fifth attempt is due 2 h after the fourth
+    assert [run.state for run in place.store.runs()[:2]] == [RunState.ESTIMATING, RunState.DONE]
+    await place.serve(1.0 * HOUR)  # the next service does not wait for it
+    assert place.store.runs()[0].state is RunState.DONE
+
+
 async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.steps.is_stuck = True
