@@ -52,6 +52,11 @@ def canonical(unit: str) -> str:
     return _SPELLINGS.get(spelled.lower(), spelled)
 
 
+def is_motion(unit: str) -> bool:
+    """Return whether a unit is one of displacement, velocity or acceleration."""
+    return canonical(unit) in _MOTION
+
+
 def in_acceleration(unit: str) -> float | None:
     """Return how many m/s² one of a unit is; None if it is no unit of acceleration."""
     derivatives, si = _MOTION.get(canonical(unit), (0, 1.0))

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.bench.model import PolesZeros
+from daq.bench.units import is_motion
 from daq.errors import ImportFormatError
 from daq.formats.readers.waveforms import load_obspy
 
@@ -239,9 +240,16 @@ def _channel(where: str, response: Any) -> ChannelResponse:  # noqa: ANN401 - Ob
         raise ImportFormatError(f"{where}: expected a gain for every stage, or a sensitivity")
     motion = response.response_stages[0].input_units or (stated and stated.input_units)
     unit = str(motion or "").lower()
+    unit = _UNITS.get(unit, unit)
+    if not is_motion(unit):
+        _LOGGER.warning(
+            "%s: its input is in %r; expected a unit of motion, such as M/S or M/S**2. The channel"
+            " keeps this unit; if it is a mistake, import again with the right response",
+            *(where, motion),
+        )
     return ChannelResponse(
         sensitivity=sensitivity,
-        unit=_UNITS.get(unit, unit),
+        unit=unit,
         shape=PolesZeros(
             zeros=tuple(zeros), poles=tuple(poles), normalization=normalization, frequency=frequency
         ),

@@ -184,6 +184,16 @@ def test_units_that_do_not_meet_are_refused(tmp_path: Path) -> None:
         read_responses(path)
 
 
+def test_an_input_that_is_no_motion_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = changed(station_file(tmp_path / "s.xml", EPOCHS[1:2]), "M/S", "PA")
+    (epochs,) = read_responses(path).by_channel.values()
+    assert epochs[0].response.unit == "pa"
+    (said,) = caplog.messages
+    assert "its input is in 'PA'; expected a unit of motion" in said
+
+
 def test_entities_are_not_resolved(tmp_path: Path) -> None:
     path = station_file(tmp_path / "s.xml", EPOCHS)
     changed(
