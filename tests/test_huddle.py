@@ -245,7 +245,9 @@ def test_too_few_sensors_are_refused_by_name() -> None:
 
 def test_too_few_averages_are_refused_with_the_reason() -> None:
     sensors = {name: array[:2000] for name, array in triaxial().items()}
-    with pytest.raises(huddle.EstimatorError, match=r"2\.89286 effective averages: more than 3"):
+    with pytest.raises(
+        huddle.EstimatorError, match=r"2\.89286 effective averages; expected more than 3"
+    ):
         huddle.self_noise(sensors, fs=RATE, segment="10s")
 
 

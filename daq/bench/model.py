@@ -24,8 +24,8 @@ from pydantic import (
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys, to_table
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
 from daq.bench.tables.fields import Duration, Name, Number, PositiveNumber, Table
+from daq.bench.tables.toml_text import to_toml
 from daq.bench.tables.unattended import History, Hooks, Metrics, Schedule, Storage
-from daq.bench.toml_text import to_toml
 from daq.bench.units import DensityUnit
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from daq.bench.toml_text import to_toml
+from daq.bench.tables.toml_text import to_toml
 
 if TYPE_CHECKING:
     from pathlib import Path

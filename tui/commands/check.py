@@ -13,7 +13,7 @@ from rich.table import Table
 from daq.acquisition.before_test.device_check import discover, probe_bench, search_description
 from daq.bench.durations import format_duration
 from daq.bench.editing import set_sensor_values
-from daq.bench.toml_text import to_toml
+from daq.bench.tables.toml_text import to_toml
 from daq.drivers.bench_file import load
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock

@@ -9,7 +9,7 @@ import pytest
 
 from daq.bench.driver_rules import Checking
 from daq.bench.model import Channel, Sensor
-from daq.bench.toml_text import to_toml
+from daq.bench.tables.toml_text import to_toml
 from daq.drivers.bench_file import parse
 from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError
