@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 ONE_SIDED = 1.1
 """Lower half of an interval over its upper half, from which on both are shown."""
+ONE_SIDED_DB = 0.02
+"""Halves that differ by less are shown as one, the larger."""
 
 
 def utc(ns: int) -> str:
@@ -65,7 +67,9 @@ def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
         return f"below {level(high)}"
     up = decibels(high) - decibels(psd)
     down = up if math.isnan(low) else decibels(psd) - decibels(low)
-    return f"{level(psd)} {f'±{up:.2f}' if down < ONE_SIDED * up else f'+{up:.2f} −{down:.2f}'}"
+    if down < max(ONE_SIDED * up, up + ONE_SIDED_DB):
+        return f"{level(psd)} ±{max(up, down):.2f}"
+    return f"{level(psd)} +{up:.2f} −{down:.2f}"
 
 
 def interval(low: float, high: float) -> str:

@@ -122,7 +122,7 @@ def _channels(state: State, snapshot: Snapshot, settings: Settings, *, width: in
         low, high = float(means[column].low[0]), float(means[column].high[0])
         cells: list[str | Text] = [
             *recorded,
-            level_with_error(float(means[column].mean[0]), high),
+            level_with_error(float(means[column].mean[0]), high, low),
         ]
         if is_full:
             cells.append("?" if math.isnan(cov[column]) else percent(cov[column]))

@@ -45,8 +45,9 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
         if column in alone:
             cells["noise, 95 %"] = Text(PARTNER_WORDS[alone[column]], "bold #ff6b6b")
         elif means:
-            mean, high = float(means[column].mean[0]), float(means[column].high[0])
-            cells["noise, 95 %"] = Text(level_with_error(mean, high))
+            found = means[column]
+            mean, low, high = (float(ends[0]) for ends in (found.mean, found.low, found.high))
+            cells["noise, 95 %"] = Text(level_with_error(mean, high, low))
             cells["SNR, dB"] = Text(_ratio(float(data[column]), mean))
         if not math.isnan(covs[column]):
             cells["known to"] = Text(percent(covs[column]))
