@@ -67,8 +67,10 @@ def level_with_error(psd: float, high: float, low: float = math.nan) -> str:
         return f"below {level(high)}"
     up = decibels(high) - decibels(psd)
     down = up if math.isnan(low) else decibels(psd) - decibels(low)
-    if down < max(ONE_SIDED * up, up + ONE_SIDED_DB):
-        return f"{level(psd)} ±{max(up, down):.2f}"
+    if down < ONE_SIDED * up:
+        return f"{level(psd)} ±{up:.2f}"
+    if down < up + ONE_SIDED_DB:
+        return f"{level(psd)} ±{down:.2f}"
     return f"{level(psd)} +{up:.2f} −{down:.2f}"
 
 
