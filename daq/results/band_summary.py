@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.estimation.noise_estimates import ALL_METHODS
+from estimator.likelihood.gradients import misfit
 from estimator.self_noise.band_means import (
     NORMAL_95,
     BandMeans,
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
 
 AT_BOUND = 0.05
 """Share of frequencies at the bound of zero from which on their mean is not that of the noise."""
+SECOND_ORDER = 2.5
+"""Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation
+(docs/validation/gradients.md)."""
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
@@ -61,8 +66,9 @@ def channel_means(
     """Return the mean noise of every channel in a band, each with its interval.
 
     It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
-    given, its lower end lowered by what the clocks may have added. Where maximum likelihood stands
-    at its bound of zero at many frequencies, the mean is that of a noise constant over the band
+    given, its lower end lowered by what the clocks may have added, and widened by what further
+    dimensions of the motion may have added (`dimension_error`). Where maximum likelihood stands at
+    its bound of zero at many frequencies, the mean is that of a noise constant over the band
     (`estimator.self_noise.quiet_sensor`).
     """
     frequency = snapshot.frequency
@@ -107,7 +113,41 @@ def channel_means(
                 )
                 parts = (mean, (high - low) / (2 * quantile), low - extra, high)
                 means[column] = BandMeans(*(np.array([float(part)]) for part in parts))
-    return tuple(means)
+    share = dimension_error(snapshot, noise.method)
+    if not share.any():
+        return tuple(means)
+    common = share[:, None] * np.nan_to_num(np.abs(noise.noise_psd))
+    errors = quantile * np.average(common[inside], axis=0, weights=width[inside])
+    return tuple(_widened(mean, error) for mean, error in zip(means, errors, strict=True))
+
+
+def dimension_error(snapshot: Snapshot, method: str) -> FloatArray:
+    """Return what further dimensions may bias the noise by, as a share of it, shape (n_freqs,).
+
+    One standard deviation. It is common to the frequencies of a band, so that averaging over them
+    does not reduce it: what gradients of the motion leave unexplained, and the bias of many free
+    factors, which is of second order in the c.o.v. of one frequency. Zero without further
+    dimensions, and with the other methods, which have none.
+    """
+    share = np.zeros(len(snapshot.frequency))
+    if method != "maximum-likelihood":
+        return share
+    for choice in snapshot.diagnostics.dimensions:
+        if choice.n_factors <= choice.usual or not math.isfinite(choice.cov):
+            continue
+        inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
+        share[inside] = (
+            misfit(choice.test, sum(snapshot.dims), snapshot.n_effective)
+            if choice.gradients
+            else SECOND_ORDER * choice.cov**2
+        )
+    return share
+
+
+def _widened(mean: BandMeans, error: float) -> BandMeans:
+    """Return a mean with an error in common added to both halves of its interval."""
+    low = mean.mean - np.hypot(mean.mean - mean.low, error)
+    return replace(mean, low=low, high=mean.mean + np.hypot(mean.high - mean.mean, error))
 
 
 def deviation_at_bound(noise: SelfNoise, column: int) -> FloatArray:

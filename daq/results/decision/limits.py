@@ -23,6 +23,7 @@ from daq.results.band_summary import (
     averages_at,
     correlation_of,
     deviation_at_bound,
+    dimension_error,
     highest_known,
     judged_method,
 )
@@ -33,7 +34,7 @@ from daq.results.partners import without_partners
 from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import SharedNoise
-from estimator.self_noise.band_means import band_means, decision_interval
+from estimator.self_noise.band_means import NORMAL_95, band_means, decision_interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -248,7 +249,7 @@ def _beside(
         low=low,
         high=high,
         added=added,
-        error=_errors(snapshot, centre),
+        error=_errors(snapshot, edges, judged_method(snapshot, settings)),
         averages=averages,
         is_alone=np.array(
             [column in without_partners(snapshot, (f, f)) for f in centre.tolist()], dtype=bool
@@ -257,19 +258,31 @@ def _beside(
     )
 
 
-def _errors(snapshot: Snapshot, centre: FloatArray) -> FloatArray:
+def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str) -> FloatArray:
     """Return what the estimate may be off by in each band, as a share of the noise."""
-    error = np.zeros(centre.shape)
+    if edges.size < 2:
+        return np.empty(0)
+    low, high = snapshot.frequency[edges[:-1]], snapshot.frequency[edges[1:] - 1]
+    centre = np.sqrt(low * high)
+    share = dimension_error(snapshot, method)[: edges[-1]]
+    error = NORMAL_95 * np.maximum.reduceat(share, edges[:-1])
+    explained = np.zeros(centre.shape, np.bool_)
+    for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
+        here = (high >= choice.low) & (low <= choice.high)
+        explained |= here
+        if choice.is_biased or choice.is_undetermined:
+            error = np.where(here, np.inf, error)
     for advice in snapshot.diagnostics.advice:
         if advice.band is None or advice.level is Level.NOTE:
             continue
         here = (centre >= advice.band[0]) & (centre <= advice.band[1])
         if isinstance(advice, ModelMisfit):
+            here &= ~explained
             error = np.where(here, np.maximum(error, advice.error), error)
         elif isinstance(advice, SharedNoise):
             error = np.where(here, np.maximum(error, advice.harm), error)
         elif isinstance(advice, TooFewDimensions):
-            error = np.where(here, np.inf, error)
+            error = np.where(here & ~explained, np.inf, error)
     return error
 
 

@@ -148,6 +148,24 @@ def test_four_sensors_fit_further_dimensions_but_remain_undetermined() -> None:
     assert np.abs(found.noise_psd.mean(axis=0) - 1).max() > 0.2
 
 
+def test_motion_of_too_many_dimensions_is_said_to_bias_the_noise() -> None:
+    """Eleven of fifteen would leave sixteen equations for fifteen unknown noises."""
+    rng = np.random.default_rng(5)
+    loadings = rng.standard_normal((15, 11))
+    csm = np.tile((100 * loadings @ loadings.T + np.eye(15)).astype(complex), (8, 1, 1))
+    averages = wishart(csm, 450, rng)[0]
+    _, (choice,) = choose_dimension(
+        averages,
+        np.arange(1.0, 9.0),
+        dims=FIVE,
+        n_effective=450,
+        band=np.zeros(8, np.int64),
+        neighbours=INDEPENDENT,
+    )
+    assert choice.n_factors == 10
+    assert choice.is_biased
+
+
 def test_a_missing_dimension_is_excluded_and_improves_precision() -> None:
     """Horizontal motion only, triaxial sensors at random orientations."""
     rng = np.random.default_rng(3)

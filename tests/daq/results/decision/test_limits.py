@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
+from daq.results.band_summary import channel_means, dimension_error
 from daq.results.decision.limits import FEWEST_AVERAGES, judge
 from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
+from estimator.likelihood.dimension import BandDimension
+from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tui.output.verdict_text import not_judged
@@ -293,3 +296,51 @@ def test_a_model_is_a_limit_in_any_unit() -> None:
     verdicts = {(each.limit, each.verdict) for each in found.limits}
     # noise of -120 to -110 dB: below -91 dB in part, above -120 dB at 0.8 s, above the NLNM
     assert verdicts == {("loud", Verdict.FAIL), ("quiet", Verdict.FAIL), ("loud", Verdict.PASS)}
+
+
+def with_further_dimensions(cov: float, *, accepted: bool) -> Snapshot:
+    """Five dimensions from 1 to 10 Hz, and what maximum likelihood makes of one motion."""
+    snapshot = made_snapshot(n_effective=1000.0)
+    test = BandTest(1.0, 1.0, 0.5 if accepted else 1e-6, 19)
+    choice = BandDimension(
+        low=1.0,
+        high=10.0,
+        n_factors=5,
+        usual=3,
+        accepted=accepted,
+        test=test,
+        tried=(test,),
+        cov=cov,
+        usual_cov=0.03,
+    )
+    noise = self_noise("maximum-likelihood", snapshot.csm, dims=snapshot.dims, n_effective=1000.0)
+    return replace(
+        snapshot,
+        results={"maximum-likelihood": noise},
+        diagnostics=replace(snapshot.diagnostics, dimensions=(choice,)),
+    )
+
+
+def test_the_error_of_further_dimensions_is_not_averaged_away() -> None:
+    settings = replace(SETTINGS, methods=("maximum-likelihood",))
+    plain, wide = (with_further_dimensions(cov, accepted=True) for cov in (0.0, 0.2))
+    noise = plain.results["maximum-likelihood"]
+    for band, share in (((1.0, 10.0), 0.1), ((20.0, 30.0), 0.0)):  # 2.5 times 0.2 squared
+        (old, *_), (new, *_) = (channel_means(noise, s, settings, band) for s in (plain, wide))
+        assert new.mean == old.mean
+        wanted = math.hypot(old.high[0] - old.mean[0], 1.96 * share * old.mean[0])
+        assert new.high[0] - new.mean[0] == pytest.approx(wanted, rel=1e-3)
+    assert not dimension_error(wide, "three-sensor").any()
+
+
+@pytest.mark.parametrize(("accepted", "verdict"), [(True, Verdict.PASS), (False, None)])
+def test_dimensions_that_do_not_explain_the_averages_decide_nothing(
+    accepted: bool, verdict: Verdict | None
+) -> None:
+    settings = replace(SETTINGS, methods=("maximum-likelihood",))
+    snapshot = with_further_dimensions(0.04, accepted=accepted)
+    found = judge(bench_with(1.2e-11), snapshot, settings)
+    assert found is not None
+    assert found.verdict is (verdict or Verdict.NOT_DECIDED)
+    if verdict is None:
+        assert {each.obstacle for each in found.limits} == {Obstacle.MODEL_MISFIT}
