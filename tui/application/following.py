@@ -36,8 +36,15 @@ from tui.application.recordings_view.view import RecordingsView
 from tui.application.reference import reference_of
 from tui.application.result_view.view import ResultView
 from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
-from tui.application.test_view.plot import PlainMonochrome
 from tui.application.test_view.view import TestView
+from tui.application.themes import (
+    COLOUR_BLIND,
+    NO_COLOUR,
+    THEMES,
+    USUAL,
+    PlainMonochrome,
+    SafeColours,
+)
 from tui.application.view import View
 from tui.output.verdict_text import WORDS
 from tui.runs.catalogue import delete_recording
@@ -80,6 +87,11 @@ class FollowingApp(App[None]):
         driver: type[Driver] | None = None,
     ) -> None:
         super().__init__(driver)
+        for theme in THEMES.values():
+            self.register_theme(theme)
+        self.theme = USUAL
+        for name in self.available_themes.keys() - THEMES.keys():
+            self.unregister_theme(name)
         self._models = models
         self._controls = controls
         self._ended = threading.Event()
@@ -116,12 +128,16 @@ class FollowingApp(App[None]):
         self._ended.set()
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Return what lines go through: without colours, plots as well."""
-        filters = super().get_line_filters()
-        return [
-            HarmlessLines(),
-            *(PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters),
+        """Return what lines go through: harmless, and in the colours of the theme."""
+        filters = [
+            PlainMonochrome() if isinstance(each, Monochrome) else each
+            for each in super().get_line_filters()
         ]
+        if self.theme == COLOUR_BLIND:  # before names of colours become numbers
+            filters.insert(0, SafeColours())
+        elif self.theme == NO_COLOUR:
+            filters.append(PlainMonochrome())
+        return [HarmlessLines(), *filters]
 
     # ---------------------------------------------------------------------- views
 

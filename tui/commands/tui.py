@@ -16,6 +16,7 @@ from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from tui.application.app import HuddleApp
 from tui.application.terminal.ascii_text import is_ascii_only
+from tui.application.themes import THEMES, USUAL
 from tui.commands.tui_controls import BenchControls, RecordingControls, with_comparison
 from tui.output.console import notices
 from tui.output.logs.lines import screen_taken
@@ -116,6 +117,7 @@ def _run(app: HuddleApp, *, again: Path) -> None:
             "the application needs a terminal; huddle watch RECORDING and huddle run BENCH need"
             " none"
         )
+    app.theme = _theme()
     with screen_taken():
         app.run()
     if app.path is None:
@@ -127,6 +129,22 @@ def _run(app: HuddleApp, *, again: Path) -> None:
         )
     else:
         notices().print(f"Recording: {app.path}", soft_wrap=True)
+
+
+def _theme() -> str:
+    """Return the colour theme that HUDDLE_THEME names.
+
+    Raises
+    ------
+    typer.BadParameter
+        There is none of this name.
+    """
+    name = os.environ.get("HUDDLE_THEME", USUAL)
+    if name not in THEMES:
+        raise typer.BadParameter(
+            f"HUDDLE_THEME = {name!r}: no such theme; expected {', '.join(THEMES)}"
+        )
+    return name
 
 
 def show_demo(path: Path, settings: Settings) -> Path | None:
@@ -141,7 +159,9 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
         with screen_taken():
-            HuddleApp(controls, start=True, driver=_driver()).run()
+            app = HuddleApp(controls, start=True, driver=_driver())
+            app.theme = _theme()
+            app.run()
         for recorder in controls.started:
             recorder.stop()
     finally:

@@ -149,6 +149,9 @@ async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
         assert "found nothing" in await press(*"/dev/nothing", "enter")
         assert "new sensor, driver epson" in await press(*["backspace"] * 7, *"tty9", "enter")
         assert app.screen.query_one("#serial_number", Input).value == "S9"
+        app.screen.query_one("#setting-temperature_stabilisation", Input).focus()
+        assert "temperature_stabilisation " in await press("home")  # whole, the longest of all
+        app.screen.query_one("#name", Input).focus()
         assert "port" in await press("D")  # what a field means is with the cursor
         sensitivity = app.screen.query_one("#sensitivity", Input)
         for name, value in (("channels", "X Y Z"), ("sensitivity", "1 2")):

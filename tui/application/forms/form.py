@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 FRAME = 6
 """Rows of the frame, and of what a field means."""
+NARROWEST = 20
+"""Columns for the names of fields, so that most forms look alike."""
 Result = TypeVar("Result")
 
 
@@ -63,11 +65,14 @@ class Form(ModalScreen[Result | None], Generic[Result]):
 
     def compose(self) -> ComposeResult:
         """Lay out a line for each field."""
+        widest = max(len(field.title) for field in self._fields)
         with Vertical(classes="form") as form:
             with VerticalScroll(can_focus=False):
                 for field in self._fields:
                     with Horizontal():
-                        yield Label(field.title)
+                        label = Label(field.title)
+                        label.styles.width = max(NARROWEST, widest + 1)
+                        yield label
                         yield Input(
                             field.value,
                             id=field.name,

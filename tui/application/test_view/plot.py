@@ -6,9 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.segment import Segment
-from rich.style import Style
-from textual.filter import Monochrome
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
@@ -18,8 +15,6 @@ from tui.application.test_view.units import SpectrumUnit
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from textual.color import Color
-
     from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
@@ -28,15 +23,6 @@ LEAST_LAG = 1.0  # µs: what is less is not worth a picture that fills the scree
 SHORT, LONG, DAYS = 2.0, 300.0, 7200.0  # minutes: below seconds, from there on hours, days
 TIME_STEPS = (1 / 60, 1 / 30, 1 / 12, 1 / 6, 0.25, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720)
 LARGE = 2000.0  # µs: above milliseconds
-
-
-class PlainMonochrome(Monochrome):
-    """Takes colours away (NO_COLOR); the canvas of plots has pieces without any style."""
-
-    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
-        """Return the pieces without colours."""
-        styled = [Segment(text, style or Style.null(), to) for text, style, to in segments]
-        return super().apply(styled, background)
 
 
 class FrequencyAxis(AxisFormatter):

@@ -1,0 +1,85 @@
+"""Colour themes: usual, safe for colour-blind eyes, and without colour.
+
+Everything is drawn in the colours of the usual theme. A filter behind the drawing replaces them, so
+that curves, tables and dialogs follow one table. No theme is needed to read a state: each has a
+symbol and a word, and each curve a mark.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+from rich.segment import Segment
+from rich.style import Style
+from textual.filter import LineFilter, Monochrome
+from textual.theme import Theme
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.color import Color as RichColor
+    from textual.color import Color
+
+USUAL, COLOUR_BLIND, NO_COLOUR = "huddle", "colour-blind", "no-colour"
+THEMES: Final = {
+    name: Theme(
+        name=name,
+        primary="#4cc9f0",
+        error="#ff6b6b",
+        foreground="#d5dbe7",
+        background="#10141c",
+        surface="#1b2230",
+        panel="#1b2230",
+    )
+    for name in (USUAL, COLOUR_BLIND, NO_COLOUR)
+}
+SAFE: Mapping[str, str] = {
+    "green": "#56b4e9",
+    "yellow": "#f7f0a0",
+    "red": "#e0461e",
+    "#ff6b6b": "#e0461e",
+    "#4cc9f0": "#56b4e9",
+    "#1d6f8c": "#2b5a75",
+    "#f4a261": "#e69f00",
+    "#8a5a34": "#735000",
+    "#c297ff": "#cc79a7",
+    "#5f4890": "#663d54",
+    "#e9d86b": "#f7f0a0",
+    "#7f7638": "#787221",
+    "#7bd88f": "#009e73",
+    "#3f6d4b": "#004f3a",
+    "#ff7b9c": "#ffffff",
+}
+"""Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart."""
+
+
+class PlainMonochrome(Monochrome):
+    """Takes colours away (NO_COLOR); the canvas of plots has pieces without any style."""
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """Return the pieces without colours."""
+        styled = [Segment(text, style or Style.null(), to) for text, style, to in segments]
+        return super().apply(styled, background)
+
+
+class SafeColours(LineFilter):
+    """Replaces colours that colour-blind eyes take for one another."""
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:  # noqa: ARG002 -- of the seam
+        """Return the pieces in other colours."""
+        return [
+            Segment(text, None if style is None else _safe(style), control)
+            for text, style, control in segments
+        ]
+
+
+@lru_cache(1024)
+def _safe(style: Style) -> Style:
+    colours = (style.color, style.bgcolor)
+    safe = [None if colour is None else SAFE.get(_name(colour)) for colour in colours]
+    return style + Style(color=safe[0], bgcolor=safe[1]) if any(safe) else style
+
+
+def _name(colour: RichColor) -> str:
+    return colour.name if colour.triplet is None else colour.triplet.hex
