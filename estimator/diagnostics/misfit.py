@@ -21,6 +21,8 @@ class SharedNoise(Advice):
         Coherency of the noise of each pair, from -1 to 1.
     errors : tuple of float
         Their standard errors.
+    alternatives : tuple of (int, int)
+        Pairs, of these sensors or of others, one of which may share noise instead.
     three_sensor : float
         Largest bias of the three-sensor noise of any channel, as a fraction of the noise; NaN
         without such an estimate.
@@ -34,6 +36,7 @@ class SharedNoise(Advice):
     channels: tuple[tuple[int, int], ...]
     amounts: tuple[float, ...]
     errors: tuple[float, ...]
+    alternatives: tuple[tuple[int, int], ...]
     three_sensor: float
     maximum_likelihood: float
     channel: int

@@ -289,6 +289,7 @@ def _shared_noise(
             channels=tuple(shared.pairs[n] for n in here),
             amounts=tuple(float(shared.amount[n]) for n in here),
             errors=tuple(float(shared.error[n]) for n in here),
+            alternatives=shared.alternatives,
             three_sensor=_largest(shared.three_sensor),
             maximum_likelihood=_largest(shared.maximum_likelihood),
             channel=int(np.nanargmax(bias)) if np.isfinite(bias).any() else shared.pairs[0][0],

@@ -45,6 +45,9 @@ MAX_BINS = 16
 """Maximum number of frequencies for the effect on the estimates."""
 MAX_SHIFT = 5.0
 """Largest reported bias, in ln of the PSD: the theory is of first order."""
+AS_WELL = 9.0
+"""Decrease of the statistic by another pair, short of that by the named one, that leaves open which
+of them shares noise: the likelihood ratio is then at most 90."""
 MANY = 1e9
 """Number of averages that stands for matrices without scatter."""
 
@@ -63,8 +66,10 @@ class SharedPairs:
         Coherency of the noise of each pair, from -1 to 1.
     error : float64, shape (n_pairs,)
         Its standard error.
+    alternatives : tuple of (int, int)
+        Pairs that would explain the averages about as well as one of `pairs`, in its place.
     three_sensor, maximum_likelihood : float64, shape (n_channels,)
-        Bias of the noise estimates as a fraction of the noise.
+        Bias of the noise estimates as a fraction of the noise, the largest of all alternatives.
     explained : float64, shape (n_bands,)
         Part of the model test's statistic that the pairs explain, in every band.
     """
@@ -73,6 +78,7 @@ class SharedPairs:
     pairs: tuple[tuple[int, int], ...]
     amount: FloatArray
     error: FloatArray
+    alternatives: tuple[tuple[int, int], ...]
     three_sensor: FloatArray
     maximum_likelihood: FloatArray
     explained: FloatArray
@@ -84,6 +90,7 @@ class SharedPairs:
         return replace(
             self,
             pairs=tuple((channels[i], channels[j]) for i, j in self.pairs),
+            alternatives=tuple((channels[i], channels[j]) for i, j in self.alternatives),
             three_sensor=closed,
             maximum_likelihood=likely,
         )
@@ -147,10 +154,23 @@ def shared_noise(
     amount, error = there.amounts(chosen)
     if np.any(np.abs(amount) > 1 + SEEN * error):  # no coherency: the misfit has another cause
         return None
-    amounts = np.zeros(len(there.pairs))
-    amounts[chosen] = amount
+    others = [
+        (step, int(other))
+        for step in range(len(chosen))
+        for other in _alternatives(there, chosen, step)
+    ]
+    choices = [chosen] + [_in_place(chosen, step, other) for step, other in others]
     inside = np.any([bands[n] for n in of_bands], axis=0)
-    closed, likely = _effect(maximum, inside, there, amounts, dims=dims, n_effective=n_effective)
+    closed, likely = (
+        _largest(np.array(biases))
+        for biases in zip(
+            *(
+                _effect(maximum, inside, there, each, dims=dims, n_effective=n_effective)
+                for each in choices
+            ),
+            strict=True,
+        )
+    )
     explained = [
         scores[n].explained(chosen, amount) * inflation if n in of_bands else 0.0
         for n in range(len(bands))
@@ -160,6 +180,9 @@ def shared_noise(
         pairs=tuple((int(i), int(j)) for i, j in there.pairs[chosen]),
         amount=amount,
         error=error,
+        alternatives=tuple(
+            dict.fromkeys((int(i), int(j)) for i, j in there.pairs[[other for _, other in others]])
+        ),
         three_sensor=closed,
         maximum_likelihood=likely,
         explained=np.array(explained),
@@ -217,6 +240,21 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
     return chosen[np.abs(amount) > SEEN * error]
 
 
+def _alternatives(scores: Scores, chosen: IntArray, step: int) -> IntArray:
+    """Return the pairs that explain the scores about as well as one of the chosen pairs."""
+    z = scores.without(np.delete(chosen, step)).z
+    own = float(z[chosen[step]] ** 2)
+    z[chosen] = 0.0
+    return np.flatnonzero((z**2 > own - AS_WELL) & (z**2 > AS_WELL))
+
+
+def _in_place(chosen: IntArray, step: int, other: int) -> IntArray:
+    """Return the chosen pairs with another in the place of one."""
+    changed = chosen.copy()
+    changed[step] = other
+    return changed
+
+
 def _groups(scores: Scores, dims: tuple[int, ...]) -> list[IntArray]:
     """Return the pairs of like channels, and all pairs, of every two sensors."""
     sensor = np.repeat(np.arange(len(dims)), dims)
@@ -256,12 +294,14 @@ def _effect(
     maximum: Maximum,
     inside: BoolArray,
     scores: Scores,
-    amounts: FloatArray,
+    chosen: IntArray,
     *,
     dims: tuple[int, ...],
     n_effective: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the bias of three-sensor and maximum likelihood noise, per channel."""
+    amounts = np.zeros(len(scores.pairs))
+    amounts[chosen] = np.clip(scores.amounts(chosen)[0], -1.0, 1.0)
     rows = np.flatnonzero(inside & usable(maximum, n_effective))
     rows = rows[:: -(-len(rows) // MAX_BINS)]
     psi = maximum.psi[rows]
@@ -282,6 +322,12 @@ def _effect(
         closed = (off - three_sensor(sound, dims=dims, n_effective=MANY).noise_psd) / psi
     likely = np.expm1(np.clip(shift(maximum, rows, scores, amounts), -MAX_SHIFT, MAX_SHIFT))
     return _median(closed), _median(likely)
+
+
+def _largest(biases: FloatArray) -> FloatArray:
+    """Return the number of largest magnitude of each column; NaN without any."""
+    rows = np.argmax(np.nan_to_num(np.abs(biases)), axis=0)
+    return np.asarray(np.take_along_axis(biases, rows[None], axis=0)[0])
 
 
 def _median(values: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Bias, scatter and coverage of the estimates, and what the diagnosis finds.
+"""Bias, scatter and coverage of the estimates.
 
 Every point has averages of its own, drawn from known matrices of sensors that point anyhow.
 """
@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from estimator.diagnostics.shared_noise import shared_noise
-from estimator.likelihood.dimension import bands
-from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.fisher import cramer_rao_cov
 from estimator.methods import self_noise
 from estimator.noise_parameters.fit import fit, terms_at
@@ -45,7 +42,7 @@ INDEPENDENT = np.eye(1, 8)[0]
 _STUDY: TypeAlias = "Callable[[ProgressCallback, float], Study]"
 
 
-def _share(x: float, hits: float, n: float, expected: float, allowed: float) -> Point:
+def share(x: float, hits: float, n: float, expected: float, allowed: float) -> Point:
     """Return a share of n independent outcomes beside what is expected of it."""
     error = float(np.sqrt(max(expected * (1 - expected), 0.25 / n) / n))
     return Point(x, hits, expected, error, allowed)
@@ -69,7 +66,7 @@ def coverage(told: ProgressCallback, length: float) -> Study:
             covers = ((found.low < 1) & (found.high > 1))[known].mean()
             # Channels of a sensor share little, those of three sensors half of their scatter.
             allowed = COVERS if snr >= 1 else WIDER
-            series[method].append(_share(x, float(covers), 3 * n_draws, NOMINAL, allowed))
+            series[method].append(share(x, float(covers), 3 * n_draws, NOMINAL, allowed))
     return Study(
         "coverage",
         f"Coverage of the intervals of 95 %, {n_draws} draws a point",
@@ -173,9 +170,9 @@ def quiet(told: ProgressCallback, length: float) -> Study:
             )
         noise, low, high = np.array(found).swapaxes(0, 1)
         covers = float(((low < 1) & (high > 1)).mean())
-        points.append(_share(snr, covers, 3 * n_draws, NOMINAL, COVERS))
+        points.append(share(snr, covers, 3 * n_draws, NOMINAL, COVERS))
         below = float((noise < 1).mean())
-        biases.append(_share(snr, below, 3 * n_draws, 0.5, 0.0))
+        biases.append(share(snr, below, 3 * n_draws, 0.5, 0.0))
     return Study(
         "quiet",
         f"A quiet sensor among noisy ones, {n_draws} draws a point",
@@ -229,77 +226,6 @@ def unequal(told: ProgressCallback, length: float) -> Study:
     )
 
 
-CASES = (
-    ("3 % in one pair", ((0, 3),), 0.03, 480),
-    ("10 % in one pair", ((0, 3),), 0.1, 480),
-    ("10 % within a sensor", ((0, 1),), 0.1, 480),
-    ("10 % in all pairs of two sensors", ((0, 3), (1, 4), (2, 5)), 0.1, 480),
-)
-"""Of item 13, besides sound tests."""
-
-
-def shared(told: ProgressCallback, length: float) -> Study:
-    """Noise that channels share: named rightly, and not where there is none."""
-    n, n_tests, n_sound = 226, max(10, round(40 * length)), max(20, round(400 * length))
-    named, amounts = [], []
-
-    def found_in(
-        rng: np.random.Generator, pairs: tuple[tuple[int, int], ...], amount: float, n_freqs: int
-    ) -> tuple[set[tuple[int, int]], float]:
-        true = bench(rng, snr=1e3, shared=pairs, coherency=amount)
-        csm = averaged(np.broadcast_to(true, (n_freqs, 9, 9)), n, rng)
-        number = bands(np.linspace(1, 60, n_freqs))
-        found = shared_noise(
-            maximise(csm, 3),
-            [number == b for b in np.unique(number)],
-            dims=(3, 3, 3),
-            n_effective=n,
-            neighbours=np.zeros(0),
-        )
-        return (set(), 0.0) if found is None else (set(found.pairs), float(found.amount.mean()))
-
-    for number, (what, pairs, amount, n_freqs) in enumerate(CASES):
-        told(f"shared noise: {what}", 0.0)
-        rng = np.random.default_rng([25, number])
-        outcomes = [found_in(rng, pairs, amount, n_freqs) for _ in range(n_tests)]
-        right = np.array([each == set(pairs) for each, _ in outcomes])
-        sizes = np.array([size for each, size in outcomes if each == set(pairs)])
-        named.append(_share(number + 1, float(right.mean()), n_tests, 1.0, 0.05))
-        error = float(sizes.std(ddof=1) / np.sqrt(len(sizes)))
-        amounts.append(Point(number + 1, float(sizes.mean()), amount, error, 0.02 * amount))
-    rng = np.random.default_rng(25)
-    accused = 0
-    for number in range(n_sound):
-        told("shared noise: sound tests", number / n_sound)
-        accused += bool(found_in(rng, (), 0.0, 120)[0])
-    alarms = _share(0, accused / n_sound, n_sound, 0.01, 0.005)
-    x_label = "case (1)"
-    return Study(
-        "shared-noise",
-        f"Shared noise: {n_tests} tests of each of 4 cases, {n_sound} sound tests",
-        (
-            Panel(
-                "(a) named, with the right pairs and no other",
-                x_label,
-                "share of tests (1)",
-                (Series("named rightly", "score test", "share", tuple(named)),),
-            ),
-            Panel(
-                "(b) coherency of the noise",
-                x_label,
-                "coherency (1)",
-                (Series("amount", "score test", "bias", tuple(amounts)),),
-            ),
-            Panel(
-                "(c) false alarms at 1 %",
-                x_label,
-                "share of sound tests (1)",
-                (Series("accused", "score test", "share", (alarms,)),),
-            ),
-        ),
-    )
-
-
 TERMS = np.array([2e-13, 5e-12, 1e-12, 2e-16])
 """Random walk, flicker, white and f² at 1 Hz."""
 
@@ -335,7 +261,7 @@ def noise_terms(told: ProgressCallback, length: float) -> Study:
                         "terms",
                         "share",
                         tuple(
-                            _share(k, float(c), n_draws, NOMINAL, COVERS)
+                            share(k, float(c), n_draws, NOMINAL, COVERS)
                             for k, c in enumerate(covers)
                         ),
                     ),
@@ -370,6 +296,5 @@ ESTIMATES: Mapping[str, _STUDY] = {
     "many-sensors": many_sensors,
     "quiet": quiet,
     "unequal": unequal,
-    "shared-noise": shared,
     "noise-terms": noise_terms,
 }

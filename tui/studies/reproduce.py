@@ -21,6 +21,7 @@ from tui.studies.gradients import gradients
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.responses import calibration, edges
+from tui.studies.shared_noise import SHARED_NOISE, shared
 from tui.studies.study import TOLERANCE
 from tui.studies.verdicts import verdicts
 
@@ -38,7 +39,7 @@ RESPONSES = {
     "gradients": gradients,
     "clock-coverage": clock_coverage,
 }
-STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, *RESPONSES)
+STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, SHARED_NOISE, *RESPONSES)
 ALL = "all"
 DEFAULT_FOLDER = Path("reproduced")
 
@@ -78,6 +79,8 @@ def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> I
             yield clocks(told, length=length)
         elif name == VERDICTS:
             yield verdicts(told, length=length)
+        elif name == SHARED_NOISE:
+            yield shared(told, length)
         elif name in ESTIMATES:
             yield ESTIMATES[name](told, length)
         elif name in RESPONSES:

@@ -65,6 +65,13 @@ def test_pairs_are_reported_with_their_amount(
         assert error < 0.02
 
 
+def test_pairs_that_the_averages_cannot_tell_apart_are_said() -> None:
+    """Of these directions, another pair explains the averages better by chance."""
+    (advice,) = found_in(averages(np.random.default_rng(24), ((0, 3),), 0.05))
+    assert advice.channels == ((6, 8),)
+    assert (0, 3) in advice.alternatives
+
+
 def test_the_effect_on_the_estimates_is_that_of_the_true_matrices() -> None:
     """Within a sensor the three-sensor estimate has no bias at all."""
     rng = np.random.default_rng(8)

@@ -21,7 +21,7 @@ def _shared_noise(advice: SharedNoise, names: Names) -> Explanation:
     amounts = [
         f"{pair} {100 * amount:.2g} ± {100 * error:.1g} %"
         for pair, amount, error in zip(
-            _pairs(advice, names), advice.amounts, advice.errors, strict=True
+            _pairs(advice.channels, names), advice.amounts, advice.errors, strict=True
         )
     ]
     whose = (
@@ -29,15 +29,19 @@ def _shared_noise(advice: SharedNoise, names: Names) -> Explanation:
         if within
         else f"Sensors {names.list_sensors(advice.sensors)}"
     )
+    others = _pairs(advice.alternatives, names)
+    instead = (
+        f" It may be {listed(others, 'or')} instead: these averages cannot tell." if others else ""
+    )
     return Explanation(
-        f"{whose} share noise at {where(advice)} ({', '.join(amounts)} of the noise). "
+        f"{whose} share noise at {where(advice)} ({', '.join(amounts)} of the noise).{instead} "
         f"{_effect(advice, names)}",
         "Check what these channels have in common: digitizer, power supply, ground, cable, mount.",
     )
 
 
-def _pairs(advice: SharedNoise, names: Names) -> list[str]:
-    return [f"{names.channels[one]} and {names.channels[other]}" for one, other in advice.channels]
+def _pairs(pairs: tuple[tuple[int, int], ...], names: Names) -> list[str]:
+    return [f"{names.channels[one]} and {names.channels[other]}" for one, other in pairs]
 
 
 def _effect(advice: SharedNoise, names: Names) -> str:
@@ -101,4 +105,5 @@ def _alert(advice: SharedNoise, names: Names) -> str:
     harm = (
         "" if advice.level is Level.NOTE else f", which biases estimates by {percent(advice.harm)}"
     )
-    return f"{listed(_pairs(advice, names))} share noise{harm}"
+    pairs = _pairs(advice.channels + advice.alternatives, names)
+    return f"{listed(pairs, 'or' if advice.alternatives else 'and')} share noise{harm}"

@@ -86,6 +86,7 @@ SHARED = SharedNoise(
     channels=((0, 3), (1, 4)),
     amounts=(0.1, -0.08),
     errors=(0.004, 0.003),
+    alternatives=((0, 5), (2, 3)),
     three_sensor=-0.07,
     maximum_likelihood=0.06,
     channel=3,
@@ -94,6 +95,7 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
     (
         SHARED,
         (
+            "It may be a.x and b.z or a.z and b.x instead: these averages cannot tell.",
             "Sensors a and b share noise at 2–8 Hz (a.x and b.x 10 ± 0.4 %, a.y and b.y -8 ± 0.3 %",
             "The three-sensor noise is too low by up to 7 % and the maximum likelihood noise is",
             "too high by up to 6 % (worst in b.x)",
