@@ -7,6 +7,7 @@ the channels of sensor j by those of sensor i.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,12 +18,13 @@ from estimator.self_noise.coherency import check_dims, check_frequency, coherenc
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+    from estimator.types import ComplexArray, FloatArray, IntArray
 
 MIN_COHERENCE = 0.5
 """Frequencies with a lower coherence are not used: their phase could bias the delay."""
 _STEPS = 4  # steps of least squares from the coarse delay
 _PARTS = 8  # parts of the band, for the scatter of the angles
+_MIN_PARTS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,16 +256,11 @@ def relative_response(
     S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
     matrix = _transfer(weight, S_ik, S_jk)
     horizontal = _horizontal_channels(d, vertical)
-    parts = [
-        _angles(_transfer(weight[part], S_ik[part], S_jk[part]), horizontal)
-        for part in _parts(weight)
-    ]
     rotation, reversed_channels = _rotation(matrix)
     gains = np.linalg.norm(matrix, axis=1)
     directions = matrix / gains[:, None]
     between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
     rotation_deg, horizontal_deg = _angles(matrix, horizontal)
-    error = np.array(parts).std(axis=0, ddof=1).max() / np.sqrt(len(parts)) if parts else np.nan
     return RelativeResponse(
         first=first,
         second=second,
@@ -273,7 +270,7 @@ def relative_response(
         rotation=rotation,
         rotation_deg=rotation_deg,
         horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
-        angle_error_deg=float(error),
+        angle_error_deg=_angle_error(weight, S_ik, S_jk, horizontal),
         gains=gains,
         nonorthogonality_deg=float(np.abs(between).max()),
         reversed_channels=reversed_channels,
@@ -366,8 +363,28 @@ def _angles(matrix: FloatArray, horizontal: tuple[int, int] | None) -> tuple[flo
     return whole, float(np.rad2deg(np.arctan2(-sign * matrix[one, two], sign * matrix[one, one])))
 
 
-def _parts(weight: FloatArray) -> list[BoolArray]:
-    """Return parts of the band with equal total weight, each with at least a few frequencies."""
+def _angle_error(
+    weight: FloatArray,
+    S_ik: ComplexArray,
+    S_jk: ComplexArray,
+    horizontal: tuple[int, int] | None,
+) -> float:
+    """Return the larger standard error of the two angles, degrees; NaN with few frequencies.
+
+    By the scatter between parts of the band of equal weight. Where single frequencies weigh too
+    much for that, as in microseism, by a jackknife that leaves out one part at a time.
+    """
     share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
-    parts = [share == number for number in range(_PARTS)]
-    return parts if len(weight) >= 4 * _PARTS and all(part.sum() for part in parts) else []
+    parts = [share == number for number in np.unique(share)]
+    n = len(parts)
+    if len(weight) < 4 * _PARTS or n < _MIN_PARTS:
+        return math.nan
+    whole = n == _PARTS
+    angles = np.array(
+        [
+            _angles(_transfer(weight[part], S_ik[part], S_jk[part]), horizontal)
+            for part in (parts if whole else [~part for part in parts])
+        ]
+    )
+    scatter = float(angles.std(axis=0, ddof=1).max())
+    return scatter / math.sqrt(n) if whole else scatter * (n - 1) / math.sqrt(n)
