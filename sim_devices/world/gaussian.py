@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from scipy import fft
 
+from sim_devices.world.tables import LONGEST_BLOCK
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
 
 _Kept = TypeVar("_Kept")
 
-LONGEST_BLOCK = 2**16
 LARGEST_SPECTRUM = 2**19  # n_sources × n_samples: limits the memory of a field of many waves
 
 
@@ -34,11 +35,15 @@ class WhiteSources:
         Two numbers that identify the sources: a seed, and its use.
     n_sources
         Number of sources.
+    longest_block
+        Samples of a block, a power of two; fewer where there are many sources.
     """
 
-    def __init__(self, key: tuple[int, int], n_sources: int) -> None:
+    def __init__(
+        self, key: tuple[int, int], n_sources: int, longest_block: int = LONGEST_BLOCK
+    ) -> None:
         self.n_sources = n_sources
-        self.block = min(LONGEST_BLOCK, 2 ** ((LARGEST_SPECTRUM // n_sources).bit_length() - 1))
+        self.block = min(longest_block, 2 ** ((LARGEST_SPECTRUM // n_sources).bit_length() - 1))
         self._key = np.array(key, dtype=np.uint64)
         self._samples: dict[int, FloatArray] = {}
         self._spectra: dict[int, ComplexArray] = {}
@@ -85,12 +90,14 @@ class GaussianSeries:
         block = sources.block
         frequency = fft.rfftfreq(2 * block, 1 / sampling_rate)
         amplitude = np.sqrt(sampling_rate / 2) * response(frequency)  # white unit variance: 2 / fs
-        impulse = fft.irfft(np.moveaxis(amplitude, 0, -1), 2 * block)
-        impulse = np.roll(impulse, block // 2, axis=-1)  # lag −block/2 comes first
-        impulse[..., block:] = 0
-        impulse[..., :block] *= _faded(block)
-        self._filters: ComplexArray = fft.rfft(impulse)
-        self._used = [np.flatnonzero(np.any(row, axis=1)) for row in self._filters]
+        self._used = [np.flatnonzero(row) for row in np.any(amplitude, axis=0)]
+        self._filters: list[ComplexArray] = []
+        for output, used in enumerate(self._used):
+            impulse = fft.irfft(amplitude[:, output, used].T, 2 * block)
+            impulse = np.roll(impulse, block // 2, axis=-1)  # lag −block/2 comes first
+            impulse[:, block:] = 0
+            impulse[:, :block] *= _faded(block)
+            self._filters.append(fft.rfft(impulse))
         self._blocks: dict[int, FloatArray] = {}
 
     @property
@@ -116,7 +123,7 @@ class GaussianSeries:
             white = self._sources.spectrum(index)
             shaped = np.empty((self.n_outputs, white.shape[1]), dtype=complex)
             for row, (filters, used) in enumerate(zip(self._filters, self._used, strict=True)):
-                np.einsum("sf,sf->f", filters[used], white[used], out=shaped[row])
+                np.einsum("sf,sf->f", filters, white[used], out=shaped[row])
             both = fft.irfft(shaped, 2 * self._sources.block)
             _keep(self._blocks, index, both[:, self._sources.block :])
         return self._blocks[index]

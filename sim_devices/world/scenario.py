@@ -46,13 +46,13 @@ A field of plane waves instead of one common motion; distant sensors are not coh
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError, model_validator
 
 from sim_devices.errors import ScenarioError
-from sim_devices.world.tables import USABLE, MotionModel, SensorModel, Table
+from sim_devices.world.tables import LONGEST_BLOCK, USABLE, MotionModel, SensorModel, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -71,6 +71,8 @@ class Scenario(Table):
     seed: NonNegativeInt = 0
     motion: MotionModel
     sensors: dict[str, SensorModel] = Field(min_length=1)
+    longest_block: Literal[4096, 65536] = LONGEST_BLOCK
+    """Grid samples computed at once; 4096, for smooth spectra, is quicker to begin."""
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], *, sampling_rate: float | None = None) -> Scenario:

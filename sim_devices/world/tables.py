@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 from pydantic import (
     BaseModel,
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 USABLE = 0.9
 """The motion ends at this fraction of the lowest Nyquist frequency."""
+LONGEST_BLOCK: Final = 65536
+"""Grid samples computed at once by default: spectra are as wanted at the resolution of half."""
 
 
 class Table(BaseModel):

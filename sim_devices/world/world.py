@@ -62,7 +62,7 @@ class World:
         n_sources = (
             plane_waves.n_sources(motion) if isinstance(motion, PlaneWaves) else len(motion.spectra)
         )
-        self._sources = WhiteSources((scenario.seed, 0), n_sources)
+        self._sources = WhiteSources((scenario.seed, 0), n_sources, scenario.longest_block)
         self._motions: dict[str, Motion] = {}
         self._noises: dict[str, GaussianSeries] = {}
         self._clocks: dict[str, SampleClock] = {}
@@ -97,7 +97,9 @@ class World:
         if sensor not in self._noises:
             spectra = self._scenario.noise_spectra(sensor)
             self._noises[sensor] = GaussianSeries(
-                WhiteSources(self._key(sensor, "noise"), len(spectra)),
+                WhiteSources(
+                    self._key(sensor, "noise"), len(spectra), self._scenario.longest_block
+                ),
                 lambda f: _diagonal(np.sqrt([spectrum.psd(f) for spectrum in spectra])),
                 sampling_rate=self._scenario.sensors[sensor].sampling_rate,
             )

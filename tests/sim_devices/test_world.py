@@ -27,7 +27,7 @@ def white(level: float) -> dict[str, Any]:
 
 def scenario(sensors: dict[str, dict[str, Any]], **motion: Any) -> Scenario:  # noqa: ANN401  # a table
     motion = motion or {"spectra": [white(1.0)] * 3}
-    table = {"seed": 11, "motion": motion, "sensors": sensors}
+    table = {"seed": 11, "motion": motion, "sensors": sensors, "longest_block": 4096}
     return Scenario.from_dict(table, sampling_rate=RATE)
 
 
@@ -53,12 +53,15 @@ def test_motion_and_noise_have_the_requested_psd_within_statistical_error() -> N
                                               "damping": 0.02}]},
     ]  # fmt: skip
     still = {"spectra": [white(0.0)] * 3}
-    moved = scenario({"A": {}}, spectra=spectra)
-    noisy = Scenario.from_dict(
-        {"seed": 1, "motion": still, "sensors": {"A": {"noise": spectra}}}, sampling_rate=RATE
+    moved, noisy = (
+        Scenario.from_dict({"seed": 11, "motion": motion, "sensors": sensors}, sampling_rate=RATE)
+        for motion, sensors in (
+            ({"spectra": spectra}, {"A": {}}),
+            (still, {"A": {"noise": spectra}}),
+        )
     )
     for model in (moved, noisy):
-        frequency, matrix, n = csm(*World(model).samples("A", 0, 800_000).T)
+        frequency, matrix, n = csm(*World(model).samples("A", 0, 400_000).T)
         for low, high in ((0.3, 1.0), (1.0, 7.0), (7.0, 9.0), (9.0, 60.0), (60.0, 89.0)):
             band = (frequency >= low) & (frequency < high)
             for channel, spectrum in enumerate(noisy.noise_spectra("A")):
