@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from daq.bench.model import Sensor
     from sim_devices.server.launch import RunningDevice
 
-RATE = 200.0
+RATE = 100.0
 XYZ = ("x", "y", "z")
 POLLED: dict[str, Any] = {"driver": "registers", "sampling_rate": 20.0}
 SEEDLINK: dict[str, Any] = {"driver": "seedlink", "port": "tcp"}

@@ -39,7 +39,8 @@ SPACING = 2.0
 """Between two faults of one device, s; and beyond it, where a device may have to be set up anew:"""
 SLOWER = {"registers rtu": 3.0}
 """Instead, where a reply that is lost is waited for so long."""
-LONGER = {"merge": 2.0, "stall": 3.0, "overflow": 2.0, "reset": 4.0, "disconnect": 9.0}
+LONGER = {"merge": 2.0, "stall": 3.0, "overflow": 2.0, "reset": 8.0, "disconnect": 9.0}
+"""After a reset so long that the next fault meets a device that sends again."""
 KINDS = {
     "connected", "disconnected", "late", "stalled", "resynchronised", "checksum", "reset",
     "overflow", "status", "refused",

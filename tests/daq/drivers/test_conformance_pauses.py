@@ -40,8 +40,11 @@ MODES = [
     if case["driver"] not in {"registers", "fifo"} and case.get("port") != "udp"
 ]
 """Not those that are asked for each sample, nor those whose messages nobody keeps."""
-BEGIN, SPACING = 20.0, 12.0
-ROUND = SPACING * (len(PAUSES) + 1)
+BEGIN, SPACING = 12.0, 3.0
+"""World time of the first pause, and between a pause and the next, s."""
+DURATIONS = (*PAUSES, TOO_LONG)
+STARTS = tuple(itertools.accumulate((d + SPACING for d in DURATIONS[:-1]), initial=BEGIN))
+ROUND = sum(DURATIONS) + SPACING * len(DURATIONS)
 PACKET = 200
 """Samples of the two largest units that a device of these modes sends: records of SeedLink."""
 
@@ -51,13 +54,13 @@ def script() -> list[dict[str, object]]:
         {
             "kind": "pause",
             "sensors": CASES[mode].get("sensors", [f"{mode} 1"]),
-            "at": BEGIN + SPACING * turn,
+            "at": start,
             "every": ROUND,
             "duration": duration,
             "level": BUFFER,
         }
         for mode in MODES
-        for turn, duration in enumerate((*PAUSES, TOO_LONG))
+        for start, duration in zip(STARTS, DURATIONS, strict=True)
     ]
 
 
@@ -102,7 +105,7 @@ def test_samples_kept_by_a_pausing_device_are_recorded(
                     continue
                 with subtests.test(sensor=sensor.name):
                     pauses = [s for s in served.struck(mode) if s["at"] > begun]
-                    assert {s["duration"] for s in pauses} == {*PAUSES, TOO_LONG}
+                    assert {s["duration"] for s in pauses} == set(DURATIONS)
                     events = [(e.kind, e.text) for e in recording.events if e.sensor == sensor.name]
                     kinds = [kind for kind, _ in events]
                     assert kinds.count("connected") == 1, events
