@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
     from daq.results.uncertainty_budget import Budget, Component
-    from estimator.responses.calibration import SensorCalibration, Value
+    from estimator.responses.calibration import SensorCalibration
+    from estimator.responses.derived_quantities import Value
 
 Rows = tuple[tuple[str, ...], ...]
 _LEAST_SHOWN = 1e-5

@@ -1,0 +1,319 @@
+"""Snapshots of an estimate: what its passes through the recordings show by now."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
+from daq.estimation.noise_estimates import (
+    Dimensions,
+    Estimates,
+    averages,
+    in_units,
+    known_gains,
+    known_positions,
+    noise_estimates,
+    quantisation_psd,
+    up_to,
+)
+from daq.estimation.recording_set import is_complete
+from daq.estimation.segment_course import segment_course
+from daq.estimation.segments.clipping import clipped_columns
+from daq.estimation.segments.segment_pass import still_for_a_while
+from daq.estimation.snapshot import (
+    Bridged,
+    ChannelLabel,
+    NoSegment,
+    Octave,
+    SensorTotals,
+    Snapshot,
+)
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, added
+from daq.estimation.throttle import Throttle
+from estimator.spectra.segment_rejection import Reason
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daq.estimation.equalisation import Equalisation
+    from daq.estimation.noise_estimates import Channels
+    from daq.estimation.segments.segment_pass import Pass
+    from daq.estimation.settings import Settings
+    from daq.recording.interface import ReadableRecording
+    from estimator.self_noise.result import SelfNoise
+    from estimator.spectra.multiresolution import Band
+
+_RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
+_DIAGNOSIS_SHARE = 0.01  # of the time, that diagnoses of a growing recording may take
+_SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
+
+
+class SnapshotBuilder:
+    """Makes the snapshots of one estimate.
+
+    A growing recording is diagnosed only as often as the cost allows, and the dimension of its
+    motion is chosen again only after it has grown; in between, the last results are kept.
+
+    Parameters
+    ----------
+    settings : Settings
+    unit : str
+        Of the motion.
+    channels : sequence of (str, Channel)
+    equalisation : Equalisation
+        Of the passes.
+
+    Raises
+    ------
+    WrongSettingError
+        If a gain does not fit the sensors.
+    """
+
+    def __init__(
+        self, settings: Settings, unit: str, channels: Channels, equalisation: Equalisation
+    ) -> None:
+        self._settings, self._unit, self._equalisation = settings, unit, equalisation
+        self._gains = known_gains(settings, channels)
+        self._dimensions: Dimensions | None = None
+        self._findings = Findings()
+        self._diagnoses = Throttle(_DIAGNOSIS_SHARE)
+        self._chosen_at = 0
+
+    def build(
+        self, recordings: Sequence[ReadableRecording], passes: Sequence[Pass], *, final: bool
+    ) -> Snapshot:
+        """Return the estimate from the segments taken so far.
+
+        Parameters
+        ----------
+        recordings : sequence of ReadableRecording
+        passes : sequence of Pass
+            One for each recording.
+        final : bool
+            Whether these are all segments there will be: the diagnosis is then made in any case.
+        """
+        first, last = passes[0], passes[-1]
+        dims, channels = first.aligned.dims, first.aligned.channels
+        usable = min(each.aligned.usable for each in passes)
+        raw = averages(passes)
+        bands = tuple(
+            in_units(
+                up_to(band, usable),
+                channels,
+                self._unit,
+                self._equalisation.response(band.frequencies),
+            )
+            for band in raw
+        )
+        if bands:
+            frequency = np.concatenate([band.frequencies for band in bands])
+            csm = np.concatenate([band.csm for band in bands])
+        else:
+            frequency = first.welch.frequencies
+            shape = (len(frequency), first.n_channels, first.n_channels)
+            csm = np.full(shape, np.nan, dtype=np.complex128)
+        n_segments = sum(each.n_segments for each in passes)
+        n_effective = bands[-1].n_effective if bands else 0.0
+        estimates = self._estimates(bands, recordings[0], first, n_segments, final=final)
+        latest = recordings[-1]
+        events = latest.events
+        diagnostics = SnapshotDiagnostics(
+            synchronisation=synchronisation(
+                last.aligned.clocks,
+                last.aligned.is_reference,
+                last.moved(),
+                dims=dims,
+                frequency=frequency,
+                csm=csm,
+                results=estimates.results,
+            ),
+            dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
+        )
+        if final or self._diagnoses.is_due:
+            with self._diagnoses:
+                self._findings = self._diagnose(recordings, passes, raw, bands, estimates)
+        if self._findings.fits(frequency):
+            diagnostics = self._findings.added_to(diagnostics)
+        too_much = added(diagnostics, estimates.results)
+        gaps = _bridged(passes, estimates.results)
+        return Snapshot(
+            frequency=frequency,
+            csm=csm,
+            results={
+                name: _widened(
+                    found if too_much is None else replace(found, low=found.low - too_much), gaps
+                )
+                for name, found in estimates.results.items()
+            },
+            refused=estimates.refused,
+            channels=tuple(
+                ChannelLabel(sensor, channel.name, self._unit) for sensor, channel in channels
+            ),
+            dims=dims,
+            unit=self._unit,
+            n_segments=n_segments,
+            n_dropped=sum(each.n_seen for each in passes) - n_segments,
+            n_effective=n_effective,
+            elapsed=sum(each.elapsed for each in passes),
+            start_utc_ns=first.aligned.start_utc_ns,
+            sensors=tuple(SensorTotals.of(record, events) for record in latest.sensors),
+            clocks=last.aligned.clocks,
+            drift=last.drift(),
+            closed=all(map(is_complete, recordings, (*recordings[1:], None))),
+            left_out=_left_out(passes),
+            octaves=tuple(map(Octave.of, bands)) if self._settings.octaves else (),
+            diagnostics=diagnostics,
+            no_segment=_no_segment(passes, self._settings.segment),
+            bridged=gaps,
+            quantisation_psd=(
+                quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
+                if final
+                else None
+            ),
+        )
+
+    def _diagnose(
+        self,
+        recordings: Sequence[ReadableRecording],
+        passes: Sequence[Pass],
+        raw: tuple[Band, ...],
+        bands: tuple[Band, ...],
+        estimates: Estimates,
+    ) -> Findings:
+        """Say what the averages show of the test itself: costly, and so not at every snapshot."""
+        dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
+        clipped = clipped_columns(recordings, channels)
+        stood_still = still_for_a_while(passes, self._settings)
+        found = diagnosis(
+            bands,
+            dims,
+            channels,
+            dimensions=estimates.dimensions,
+            faulty={*clipped, *stood_still},
+            course=segment_course(passes, channels, self._unit),
+        )
+        edges = self._equalisation.leakage(raw, channels, self._unit)
+        return Findings.of(
+            found, edges, bands=bands, dims=dims, clipped=clipped, stood_still=stood_still
+        )
+
+    def _estimates(
+        self,
+        bands: tuple[Band, ...],
+        recording: ReadableRecording,
+        first: Pass,
+        n_segments: int,
+        *,
+        final: bool,
+    ) -> Estimates:
+        """Estimate; while following, the dimension is chosen anew when segments have grown."""
+        if not bands:
+            return Estimates({}, {}, None)
+        keep = not final and n_segments < _RECHOICE * self._chosen_at
+        estimates = noise_estimates(
+            bands,
+            self._settings,
+            dims=first.aligned.dims,
+            gains=self._gains,
+            dimensions=self._dimensions if keep and self._fits(bands) else None,
+            positions=known_positions(recording, first.aligned.channels),
+        )
+        if estimates.dimensions is not self._dimensions:
+            self._dimensions, self._chosen_at = estimates.dimensions, n_segments
+        return estimates
+
+    def _fits(self, bands: tuple[Band, ...]) -> bool:
+        """Whether the dimensions chosen before are for the same frequencies."""
+        before = () if self._dimensions is None else self._dimensions.n_factors
+        return [len(n_factors) for n_factors in before] == [len(each.frequencies) for each in bands]
+
+
+def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridged | None:
+    """Return how many segments with gaps count, and what their windows bring in."""
+    with_gaps = [(each, each.leakage) for each in passes if each.n_bridged]
+    if not with_gaps or not results:
+        return None
+    noise = next(iter(results.values())).noise_psd
+    counts = np.array([each.n_bridged for each, _ in with_gaps])
+    leakages = [leakage for _, leakage in with_gaps if leakage is not None]
+    total = sum(each.n_segments for each in passes)
+    biases = np.array([each.bias(noise) for each in leakages])
+    return Bridged(
+        n_segments=int(counts.sum()),
+        lost=float(np.average([each.lost for each in leakages], weights=counts)),
+        leakage=np.einsum("r,rfc->fc", counts / total, biases),
+    )
+
+
+def _widened(result: SelfNoise, found: Bridged | None) -> SelfNoise:
+    """Return an estimate whose interval includes what segments with gaps bring in."""
+    if found is None:
+        return result
+    psd = np.abs(result.noise_psd)
+    too_high = np.clip(np.nan_to_num(found.leakage), 0.0, 1.0) * psd
+    too_low = np.clip(np.nan_to_num(-found.leakage), 0.0, 1.0) * psd
+    return replace(result, low=result.low - too_high, high=result.high + too_low)
+
+
+def _counting_rates(recording: ReadableRecording) -> dict[str, float]:
+    """Return the rates of the sensors whose samples are whole numbers, in Hz."""
+    return {
+        record.name: record.sampling_rate
+        for record in recording.sensors
+        if record.n_samples and record.counts(0, 1).dtype.kind in "iu"
+    }
+
+
+def _left_out(passes: Sequence[Pass]) -> dict[Reason, int]:
+    counts: Counter[Reason] = Counter()
+    for each in passes:
+        counts.update(each.left_out)
+        counts[Reason.GAP] -= each.n_bridged
+    dropped = sum(each.n_seen - each.n_segments for each in passes)
+    counts[Reason.TRANSIENT] = dropped - counts.total()
+    return {reason: counts[reason] for reason in Reason}
+
+
+def _no_segment(passes: Sequence[Pass], segment: float) -> NoSegment | None:
+    stretches = passes[-1].aligned.longest_stretches
+    if sum(each.n_segments for each in passes) or not stretches:
+        return None
+    if sum(each.n_seen for each in passes) < _SEGMENTS_MISSED:
+        return None
+    left_out = _left_out(passes)
+    sensor = min(stretches, key=lambda name: stretches[name])
+    return NoSegment(
+        max(left_out, key=lambda reason: left_out[reason]),
+        segment,
+        sensor,
+        stretches[sensor],
+    )
+
+
+def why_nothing(
+    recordings: Sequence[ReadableRecording],
+    passes: Sequence[Pass],
+    snapshot: Snapshot,
+    *,
+    segment: float,
+) -> str:
+    """Return the reason why no channel has an estimate."""
+    names = ", ".join(str(recording.path) for recording in recordings)
+    if snapshot.n_segments == 0:
+        available = sum(each.aligned.n_available for each in passes)
+        seconds = available / passes[0].welch.sampling_rate
+        return (
+            f"{names}: not one whole segment: {seconds:.3g} s with all"
+            f" sensors, {snapshot.n_dropped} segments left out (gaps, clipping), and a segment"
+            f" takes {segment:g} s; record longer or choose a shorter segment"
+        )
+    if snapshot.results:
+        return (
+            f"{names}: no channel's noise can be estimated at any frequency by "
+            f"{', '.join(snapshot.results)}: check the samples and the bench file"
+        )
+    return f"{names}: " + "; ".join(f"{name}: {why}" for name, why in snapshot.refused.items())
