@@ -11,6 +11,7 @@ import contextlib
 import fcntl
 import os
 import pty
+import re
 import struct
 import subprocess
 import tempfile
@@ -35,6 +36,7 @@ SETTLED = 25.0
 """Seconds of a test until it estimates."""
 N_KEYS = 40
 SERIAL = 9600
+_BEGUN = re.compile(r"\x1b(\[[0-9;:<=>?]*[ -/]*|\][^\x07\x1b]*)?$")
 
 
 class Terminal:
@@ -71,14 +73,18 @@ class Terminal:
         self._reader.start()
 
     def _read(self) -> None:
-        decoder = codecs.getincrementaldecoder("utf-8")()
+        decoder, held = codecs.getincrementaldecoder("utf-8")(), ""
         with contextlib.suppress(OSError):
             while received := os.read(self._master, 96 if self._baud else 65536):
                 if self._baud:  # a line takes its time
                     time.sleep(len(received) * 10 / self._baud)
                 with self._changed:
                     self.n_bytes += len(received)
-                    self._screen.feed(decoder.decode(received))
+                    text = held + decoder.decode(received)
+                    cut = _BEGUN.search(text)  # a sequence whose end is still to come
+                    whole = len(text) if cut is None else cut.start()
+                    self._screen.feed(text[:whole])
+                    held = text[whole:]
                     self._changed.notify_all()
 
     def press(self, keys: str) -> None:

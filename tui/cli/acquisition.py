@@ -134,13 +134,26 @@ def record(
         str | None,
         typer.Option(metavar="NAME", help="Operator in place of that of the bench file."),
     ] = None,
+    until_stopped: Annotated[
+        bool,
+        typer.Option("--until-stopped", help="Ignore the duration of the bench file."),
+    ] = False,
     out: OutOption = None,
     json: JsonOption = None,
 ) -> None:
     """Record without estimating, until the duration has passed or Ctrl-C."""
     from tui.commands.record import record_bench
 
-    record_bench(bench, duration=duration, operator=operator, out=out, json=json)
+    if until_stopped and duration is not None:
+        raise typer.BadParameter("--duration and --until-stopped exclude each other; expected one")
+    record_bench(
+        bench,
+        duration=duration,
+        until_stopped=until_stopped,
+        operator=operator,
+        out=out,
+        json=json,
+    )
 
 
 @examples("huddle watch night.h5", "huddle watch night.h5 --json -   (one line of JSON per update)")

@@ -33,11 +33,14 @@ def record_bench(
     path: Path,
     *,
     duration: float | None,
+    until_stopped: bool = False,
     operator: str | None = None,
     out: Path | None,
     json: str | None,
 ) -> None:
     """Record a bench until the duration has passed, or until SIGINT or SIGTERM.
+
+    The duration is that of the bench file, if none is given and `until_stopped` is false.
 
     Raises
     ------
@@ -47,7 +50,7 @@ def record_bench(
     bench = load(path)
     if operator is not None:
         bench = bench.model_copy(update={"operator": operator})
-    if duration is None:
+    if duration is None and not until_stopped:
         duration = bench.recording.duration
     if out is None:
         out = recording_path(bench, SystemClock().now())

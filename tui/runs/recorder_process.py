@@ -48,7 +48,7 @@ class RecorderProcess:
     out : Path
         Recording it writes; must not exist.
     duration : float, optional
-        In seconds; without it, until a stop is requested.
+        In seconds; without it, until a stop is requested, whatever the bench file says.
     lock : int, optional
         Descriptor of a lock that the process holds as long as it lives (not on Windows).
     operator : str, optional
@@ -74,8 +74,7 @@ class RecorderProcess:
         self.out = out
         arguments = python_command("tui", "record", str(bench_path), "--out", str(out))
         arguments += logs.arguments_for_child()
-        if duration is not None:
-            arguments += ["--duration", repr(duration)]
+        arguments += ["--until-stopped"] if duration is None else ["--duration", repr(duration)]
         if operator is not None:
             arguments += ["--operator", operator]
         descriptor, name = tempfile.mkstemp(prefix="huddle-recorder-", suffix=".log")

@@ -53,8 +53,11 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
     controls = BenchControls(bench, load(bench), settings)
     first = HuddleApp(controls)
     async with first.run_test(size=(80, 24)) as pilot:
-        await pilot.press("s", "enter")
+        assert load(bench).recording.duration is not None
+        await pilot.press("s", "tab", "tab", *["backspace"] * 9, "enter")  # until x stops it
         await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 6)
+        assert first.now is not None
+        assert first.now.ends_in is None
         await pilot.press("q")
     (recorder,) = controls.started
     assert not recorder.ended
