@@ -36,6 +36,7 @@ disconnect the cable is unplugged, and plugged in again
 silent     one unit of a bus is off, and restarts afterwards
 clip       samples end at ± ``level`` counts (of ``channel``, or of all)
 dead       samples are 0 (of ``channel``, or of all)
+moved      the sensor is on another floor, with a motion of its own; so are all that are moved
 ========== ==========================================================================
 
 Others: ``spike`` adds ``level`` counts to one sample; ``reset`` restarts the device; ``wrap`` makes
@@ -83,7 +84,7 @@ if TYPE_CHECKING:
 Kind: TypeAlias = Literal[
     "drop", "cut", "corrupt", "checksum", "garbage", "duplicate", "merge", "late",
     "jitter", "latency", "batching", "stall", "pause", "disconnect", "silent",
-    "clip", "dead", "spike",
+    "clip", "dead", "spike", "moved",
     "reset", "wrap", "overflow",
 ]  # fmt: skip
 DELAYS = ("jitter", "latency", "batching")
@@ -121,6 +122,12 @@ class Fault(BaseModel):
             return iter((self.at,) if self.at >= begin else ())
         first, every = max(0, math.ceil((begin - self.at) / self.every)), self.every
         return (self.at + k * every for k in itertools.count(first))
+
+
+    def is_on(self, times: FloatArray) -> NDArray[np.bool_]:
+        """Return whether a lasting fault is on at world ``times`` (n,)."""
+        since = times - self.at
+        return (since >= 0) & (np.mod(since, self.every or math.inf) < self.duration)
 
 
 _SCRIPT = TypeAdapter(list[Fault])
@@ -190,6 +197,15 @@ class SampleFaults:
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._faults = [fault for fault in faults if fault.kind in SAMPLE_KINDS]
         self._silences = [fault for fault in faults if fault.kind == "silent"]
+        self._moves = [fault for fault in faults if fault.kind == "moved"]
+
+    def is_moved(self, sensor: str, times: FloatArray) -> NDArray[np.bool_]:
+        """Return where a sensor is on another floor at world ``times`` (n,)."""
+        moved = np.zeros(times.shape, dtype=bool)
+        for fault in self._moves:
+            if fault.sensors is None or sensor in fault.sensors:
+                moved |= fault.is_on(times)
+        return moved
 
     def is_silent(self, sensor: str, now: float) -> bool:
         """Return whether the device of a sensor is off at world time ``now``."""
@@ -210,10 +226,9 @@ class SampleFaults:
             columns = slice(None)
             if fault.channel is not None:
                 columns = slice(fault.channel, fault.channel + 1)
-            since = times - fault.at
-            period = fault.every or math.inf
-            struck = (since >= 0) & (np.mod(since, period) < fault.duration)
+            struck = fault.is_on(times)
             if fault.kind == "spike":  # the first sample at or after each time
+                since, period = times - fault.at, fault.every or math.inf
                 step = times[1] - times[0] if times.size > 1 else 0.0
                 around = np.append(since[0] - step, since)
                 strikes = np.where(around < 0, -1.0, np.floor(around / period))
@@ -241,7 +256,7 @@ class LineFaults:
         )
         self._schedule: list[tuple[float, int, Fault, Iterator[float]]] = []
         for index, fault in enumerate(faults):
-            if fault.kind not in (*SAMPLE_KINDS, "silent", "wrap"):
+            if fault.kind not in (*SAMPLE_KINDS, "moved", "silent", "wrap"):
                 # lasting faults may have begun before the device started
                 times = fault.times(begin - fault.duration * (fault.kind in LASTING))
                 first = next(times, None)

@@ -140,7 +140,8 @@ class Source:
         table["motion"]["bandwidth"] = scenario.bandwidth
         for sensor in device.sensors:
             table["sensors"][sensor]["sampling_rate"] = self.sampling_rate
-        self._world = World(Scenario.from_dict(table))
+        self._simulated = Scenario.from_dict(table)
+        self._world = World(self._simulated)
 
     def at_rate(self, sampling_rate: float) -> Source:
         """Return a source with the same world and another sampling rate."""
@@ -156,10 +157,14 @@ class Source:
 
     def counts(self, sensor: str, first_sample: int, n: int) -> NDArray[np.float64]:
         """Return the main channels in counts, neither rounded nor clipped, (n, n_channels)."""
-        counts = self._world.samples(sensor, first_sample, n) * self._sensitivities[sensor]
+        samples = self._world.samples(sensor, first_sample, n)
         if self._faults is None:
-            return counts
-        return self._faults.apply(sensor, counts, self.times(sensor, first_sample, n))
+            return samples * self._sensitivities[sensor]
+        times = self.times(sensor, first_sample, n)
+        moved = self._faults.is_moved(sensor, times)
+        if moved.any():
+            samples[moved] = self._other_floor.samples(sensor, first_sample, n)[moved]
+        return self._faults.apply(sensor, samples * self._sensitivities[sensor], times)
 
     def times(self, sensor: str, first_sample: int, n: int) -> FloatArray:
         """Return the world time of each sample in s, shape (n,)."""
@@ -179,6 +184,10 @@ class Source:
             if later.size:
                 return guess + int(later[0])
             guess += 256
+
+    @cached_property
+    def _other_floor(self) -> World:
+        return World(self._simulated, floor=1)
 
     @cached_property
     def _sensitivities(self) -> dict[str, FloatArray]:

@@ -54,15 +54,23 @@ class Motion:
 
 
 class World:
-    """Motion, clocks and noise of the sensors of a scenario, computed on demand."""
+    """Motion, clocks and noise of the sensors of a scenario, computed on demand.
 
-    def __init__(self, scenario: Scenario) -> None:
+    Parameters
+    ----------
+    scenario
+    floor
+        Number of the floor: the motion of each has the same spectra, and is independent.
+    """
+
+    def __init__(self, scenario: Scenario, *, floor: int = 0) -> None:
         self._scenario = scenario
         motion = scenario.motion
         n_sources = (
             plane_waves.n_sources(motion) if isinstance(motion, PlaneWaves) else len(motion.spectra)
         )
-        self._sources = WhiteSources((scenario.seed, 0), n_sources, scenario.longest_block)
+        key = scenario.seed, floor << 32
+        self._sources = WhiteSources(key, n_sources, scenario.longest_block)
         self._motions: dict[str, Motion] = {}
         self._noises: dict[str, GaussianSeries] = {}
         self._clocks: dict[str, SampleClock] = {}

@@ -16,6 +16,7 @@ from daq.drivers.registry import driver_type
 from daq.errors import BenchFileError, DeviceError, NoAnswerError, NotConnectedError
 from daq.protocols.block import Block, BlockFlag, Event
 from daq.protocols.epson import commands
+from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.errors import ScenarioError
 from sim_devices.faults import LineFaults, SampleFaults, parse
 from sim_devices.world.world import World
@@ -144,6 +145,24 @@ def test_faults_change_samples(cut: int) -> None:
     wanted[50:60, 2] = 0
     wanted[80:90] = 2
     np.testing.assert_array_equal(counts, wanted)
+
+
+def test_a_moved_sensor_shares_no_motion_and_keeps_its_noise() -> None:
+    script = parse([{"kind": "moved", "at": 10.0, "duration": 10.0, "sensors": ["A"]}])
+    channels = tuple(ChannelSpec(name, 1.0) for name in "XYZ")
+    table = DeviceSpec(("A",), "text", "pty", 200.0, {"A": channels})
+    model = scenario("AB")
+    found = Source(model, table, faults=SampleFaults(script)).counts("A", 0, 6000)
+    here, elsewhere = (World(model, floor=floor).samples("A", 0, 6000) for floor in (0, 1))
+    moved = slice(2000, 4000)
+    np.testing.assert_array_equal(found[moved], elsewhere[moved])
+    np.testing.assert_array_equal(np.delete(found, moved, axis=0), np.delete(here, moved, axis=0))
+    noise = World(model).noise("A", 0, 6000)
+    motion = np.stack([here - noise, elsewhere - noise])
+    power = np.einsum("fnc,gnc->fgc", motion, motion)
+    coherence = power[0, 1] / np.sqrt(power[0, 0] * power[1, 1])
+    assert np.abs(coherence).max() < 0.1  # six times the error of 6000 samples
+    np.testing.assert_allclose(power[1, 1], power[0, 0], rtol=0.2)
 
 
 def test_errors_in_a_script_are_reported() -> None:
