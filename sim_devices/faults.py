@@ -123,7 +123,6 @@ class Fault(BaseModel):
         first, every = max(0, math.ceil((begin - self.at) / self.every)), self.every
         return (self.at + k * every for k in itertools.count(first))
 
-
     def is_on(self, times: FloatArray) -> NDArray[np.bool_]:
         """Return whether a lasting fault is on at world ``times`` (n,)."""
         since = times - self.at

@@ -78,6 +78,8 @@ class FollowingApp(App[None]):
 
     DEFAULT_MODE = BENCH
 
+    _filters_for: tuple[str, Sequence[LineFilter]] = "", ()
+    _line_filters: Sequence[LineFilter] = ()
     state: var[State] = var(partial(State, ""), always_update=True)
 
     def __init__(
@@ -128,16 +130,22 @@ class FollowingApp(App[None]):
         self._ended.set()
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Return what lines go through: harmless, and in the colours of the theme."""
-        filters = [
-            PlainMonochrome() if isinstance(each, Monochrome) else each
-            for each in super().get_line_filters()
-        ]
-        if self.theme == COLOUR_BLIND:  # before names of colours become numbers
-            filters.insert(0, SafeColours())
-        elif self.theme == NO_COLOUR:
-            filters.append(PlainMonochrome())
-        return [HarmlessLines(), *filters]
+        """Return what lines go through: harmless, and in the colours of the theme.
+
+        The same object until something changes: Textual keeps what it made of a line.
+        """
+        filters = super().get_line_filters()
+        if self._filters_for != (self.theme, filters):
+            self._filters_for = self.theme, filters
+            shown = [
+                PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters
+            ]
+            if self.theme == COLOUR_BLIND:  # before names of colours become numbers
+                shown.insert(0, SafeColours())
+            elif self.theme == NO_COLOUR:
+                shown.append(PlainMonochrome())
+            self._line_filters = [HarmlessLines(shown)]
+        return self._line_filters
 
     # ---------------------------------------------------------------------- views
 

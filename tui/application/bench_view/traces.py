@@ -9,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
+DOTS = np.array([[0x01, 0x02, 0x04, 0x40], [0x08, 0x10, 0x20, 0x80]])
 """Bits of the dots of a Braille character, by column and row from the top."""
 
 
@@ -33,9 +33,9 @@ def trace(values: NDArray[np.float64], *, width: int) -> str:
             np.clip(np.floor((1 - (each - bottom) / span) * 4), 0, 3).astype(int)
             for each in (high, low)
         )
-    cells = np.zeros(width, dtype=int)
-    for column in range(n_columns):
-        at = column * len(high) // n_columns
-        for row in range(first[at], last[at] + 1):
-            cells[column // 2] |= DOTS[column % 2][row]
-    return "".join(chr(0x2800 + cell) for cell in cells)
+    column = np.arange(n_columns)
+    at, row = column * len(high) // n_columns, np.arange(4)
+    is_set = (row >= first[at, None]) & (row <= last[at, None])
+    cells = (is_set * DOTS[column % 2]).sum(axis=1).reshape(width, 2).sum(axis=1)
+    text: bytes = (0x2800 + cells).astype("<u2").tobytes()
+    return text.decode("utf-16-le")

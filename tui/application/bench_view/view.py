@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 MOST_LINES = 6
 """Lines of findings that are shown."""
+CHECKED_EVERY = 2
+"""Updates of the traces from one check to the next: both take as long."""
 
 
 class BenchView(View):
@@ -73,6 +75,8 @@ class BenchView(View):
         self._is_frozen = False
         self._chosen = ""
         self._n_lines, self._alert = (-1, -1), ""
+        self._findings: list[Text] = []
+        self._n_updates = 0
 
     def parts(self) -> ComposeResult:
         """Yield the sensors, what is wrong, and one line on what to do."""
@@ -96,7 +100,7 @@ class BenchView(View):
         else:
             shown = sensors_of_bench(state, chosen=self._chosen)
         lines = [Text(f"▲ {line}", BAD) for line in state.failure.splitlines()]
-        lines += checks(self._sensors) if is_live else []
+        lines += self._findings if is_live else []
         self.set_class(bool(lines), "-alert")
         if len(lines) > MOST_LINES:
             more = Text(f"and {len(lines) - MOST_LINES + 1} more", MUTED)
@@ -149,7 +153,7 @@ class BenchView(View):
         if self._ended is not None:
             self.end_preview()
         elif (preview := self._controls.preview) is not None:
-            self._ended = threading.Event()
+            self._ended, self._n_updates = threading.Event(), 0
             self._read(preview, self._ended)
         self.show(self.state)
         self.refresh_bindings()
@@ -239,4 +243,7 @@ class BenchView(View):
     def _on_preview(self, message: PreviewUpdated) -> None:
         if self._ended is not None and not self._is_frozen:
             self._sensors = message.sensors
+            if self._n_updates % CHECKED_EVERY == 0:
+                self._findings = checks(self._sensors)
+            self._n_updates += 1
             self.show(self.state)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import numpy as np
+from textual_hires_canvas import Canvas
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
@@ -14,6 +16,8 @@ from tui.application.test_view.units import SpectrumUnit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from textual.app import RenderResult
 
     from tui.application.test_view.curves import Curve, Line
 
@@ -101,6 +105,23 @@ class FullPlot(PlotWidget, can_focus=False):
         super().__init__(id=id, allow_pan_and_zoom=False)
         self.set_x_formatter(x)
         self.set_y_formatter(y)
+        self._legend: object = None
+
+    def render(self) -> RenderResult:
+        """Render the plot; each canvas is refreshed once, not for each of its cells."""
+        with ExitStack() as batches:
+            for canvas in self.query(Canvas):
+                batches.enter_context(canvas.batch_refresh())
+            return super().render()
+
+    def _update_legend(self) -> None:
+        """Leave the legend as it is: `write_legend` is called once all curves are there."""
+
+    def write_legend(self, curves: object) -> None:
+        """Write the legend, unless it is of the same curves: a change lays out the screen again."""
+        if curves != self._legend:
+            self._legend = curves
+            super()._update_legend()
 
     @property
     def n_points(self) -> int:
@@ -206,6 +227,7 @@ class PsdPlot(FullPlot):
                 marker_style=curve.style,
                 label=curve.label,
             )
+        self.write_legend(tuple((curve.label, curve.style, curve.marker) for curve in curves))
 
     def _draw_band(self, curve: Curve, *, dot: float, limits: tuple[float, float]) -> None:
         """Fill the 95 % interval with dots, two across each column as Braille has them."""

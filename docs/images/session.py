@@ -1,0 +1,184 @@
+"""Drive a whole test on simulated devices and keep its screens: `make session`, some minutes.
+
+`huddle devices` plays three sensors in processes of their own, with a fault script: a cable is
+pulled and put back, and later a sensor is moved to another floor. `huddle tui` runs on a
+pseudo-terminal and gets keys only. Its screens become docs/session.md. A step whose words do not
+come to the screen ends the session with an error, and docs/session.md stays as it was.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.application import Terminal
+from daq.python_process import python_command
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "session.md"
+SIZE = (120, 36)
+SPEED = 4.0
+PATIENCE = 400.0
+"""Seconds until a step must have come to the screen."""
+LIMIT = """
+[[limits]]
+name = "data sheet"
+frequency = [2.0, 20.0]
+psd = [3.6e-12, 3.6e-12]
+"""
+FAULTS = """
+[[faults]]
+kind = "disconnect"
+sensors = ["B"]
+at = 150.0
+duration = 40.0
+
+[[faults]]
+kind = "moved"
+sensors = ["C"]
+at = 900.0
+duration = 1e6
+"""
+PREFACE = """\
+# A session
+
+A test on three simulated accelerometers, from the checks to the report. `make session` drives it:
+`huddle devices` plays the sensors in processes of their own, `huddle tui` runs on a terminal of
+120×36 and gets only the keys named here. During the first test a cable is pulled and put back;
+before the second one ends, a sensor is moved to another floor. The screens are copied as they were.
+A test compares titles, keys and columns with the application of today.
+"""
+
+
+class Session:
+    """What a person does at a terminal, and the screens that were kept.
+
+    Parameters
+    ----------
+    terminal : Terminal
+    folder : Path
+        Of the bench; its name is not for the page.
+    """
+
+    def __init__(self, terminal: Terminal, folder: Path) -> None:
+        self._terminal, self._folder = terminal, str(folder)
+        self.page = PREFACE
+
+    def see(self, *texts: str, without: str = "") -> None:
+        """Wait until some texts are on the screen, and another one is not."""
+        deadline = time.monotonic() + PATIENCE
+        for text in texts:
+            self._terminal.wait_for(text, timeout=deadline - time.monotonic())
+        while without and any(without in row for row in self._terminal.rows):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{without!r} stayed on the screen")
+            time.sleep(0.2)
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after the other, as a person does."""
+        for key in keys:
+            self._terminal.press(key)
+            time.sleep(0.3)
+
+    def keep(self, title: str, text: str) -> None:
+        """Keep the screen, once it has come to rest."""
+        time.sleep(1.5)
+        home = "/home/lab".ljust(len(self._folder))
+        rows = [row.replace(self._folder, home).rstrip() for row in self._terminal.rows]
+        screen = "\n".join(rows).rstrip("\n")
+        self.page += f"\n## {title}\n\n{text}\n\n```text\n{screen}\n```\n"
+        print(f"{title}\n{screen}\n", flush=True)
+
+
+@contextmanager
+def simulated(folder: Path) -> Iterator[Path]:
+    """Play the devices of the demo's bench; yields a bench file that reaches them."""
+    demo = (ROOT / "tui" / "resources" / "demo.toml").read_text(encoding="utf-8")
+    bench, faults, reachable = (folder / f"{n}.toml" for n in ("demo", "faults", "lab"))
+    bench.write_text(demo.replace('name = "demo"', 'name = "lab"', 1) + LIMIT, encoding="utf-8")
+    faults.write_text(FAULTS, encoding="utf-8")
+    command = python_command("tui", "devices", str(bench), "--speed", str(SPEED))
+    command += ["--faults", str(faults), "--out", str(reachable)]
+    with subprocess.Popen(command, cwd=folder) as devices:
+        try:
+            while not reachable.exists():
+                if devices.poll() is not None:
+                    raise RuntimeError("the simulated devices did not start")
+                time.sleep(0.2)
+            yield reachable
+        finally:
+            devices.terminate()
+
+
+def drive(session: Session) -> None:
+    """Do the whole test."""
+    session.see("p checks the sensors")
+    session.press("p")
+    session.see("ready: s starts a test")
+    session.keep(
+        "Before the test",
+        "`p` reads the sensors without recording. The last line says that all is ready.",
+    )
+    session.press("s")
+    session.see("start a test")
+    session.press("\t", "after transport", "\t", "\x7f" * 8, "decided")
+    session.keep(
+        "The start form",
+        "`s`, then a note, and `decided`: the test ends when every limit is passed or failed.",
+    )
+    session.press("\r")
+    session.see("power spectral density", "known to", "● recording")
+    session.keep("The test runs", "The first curves, and a verdict that is not decided yet.")
+    session.see("disconnected")
+    session.keep("A cable is pulled", "The recorder goes on with the other two sensors.")
+    session.see("● live", without="disconnected")
+    session.keep(
+        "The cable is put back",
+        "The sensor is found again. The missing samples are a gap of known length.",
+    )
+    session.see("■ ended", "PASS: ")
+    session.keep(
+        "Decided", "The test has ended by itself. The Result view opens, with margin and interval."
+    )
+    session.press("w")
+    session.see("Report written")
+    session.keep("The report", "`w` writes it beside the recording.")
+    session.press("s")
+    session.see("start a test")
+    session.press("\r")
+    session.see("● recording", "C records none of the motion")
+    session.keep(
+        "A sensor on another floor",
+        "The next test, while somebody carries sensor C away. The line of alerts names it.",
+    )
+    session.press("x", "y")
+    session.see("■ ended", "3 Result", "C")
+    session.keep("Stopped", "`x`, then `y`. The result does not hide what was wrong.")
+    session.press("4")
+    session.see("enter")
+    session.keep("All recordings", "`4` lists them.")
+
+
+def main() -> None:
+    """Drive the session; write the page."""
+    with tempfile.TemporaryDirectory(prefix="lab-") as name, simulated(Path(name)) as bench:
+        terminal = Terminal(bench, SIZE, None)
+        session = Session(terminal, Path(name))
+        try:
+            drive(session)
+        finally:
+            session.press("\x1b", "2", "x", "y")  # no recorder stays behind a session that failed
+            time.sleep(3)
+            terminal.close()
+    PAGE.write_text(session.page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
