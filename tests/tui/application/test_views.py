@@ -9,9 +9,11 @@ import pytest
 from daq.bench.model import Limit
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, ended, running, shown
+from tests.tui.application.test_bench_view import SOUND, Reading
+from tests.tui.application.test_recordings import entries, settled
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tui.application.app import HuddleApp
-from tui.application.messages import SnapshotReady
+from tui.application.messages import CatalogueRead, SnapshotReady
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
 
 if TYPE_CHECKING:
@@ -107,13 +109,21 @@ async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback
 @pytest.mark.parametrize(("name", "size"), [("small", (40, 12)), ("middle", (120, 36))])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
     """Verdict, sensors, progress and alert are there at any size."""
+    told.path = told.path.__class__("/bench/run.h5")  # as the pictures show it
+    told.sensors = reading = Reading(SOUND)
     limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
     told.bench = demo_bench().model_copy(update={"limits": (limit,)})
     app = HuddleApp(told)
     async with app.run_test(size=size) as pilot:
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-idle")
+        await pilot.press("p")
+        reading.begun.wait(60)
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-bench")
+        assert "ready: s starts a test" in screen_text(app)
         await shown(pilot, app, *running())
+        assert reading.is_over.wait(60)
         await assert_looks_as_before(pilot, f"{name}-running")
         text = screen_text(app)
         for said in ("1:40  FAIL", "known to 46 %", "C has been silent", "X −119.9"):
@@ -121,3 +131,8 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await shown(pilot, app, *ended())
         await assert_looks_as_before(pilot, f"{name}-result")
         assert "✗ FAIL: 2 of 9 channels" in screen_text(app)
+        await pilot.press("4")
+        await settled(pilot, app)
+        app.screen.post_message(CatalogueRead(entries(told.folder)))
+        await shown(pilot, app)
+        await assert_looks_as_before(pilot, f"{name}-recordings")

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from tui.runs.catalogue import Entry
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-COLUMNS = ("started, UTC", "bench", "length", "verdict", "size", "file")
+COLUMNS = ("started, UTC", "verdict", "length", "bench", "size", "file")
+"""What matters most comes first: a narrow terminal cuts the others."""
 
 
 def row(entry: Entry, *, shown: bool = False, is_reference: bool = False) -> tuple[Text, ...]:
@@ -22,9 +23,9 @@ def row(entry: Entry, *, shown: bool = False, is_reference: bool = False) -> tup
     mark = "▸" if shown else "≈" if is_reference else " "
     return (
         Text(f"{mark} {started}"),
-        Text(entry.bench or "–", "bold"),
-        Text(clock_time(entry.length) if entry.length else "–", justify="right"),
         verdict(entry),
+        Text(clock_time(entry.length) if entry.length else "–", justify="right"),
+        Text(entry.bench or "–", "bold"),
         Text(size(entry.size), justify="right"),
         Text(entry.path.name, MUTED),
     )
