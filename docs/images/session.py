@@ -90,7 +90,7 @@ class Session:
     def keep(self, title: str, text: str) -> None:
         """Keep the screen, once it has come to rest."""
         time.sleep(1.5)
-        home = "/home/lab".ljust(len(self._folder))
+        home = "/home/lab"
         rows = [row.replace(self._folder, home).rstrip() for row in self._terminal.rows]
         screen = "\n".join(rows).rstrip("\n")
         self.page += f"\n## {title}\n\n{text}\n\n```text\n{screen}\n```\n"

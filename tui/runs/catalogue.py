@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daq.acquisition.retention import remove_run
@@ -12,7 +12,7 @@ from daq.recording.storage.locking import is_being_written
 from daq.results.store import stored_verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
 
@@ -49,6 +49,10 @@ class Entry:
         Of the stored result; None where none is stored.
     problem : str
         Why the file cannot be read.
+    run_id, continues : str
+        Of the recording, and of the one that it continues because the disk refused that.
+    part_of, goes_on_in : str
+        Names of the files before and after it, where a recording is in parts.
     """
 
     path: Path
@@ -64,6 +68,10 @@ class Entry:
     has_result: bool = False
     verdict: Verdict | None = None
     problem: str = ""
+    run_id: str = ""
+    continues: str = ""
+    part_of: str = ""
+    goes_on_in: str = ""
 
 
 def catalogue(
@@ -104,7 +112,18 @@ def catalogue(
             found.append(Entry(path, *now, is_growing=True))
             continue
         found.append(_entry(path, *now))
-    return sorted(found, key=lambda entry: (_start(entry), entry.path.name), reverse=True)
+    return sorted(
+        _in_parts(found), key=lambda entry: (_start(entry), entry.path.name), reverse=True
+    )
+
+
+def _in_parts(entries: Sequence[Entry]) -> Iterator[Entry]:
+    """Yield recordings with the names of the files that they continue, and that continue them."""
+    named = {entry.run_id: entry.path.name for entry in entries if entry.run_id}
+    following = {entry.continues: entry.path.name for entry in entries if entry.continues}
+    for entry in entries:
+        part_of, goes_on_in = named.get(entry.continues, ""), following.get(entry.run_id, "")
+        yield replace(entry, part_of=part_of, goes_on_in=goes_on_in)
 
 
 def delete_recording(path: Path) -> None:
@@ -148,6 +167,8 @@ def _entry(path: Path, size: int, modified_ns: int) -> Entry:
                 has_limits=bench is not None and bool(bench.limits),
                 has_result=has_result,
                 verdict=verdict,
+                run_id=recording.run_id,
+                continues=recording.continues,
             )
     except (HuddleError, OSError) as error:
         return Entry(path, size, modified_ns, problem=str(error))

@@ -14,6 +14,7 @@ from daq.results.decision.limits import judge
 from daq.results.decision.verdict import Verdict
 from daq.results.store import store_results
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
+from tui.application.recordings_view.rows import about, verdict
 from tui.runs.catalogue import catalogue, delete_recording
 
 if TYPE_CHECKING:
@@ -50,6 +51,21 @@ def test_each_recording_says_what_became_of_it(tmp_path: Path) -> None:
     assert not found["left"].is_closed
     assert found["torn"].problem
     assert {found[n].bench for n in ("bare", "none", "left")} == {bench.name}
+
+
+def test_a_recording_in_parts_names_the_other_files(tmp_path: Path) -> None:
+    """The disk refused the first file: its recorder went on in a second one."""
+    with growing(tmp_path / "run.h5"):
+        pass
+    with Recording.open(tmp_path / "run.h5") as first:
+        run_id = first.run_id
+    with growing(tmp_path / "run-2.h5", continues=run_id) as writer:
+        writer.close()
+    second, first_part = catalogue(tmp_path, {})
+    assert (first_part.goes_on_in, second.part_of) == ("run-2.h5", "run.h5")
+    assert [verdict(each).plain for each in (first_part, second)] == ["in parts", "part"]
+    assert "goes on in run-2.h5" in about(first_part).plain
+    assert "open that one for the result of all parts" in about(second).plain
 
 
 def test_files_that_have_not_changed_are_not_read_again(

@@ -37,13 +37,14 @@ def verdict(entry: Entry) -> Text:
         return Text("unreadable", BAD)
     if entry.is_growing:
         return Text("● recording", BAD)
+    if entry.part_of or (entry.goes_on_in and not entry.has_result):
+        return Text("part" if entry.part_of else "in parts", MUTED)
     if not entry.is_closed and entry.created is not None and not entry.has_result:
         return Text("left open", "yellow")
     if entry.verdict is not None:
         return Text(WORDS[entry.verdict], STYLES[entry.verdict])
-    if not entry.has_result:
-        return Text("no result", MUTED)
-    return Text("not judged" if entry.has_limits else "no limits", MUTED)
+    why = "not judged" if entry.has_limits else "no limits"
+    return Text(why if entry.has_result else "no result", MUTED)
 
 
 def about(entry: Entry) -> Text:
@@ -53,7 +54,11 @@ def about(entry: Entry) -> Text:
     parts = [str(entry.path)]
     if entry.operator:
         parts.append(f"operator {entry.operator}")
-    if not (entry.is_closed or entry.is_growing) and entry.created is not None:
+    if entry.part_of:
+        parts.insert(0, f"continues {entry.part_of}: open that one for the result of all parts")
+    elif entry.goes_on_in:
+        parts.insert(0, f"goes on in {entry.goes_on_in}, the disk refused this file: one result")
+    elif not (entry.is_closed or entry.is_growing) and entry.created is not None:
         parts.insert(0, f"its recorder did not close it: huddle repair {entry.path.name}")
     return Text(" · ".join(parts), MUTED)
 
