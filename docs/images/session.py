@@ -43,7 +43,7 @@ duration = 40.0
 [[faults]]
 kind = "moved"
 sensors = ["C"]
-at = 900.0
+at = 700.0
 duration = 1e6
 """
 PREFACE = """\
@@ -152,11 +152,11 @@ def drive(session: Session) -> None:
     session.keep("The report", "`w` writes it beside the recording.")
     session.press("s")
     session.see("start a test")
-    session.press("\r")
+    session.press("\t", "\t", "\x7f" * 8, "\r")
     session.see("● recording", "C records none of the motion")
     session.keep(
         "A sensor on another floor",
-        "The next test, while somebody carries sensor C away. The line of alerts names it.",
+        "The next test, without an end. Somebody carries sensor C away: the alert names it.",
     )
     session.press("x", "y")
     session.see("recording  ", "known to", "channel    data")

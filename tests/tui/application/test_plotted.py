@@ -88,6 +88,18 @@ async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) 
         await shown(pilot, app)
         assert "ng/√Hz" in screen_text(app)
         assert view(app).choice.span is None
+        await pilot.press("space", "right", "space", "down")
+        await shown(pilot, app)
+        text = screen_text(app)
+        assert "A.X, A.Y, B.Y   noise in ng/√Hz" in text
+        names = ("A.X", "A.Y", "B.Y")
+        assert all(f"{m}  {name}" in text for m, name in zip("●×◆", names, strict=True))
+        await pilot.press("l")
+        await shown(pilot, app)
+        assert "A.X, A.Y, B.Y, C.Y   noise" in screen_text(app)
+        await pilot.press("l", "escape")
+        await shown(pilot, app)
+        assert "B Y   power spectral density in ng/√Hz" in screen_text(app)
 
 
 async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback) -> None:

@@ -54,6 +54,8 @@ class Choice:
         A row per channel in place of one per sensor.
     overlay : bool
         The like channels of all sensors in place of one channel.
+    picked : frozenset of int
+        Channels that are drawn beside the chosen one.
     unit : int
         Among those of `units_of`.
     span : (float, float) or None
@@ -67,6 +69,7 @@ class Choice:
     clocks: bool = False
     channels: bool = False
     overlay: bool = False
+    picked: frozenset[int] = frozenset()
     unit: int = 0
     span: tuple[float, float] | None = None
     cursor: float | None = None
@@ -121,7 +124,18 @@ def stepped(choice: Choice, snapshot: Snapshot, *, channel: int = 0, sensor: int
     return replace(choice, channel=starts[other] + min(place, snapshot.dims[other] - 1))
 
 
-def like_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
+def compared_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
+    """Return the channels that are drawn in one plot; none where it is of the chosen one alone."""
+    like = _like_channels(choice, snapshot) if choice.overlay else []
+    return sorted({choice.channel, *choice.picked, *like}) if like or choice.picked else []
+
+
+def picking(choice: Choice) -> Choice:
+    """Return a choice with the chosen channel among those drawn beside others, or no longer."""
+    return replace(choice, picked=choice.picked ^ {choice.channel})
+
+
+def _like_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
     """Return the channels at the place that the chosen one has in its sensor, of every sensor."""
     starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
     now = max(n for n, start in enumerate(starts) if start <= choice.channel)
@@ -142,9 +156,9 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         first, last = whole_span(snapshot)
         n_points = round(n_points * (last - first) / (choice.span[1] - choice.span[0]))
     column, frequency = choice.channel, snapshot.frequency
-    if choice.overlay:
+    if compared := compared_channels(choice, snapshot):
         masks = _models(state, n_points=n_points) + _limits(state, choice, n_points=n_points)
-        return masks + _like(state, choice, n_points=n_points)
+        return masks + _compared(state, choice, compared, n_points=n_points)
     shown = [
         data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
     ]
@@ -165,13 +179,14 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     return shown
 
 
-def _like(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
-    """Return the noise of the like channels of all sensors, the chosen one on top."""
+def _compared(
+    state: State, choice: Choice, columns: Sequence[int], *, n_points: int
+) -> list[Curve]:
+    """Return the noise of some channels, the chosen one on top."""
     snapshot, settings = state.snapshot, state.settings
     method = next(iter(choice.methods), "")
     if snapshot is None or settings is None or method not in snapshot.results:
         return []
-    columns = like_channels(choice, snapshot)
     return [
         _noise(
             *(snapshot, settings, column),
@@ -284,8 +299,8 @@ def _ends(mask: Mask) -> tuple[float, float]:
 def plot_title(snapshot: Snapshot, choice: Choice) -> str:
     """Return what the plot shows, with its unit."""
     label, unit = snapshot.channels[choice.channel], unit_of(snapshot, choice)
-    if choice.overlay:
-        names = ", ".join(snapshot.channels[c].name for c in like_channels(choice, snapshot))
+    if compared := compared_channels(choice, snapshot):
+        names = ", ".join(snapshot.channels[column].name for column in compared)
         return f"{names}   noise in {unit.name}"
     return f"{label.sensor} {label.channel}   power spectral density in {unit.name}"
 
@@ -312,5 +327,5 @@ def read_out(snapshot: Snapshot, choice: Choice, curves: Sequence[Curve]) -> str
             text += f" ({'0' if math.isnan(low) else unit.text(low)} to {unit.text(high)})"
         parts.append(f"{curve.label} {text}")
     name = snapshot.channels[choice.channel].name
-    what = "" if choice.overlay else f"{name}  "
+    what = "" if choice.overlay or choice.picked else f"{name}  "
     return f"{10**cursor:.3g} Hz  {what}{unit.name}:  {' · '.join(parts)}"

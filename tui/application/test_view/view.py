@@ -13,7 +13,7 @@ from tui.application.dialogs import TextScreen
 from tui.application.state import TEST
 from tui.application.test_view.board import Board
 from tui.application.test_view.details import details
-from tui.application.test_view.plotted import Choice, moved, panned, stepped, zoomed
+from tui.application.test_view.plotted import Choice, moved, panned, picking, stepped, zoomed
 from tui.application.test_view.units import units_of
 from tui.application.view import View
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 OF_A_SNAPSHOT = {
-    *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "freeze"),
+    *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "pick", "freeze"),
     *("cursor", "zoom", "pan", "whole"),
 }
 """What can be done once there is an estimate."""
@@ -55,6 +55,7 @@ class TestView(View):
         Binding("d", "details", "Details"),
         Binding("v", "app.save", "Save", show=False),
         Binding("l", "overlay", "Like channels", show=False),
+        Binding("space", "pick", "Pick channel", show=False),
         Binding("f", "freeze", "Freeze", show=False),
         Binding("full_stop", "cursor(0.02)", "Cursor right", show=False),
         Binding("comma", "cursor(-0.02)", "Cursor left", show=False),
@@ -74,8 +75,9 @@ class TestView(View):
         ("e", "estimate shown: each method in turn, then all"),
         ("u", "unit of the curves: dB, unit²/Hz, g²/Hz, ng/√Hz"),
         ("l", "like channels of all sensors in one plot; l again: one channel"),
+        ("space", "draw this channel beside others that you choose; space again: no longer"),
         (", .  < >", "cursor left and right, and far: values are read off above the plot"),
-        ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor"),
+        ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor, one channel"),
         ("f", "freeze the curves; recording goes on"),
         ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
@@ -153,8 +155,8 @@ class TestView(View):
         self._change(partial(panned, share=share))
 
     def action_whole(self) -> None:
-        """Show all frequencies, without a cursor."""
-        self.choice = replace(self.choice, span=None, cursor=None)
+        """Show all frequencies of one channel, without a cursor."""
+        self.choice = replace(self.choice, span=None, cursor=None, picked=frozenset())
 
     def action_unit(self) -> None:
         """Show the next unit."""
@@ -163,6 +165,10 @@ class TestView(View):
     def action_overlay(self) -> None:
         """Show like channels of all sensors, or one channel again."""
         self.choice = replace(self.choice, overlay=not self.choice.overlay)
+
+    def action_pick(self) -> None:
+        """Draw the chosen channel beside others, or no longer."""
+        self.choice = picking(self.choice)
 
     def action_table(self) -> None:
         """Show a row per channel, or per sensor again."""
@@ -212,4 +218,5 @@ def fitting(choice: Choice, state: State) -> Choice:
         names = tuple(name for name in settings.methods if name != "all")
         names = names or tuple(snapshot.results)
         methods = names if len(names) < 3 else names[:1]
-    return replace(choice, channel=channel, methods=methods)
+    picked = frozenset(each for each in choice.picked if each < len(snapshot.channels))
+    return replace(choice, channel=channel, methods=methods, picked=picked)
