@@ -27,6 +27,8 @@ FORMATS = (
 """Waveform formats that are read, by ObsPy's names, in the order in which they are tried."""
 _NUMBERED = {"SEGY", "SEG2"}
 """Formats whose traces have numbers and no codes."""
+_HEAD = 4096
+_RESPONSES = (b"B050F03", b"FDSNStationXML")  # RESP, StationXML
 
 Stream: TypeAlias = Any  # ObsPy has no types
 
@@ -66,6 +68,10 @@ def waveform_format(path: Path) -> str:
         for found in entry_points(group=f"obspy.plugin.waveform.{name}", name="isFormat"):
             if found.load()(str(path)):
                 return name
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if any(mark in head for mark in _RESPONSES):
+        raise ImportFormatError("it holds responses, no samples; give it with --response")
     known = ", ".join(FORMATS)
     raise ImportFormatError(f"unknown format; expected one of {known}, not compressed")
 

@@ -128,6 +128,10 @@ def test_a_pickle_named_as_a_waveform_is_not_run(tmp_path: Path) -> None:
     with pytest.raises(ImportFormatError, match="unknown format; expected one of MSEED"):
         read_waveforms([evil])
     assert not made.exists()
+    response = tmp_path / "RESP.XX.A..BHZ"
+    response.write_text("#\nB050F03     Station:     A\n", encoding="ascii")
+    with pytest.raises(ImportFormatError, match="responses, no samples; give it with --response"):
+        read_waveforms([response])
 
 
 def test_npz_one_array_a_sensor(tmp_path: Path) -> None:
