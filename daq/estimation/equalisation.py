@@ -10,6 +10,7 @@ whether these were followed while they grew or not.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -85,6 +86,7 @@ class Equalisation:
         self._factor = slope_factor(window, welch.sampling_rate)
         known = mode in {"auto", "known"} and len(channels) > 1
         self._known = self._by_bench(channels) if known else None
+        self._found: tuple[tuple[tuple[float, bytes], ...], _Leaks | None] = (), None
         self._can_estimate = mode in {"auto", "estimated"} and welch.segment_length % 2 == 0
         self.is_settled = not self._can_estimate or len(dims) < 3
         self.reset()
@@ -144,7 +146,7 @@ class Equalisation:
         bands : sequence of Band
             Of samples filtered as now, in the channels' own units.
         """
-        found = None if self.is_settled else self._leaks(bands)
+        found = None if self.is_settled else self._leaks_as_filtered(bands)
         if found is None or not bands:
             return False
         n_effective = min(band.n_effective for band in bands)
@@ -183,7 +185,7 @@ class Equalisation:
         unit : str
             Of the motion.
         """
-        found = self._leaks(bands)
+        found = self._leaks_as_filtered(bands)
         if found is None:
             return None
         whole = found
@@ -207,6 +209,13 @@ class Equalisation:
                 whole_share=np.maximum(whole.share, found.share),
                 sources=self.sources,
             )
+
+    def _leaks_as_filtered(self, bands: Sequence[Band]) -> _Leaks | None:
+        """Return what leaks; the averages of the last round are often those of the result."""
+        key = _key(bands)
+        if key != self._found[0]:
+            self._found = key, self._leaks(bands)
+        return self._found[1]
 
     def _leaks(self, bands: Sequence[Band], filters: ComplexArray | None = None) -> _Leaks | None:
         """Return what leaks, or would leak without the filters of this response."""
@@ -246,6 +255,14 @@ class Equalisation:
                 for name in ("noise_psd", "motion_psd", "left", "share")
             )
         )
+
+
+def _key(bands: Sequence[Band]) -> tuple[tuple[float, bytes], ...]:
+    """Return what tells averages from others, without keeping them."""
+    return tuple(
+        (band.n_effective, hashlib.sha256(np.ascontiguousarray(band.csm).ravel().data).digest())
+        for band in bands
+    )
 
 
 def _unseen(band: Band) -> FloatArray:

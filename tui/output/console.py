@@ -167,6 +167,9 @@ def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(entry) for entry in value]
+    if isinstance(value, (list, tuple)):  # of numbers, mostly: no call for each
+        return [
+            (entry if math.isfinite(entry) else None) if type(entry) is float else finite(entry)
+            for entry in value
+        ]
     return value

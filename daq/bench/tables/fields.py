@@ -33,4 +33,5 @@ Duration = Annotated[float, BeforeValidator(parse_duration)]
 class Table(BaseModel):
     """A table of the bench file: unknown keys are faults."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # Built when one is read: what only reads recordings without a bench needs none.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
