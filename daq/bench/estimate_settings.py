@@ -258,24 +258,6 @@ def to_table(settings: EstimateSettings) -> dict[str, object]:
     return table
 
 
-def to_arguments(changes: Mapping[str, object]) -> list[str]:
-    """Return settings, by field, as arguments of the command line; None means not given."""
-    arguments: list[str] = []
-    for name, value in changes.items():
-        option = OPTIONS[name]
-        flag = option.flags[0]
-        if value is None:
-            continue
-        if option.is_switch:
-            yes, _, no = flag.partition("/")
-            arguments.append(yes if value else no)
-        else:
-            text = option.text(value)
-            for each in text if isinstance(text, list) else [text]:
-                arguments += [flag, each]
-    return arguments
-
-
 def from_text(name: str, text: str | Sequence[str]) -> object:
     """Return the value of an option from the text of the command line.
 

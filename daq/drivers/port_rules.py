@@ -34,6 +34,12 @@ def only(sensors: Sequence[Sensor], why: str) -> Sensor:
     return sensor
 
 
+def port_label(sensors: Sequence[Sensor]) -> str:
+    """Return the name of a port and its sensors in messages."""
+    names = ", ".join(repr(sensor.name) for sensor in sensors)
+    return f"sensor{'s' * (len(sensors) > 1)} {names} on {sensors[0].port}"
+
+
 def require_alike(
     sensors: Sequence[Sensor], settings: Mapping[str, BaseModel], keys: Collection[str]
 ) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, Strict
 
 from daq.drivers.interface import DeviceInformation
-from daq.drivers.port_rules import require_alike
+from daq.drivers.port_rules import port_label, require_alike
 from daq.errors import BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.seedlink import packets
 from daq.protocols.seedlink.decoder import SeedLinkDecoder, Selection
@@ -180,8 +180,7 @@ async def _opened(
     selections = _selections(sensors)
     settings = SeedLinkSettings.model_validate(first.settings)
     host, number = _address(first)
-    names = ", ".join(repr(sensor.name) for sensor in sensors)
-    label = f"sensor{'s' * (len(sensors) > 1)} {names} on {first.port}"
+    label = port_label(sensors)
     async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
         server = _Server(stream)
         await server.greet(settings.protocol)

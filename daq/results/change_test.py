@@ -100,12 +100,7 @@ def changes(
         begin += change.found + 1
 
 
-def evidence(levels: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Return the martingale after each run, shape (n_runs,): 1 while nothing is known."""
-    return np.array([value for value, *_ in _course(levels, deviations)])
-
-
-def _course(
+def course(
     levels: FloatArray, deviations: FloatArray
 ) -> Iterator[tuple[float, FloatArray, FloatArray]]:
     """Yield the martingale, A and B after each run, for changes at the runs 1 to that one."""
@@ -130,7 +125,7 @@ def _course(
 
 
 def _first_change(levels: FloatArray, deviations: FloatArray, rate: float) -> Change | None:
-    for k, (value, a, b) in enumerate(_course(levels, deviations)):
+    for k, (value, a, b) in enumerate(course(levels, deviations)):
         if value * rate < 1:
             continue
         first = 1 + int(np.argmax(b**2 / a))

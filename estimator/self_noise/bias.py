@@ -2,7 +2,7 @@
 
 The bias follows from the motion's part of the cross-spectral matrix, ``c[p, q]``: the cross-PSD
 of the motion in channels p and q. `motion_csm` computes it from the channels' directions and the
-motion; `incoherent_motion` models motion that is not perfectly coherent.
+motion.
 
 References
 ----------
@@ -53,27 +53,6 @@ def motion_csm(
     blocks = H[..., :, None, :, :] @ Z @ H.conj().swapaxes(-1, -2)[..., None, :, :, :]
     p = n_sensors * n_rows
     return np.asarray(blocks.swapaxes(-3, -2).reshape(*blocks.shape[:-4], p, p))
-
-
-def incoherent_motion(
-    motion: ComplexArray | FloatArray, coherency: ComplexArray | FloatArray
-) -> ComplexArray:
-    """Return the cross-PSD matrices of partially coherent motions with equal PSDs.
-
-    Parameters
-    ----------
-    motion : complex128 or float64, shape (..., d, d)
-        PSD matrix of the motion at each sensor.
-    coherency : complex128 or float64, shape (..., n_sensors, n_sensors)
-        Hermitian, ones on its diagonal: ``S_ZiZj = coherency[i, j] S_Z``. (The *coherence* that
-        instruments display is its squared magnitude.)
-
-    Returns
-    -------
-    complex128, shape (..., n_sensors, n_sensors, d, d)
-    """
-    factors = np.asarray(coherency, dtype=np.complex128)[..., None, None]
-    return np.asarray(factors * np.asarray(motion)[..., None, None, :, :])
 
 
 def snr(motion: ComplexArray, noise_psd: FloatArray) -> FloatArray:

@@ -55,8 +55,40 @@ HOOK_TIMEOUT = 60.0
 """Seconds after which a command for events is ended."""
 
 
+class _Controls:
+    """What a bench and a recording have in common: messages to recorders, settings, events."""
+
+    on_event: str
+
+    def stop(self, path: Path) -> None:
+        """Ask the recorder of a file to stop."""
+        ask(path, "stop")
+
+    def mark(self, path: Path, text: str) -> None:
+        """Ask the recorder of a file to record a remark."""
+        ask(path, "mark", text)
+
+    def announce(self, event: str, text: str, path: Path | None) -> None:
+        """Start the command that the user gave for events."""
+        announce(self.on_event, event, text, path)
+
+    def about(self, path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
+        """Return the settings for a recording, with changes and methods for comparison; its bench.
+
+        Raises
+        ------
+        HuddleError
+            If it cannot be read, or the changes do not fit it.
+        """
+        try:
+            settings, bench = settings_for(path, **changes)
+        except typer.BadParameter as error:
+            raise HuddleError(error.message) from None
+        return with_comparison(settings, changes), bench
+
+
 @dataclass
-class BenchControls:
+class BenchControls(_Controls):
     """Controls of a bench file, which start recorder processes."""
 
     path: Path
@@ -98,14 +130,6 @@ class BenchControls:
         """Return the file of a running recorder of this bench, if there is one."""
         return running_recording(self.bench)
 
-    def stop(self, path: Path) -> None:
-        """Ask the recorder of a file to stop."""
-        ask(path, "stop")
-
-    def mark(self, path: Path, text: str) -> None:
-        """Ask the recorder of a file to record a remark."""
-        ask(path, "mark", text)
-
     @property
     def preview(self) -> Preview | None:
         """Reads the sensors of the bench."""
@@ -129,16 +153,6 @@ class BenchControls:
         """Look for devices on a port that nobody reads."""
         with self.ports:
             return asyncio.run(discover(port, SystemClock()))
-
-    def announce(self, event: str, text: str, path: Path | None) -> None:
-        """Start the command that the user gave for events."""
-        announce(self.on_event, event, text, path)
-
-    def about(
-        self, path: Path, changes: Mapping[str, object]
-    ) -> tuple[Settings | None, Bench | None]:
-        """Return the settings of a recording's own bench, with changes, and that bench."""
-        return about(path, changes)
 
     def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Write the result into the recording, unless it holds one."""
@@ -164,7 +178,7 @@ class BenchControls:
 
 
 @dataclass(frozen=True)
-class RecordingControls:
+class RecordingControls(_Controls):
     """Controls of a recording: while it grows it can be stopped and marked."""
 
     path: Path
@@ -193,14 +207,6 @@ class RecordingControls:
         """Return the recording itself."""
         return self.path
 
-    def stop(self, path: Path) -> None:
-        """Ask the recorder to stop."""
-        ask(path, "stop")
-
-    def mark(self, path: Path, text: str) -> None:
-        """Ask the recorder to record a remark."""
-        ask(path, "mark", text)
-
     @property
     def preview(self) -> None:
         """Return nothing: the sensors of a recording may be anywhere."""
@@ -222,16 +228,6 @@ class RecordingControls:
         """Return none."""
         del port
         return ()
-
-    def announce(self, event: str, text: str, path: Path | None) -> None:
-        """Start the command that the user gave for events."""
-        announce(self.on_event, event, text, path)
-
-    def about(
-        self, path: Path, changes: Mapping[str, object]
-    ) -> tuple[Settings | None, Bench | None]:
-        """Return the settings of a recording's own bench, with changes, and that bench."""
-        return about(path, changes)
 
     def keep(self, path: Path, snapshot: Snapshot, verdict: TestVerdict | None) -> None:
         """Do nothing: the process that records writes the result."""
@@ -314,21 +310,6 @@ def announce(command: str, event: str, text: str, path: Path | None) -> None:
     if ended.returncode:
         said = ended.stderr.strip() or f"exit code {ended.returncode}"
         raise HuddleError(f"--on-event {command}: {said}")
-
-
-def about(path: Path, changes: Mapping[str, Any]) -> tuple[Settings, Bench | None]:
-    """Return the settings for a recording, with changes and methods for comparison; its bench.
-
-    Raises
-    ------
-    HuddleError
-        If it cannot be read, or the changes do not fit it.
-    """
-    try:
-        settings, bench = settings_for(path, **changes)
-    except typer.BadParameter as error:
-        raise HuddleError(error.message) from None
-    return with_comparison(settings, changes), bench
 
 
 def save_result(

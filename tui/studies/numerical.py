@@ -229,23 +229,49 @@ def fig4(ingredients: Ingredients) -> Study:
     return Study("fig4", "Three-channel method: bias by misalignment", tuple(panels))
 
 
+def _bias_and_cov(
+    name: str,
+    title: str,
+    lines: Mapping[str, Callable[..., Scenario]],
+    ingredients: Ingredients,
+    *,
+    method: str,
+    n_segments: int,
+    x_label: str,
+    log: Literal["", "x"] = "",
+    **axis: tuple[float, ...],
+) -> Study:
+    """Bias and c.o.v. along an axis, a line for each scenario."""
+    both = [
+        _series(ingredients, scenario, n_segments=n_segments, method=method, label=label, **axis)
+        for label, scenario in lines.items()
+    ]
+    biases, covs = zip(*both, strict=True)
+    panels = (
+        Panel("(a) bias", x_label, BIAS_LABEL, biases, log=log),
+        Panel("(b) c.o.v.", x_label, COV_LABEL, covs, log="xy" if log else "y"),
+    )
+    return Study(name, title, panels)
+
+
+def _by_angle(
+    scenario: Callable[..., Scenario], *thetas: float
+) -> dict[str, Callable[..., Scenario]]:
+    return {f"θ = {theta:g}°": partial(scenario, theta=theta) for theta in thetas}
+
+
 def fig5(ingredients: Ingredients) -> Study:
     """One other sensor aligned: no bias, but a c.o.v. that grows with SNR and angle."""
-    both = [
-        _series(
-            ingredients,
-            partial(paper_scenarios.fig5, theta=theta),
-            snr=SNRS,
-            n_segments=SEGMENTS_3H,
-            method=THREE_CHANNEL,
-            label=f"θ = {theta:g}°",
-        )
-        for theta in (0.0, 10.0, 30.0, 60.0)
-    ]
-    return Study(
+    return _bias_and_cov(
         "fig5",
         "Three-channel method: sensor k turned alone",
-        _bias_and_cov(both, x_label=SNR_LABEL, log="x"),
+        _by_angle(paper_scenarios.fig5, 0.0, 10.0, 30.0, 60.0),
+        ingredients,
+        method=THREE_CHANNEL,
+        n_segments=SEGMENTS_3H,
+        x_label=SNR_LABEL,
+        log="x",
+        snr=SNRS,
     )
 
 
@@ -270,54 +296,29 @@ def fig9(ingredients: Ingredients) -> Study:
     return Study("fig9", "Three-channel against three-sensor method", tuple(panels))
 
 
+_BY_CHANNEL_ANGLE = partial(
+    _bias_and_cov,
+    method=THREE_SENSOR,
+    n_segments=SEGMENTS_10H,
+    x_label=ALPHA_LABEL,
+    alpha=ALPHAS,
+)
+
+
 def fig12(ingredients: Ingredients) -> Study:
     """Three-sensor bias and c.o.v. against the channel angle, by SNR."""
-    both = [
-        _series(
-            ingredients,
-            partial(paper_scenarios.fig12, snr=snr),
-            alpha=ALPHAS,
-            n_segments=SEGMENTS_10H,
-            method=THREE_SENSOR,
-            label=f"SNR = {snr:g}",
-        )
-        for snr in (10.0, 100.0, 1000.0)
-    ]
-    return Study(
-        "fig12",
-        "Three-sensor method: channel angle, θ = 5°",
-        _bias_and_cov(both, x_label=ALPHA_LABEL),
-    )
+    lines = {
+        f"SNR = {snr:g}": partial(paper_scenarios.fig12, snr=snr) for snr in (10.0, 100.0, 1000.0)
+    }
+    title = "Three-sensor method: channel angle, θ = 5°"
+    return _BY_CHANNEL_ANGLE("fig12", title, lines, ingredients)
 
 
 def fig13(ingredients: Ingredients) -> Study:
     """Three-sensor bias and c.o.v. against the channel angle, by misalignment."""
-    both = [
-        _series(
-            ingredients,
-            partial(paper_scenarios.fig13, theta=theta),
-            alpha=ALPHAS,
-            n_segments=SEGMENTS_10H,
-            method=THREE_SENSOR,
-            label=f"θ = {theta:g}°",
-        )
-        for theta in (5.0, 20.0, 45.0, 60.0)
-    ]
-    return Study(
-        "fig13",
-        "Three-sensor method: channel angle, SNR 100",
-        _bias_and_cov(both, x_label=ALPHA_LABEL),
-    )
-
-
-def _bias_and_cov(
-    both: list[tuple[Series, Series]], *, x_label: str, log: Literal["", "x"] = ""
-) -> tuple[Panel, Panel]:
-    biases, covs = zip(*both, strict=True)
-    return (
-        Panel("(a) bias", x_label, BIAS_LABEL, biases, log=log),
-        Panel("(b) c.o.v.", x_label, COV_LABEL, covs, log="xy" if log else "y"),
-    )
+    lines = _by_angle(paper_scenarios.fig13, 5.0, 20.0, 45.0, 60.0)
+    title = "Three-sensor method: channel angle, SNR 100"
+    return _BY_CHANNEL_ANGLE("fig13", title, lines, ingredients)
 
 
 NUMERICAL: Mapping[str, Callable[[Ingredients], Study]] = {

@@ -27,7 +27,7 @@ import numpy as np
 from daq.drivers.guralp.links import open_link
 from daq.drivers.guralp.settings import GuralpSettings
 from daq.drivers.interface import DeviceInformation
-from daq.drivers.port_rules import require_address, require_alike
+from daq.drivers.port_rules import port_label, require_address, require_alike
 from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.guralp.gcf import component, serial_number
@@ -112,8 +112,7 @@ class GuralpDriver:
         """Open the port and listen until every stream has been received."""
         first = sensors[0]
         settings = GuralpSettings.model_validate(first.settings)
-        names = ", ".join(repr(sensor.name) for sensor in sensors)
-        label = f"sensor {names} on {first.port}"
+        label = port_label(sensors)
         ids = _configured(sensors)
         async with open_link(first.port, settings, clock, ids, label=label) as link:
             heard: list[Block | Event] = []

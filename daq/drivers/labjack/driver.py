@@ -29,6 +29,7 @@ import numpy as np
 from daq.drivers.labjack import device as setup
 from daq.drivers.labjack.device import Registers, StreamPlan, Uptime
 from daq.drivers.labjack.settings import RANGES, LabJackSettings, lacking, range_of
+from daq.drivers.port_rules import port_label
 from daq.errors import BenchFileError, DeviceError, NoAnswerError
 from daq.protocols.errors import RemoteProtocolError
 from daq.protocols.labjack import registers as reg
@@ -224,9 +225,8 @@ async def _opened(
     planned = _Planned.of(sensors)
     settings, inputs, stream_plan = planned.settings, planned.inputs, planned.stream
     common, (host, number) = settings[first.name], planned.address
-    names = ", ".join(repr(sensor.name) for sensor in sensors)
-    label = f"sensor {names} on {first.port}"
-    async with open_port(f"socket://{host}:{number}", clock, label=label) as stream:
+    address = f"socket://{host}:{number}"
+    async with open_port(address, clock, label=port_label(sensors)) as stream:
         registers = Registers(stream)
         product, identity = await setup.identify(registers, sensors)
         uptime = await setup.read_uptime(registers)

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from daq.drivers.interface import DeviceInformation
 from daq.drivers.modbus.bus import DamagedReplyError, ModbusBus, RefusedError, Reply, open_bus
-from daq.drivers.port_rules import require_address, require_alike
+from daq.drivers.port_rules import port_label, require_address, require_alike
 from daq.errors import ABSENT, BenchFileError, FileFault, NoAnswerError, WrongDeviceError
 from daq.protocols.block import Block, Event, EventKind
 from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
@@ -326,12 +326,11 @@ class RegisterDriver:
     ) -> AsyncIterator[RegisterSession]:
         """Open the bus and test which of its devices reply."""
         polled = _configured(sensors)
-        first, port = polled[0].settings, sensors[0].port
-        names = ", ".join(repr(sensor.name) for sensor in sensors)
+        first = polled[0].settings
         async with open_bus(
-            port,
+            sensors[0].port,
             clock,
-            label=f"sensor{'s' * (len(sensors) > 1)} {names} on {port}",
+            label=port_label(sensors),
             reply_timeout=first.timeout,
             baud_rate=first.baud_rate,
             parity=first.parity,

@@ -8,7 +8,6 @@ import pytest
 from estimator.errors import EstimatorError
 from estimator.methods import self_noise
 from estimator.self_noise.bias import (
-    incoherent_motion,
     motion_csm,
     snr,
     three_channel_bias,
@@ -23,6 +22,11 @@ def unit(degrees: list[float]) -> np.ndarray:
     """Uniaxial sensors at these angles from x: responses of shape (n, 1, 2)."""
     angles = np.deg2rad(degrees)
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, None, :]
+
+
+def incoherent(motion: np.ndarray, coherency: np.ndarray) -> np.ndarray:
+    """Motions with equal PSDs of which only part is coherent: ``S_ZiZj = coherency[i, j] S_Z``."""
+    return np.asarray(coherency[..., None, None] * motion)
 
 
 @pytest.mark.parametrize(("theta", "fraction"), [(10, 0.0445), (5, 0.0113)])
@@ -57,7 +61,7 @@ def test_three_sensor_has_no_bias_by_orientation_or_one_incoherent_sensor() -> N
     np.testing.assert_allclose(three_sensor_bias(common, np.ones(9), dims=(3, 3, 3)), 0, atol=1e-7)
     # section 4.1: unbiased as long as one other sensor moves with the target
     coherency = np.array([[1, 1, 0.9], [1, 1, 0.9], [0.9, 0.9, 1]])
-    c = motion_csm(H, incoherent_motion(motion, coherency))
+    c = motion_csm(H, incoherent(motion, coherency))
     bias = three_sensor_bias(c, np.ones(9), dims=(3, 3, 3))
     np.testing.assert_allclose(bias[:6], 0, atol=1e-7)
     assert bias[6:].min() > 100
@@ -68,7 +72,7 @@ def test_equal_coherency_biases_by_snr_times_the_incoherence() -> None:
     H = np.broadcast_to(np.eye(2), (3, 2, 2))
     g = 0.99
     coherency = np.full((3, 3), g) + (1 - g) * np.eye(3)
-    c = motion_csm(H, incoherent_motion(100 * PLANE, coherency))
+    c = motion_csm(H, incoherent(100 * PLANE, coherency))
     bias = three_sensor_bias(c, np.ones(6), dims=(2, 2, 2))
     np.testing.assert_allclose(bias, np.tile([100, 150], 3) * (1 - g))
     np.testing.assert_allclose(bias, three_channel_bias(c, np.ones(6), dims=(2, 2, 2)))
@@ -92,7 +96,7 @@ def test_the_bias_of_the_estimators_agrees_with_the_theory(
     )
     delays = rng.uniform(0, 0.3, n_sensors)
     coherency = np.exp(-np.abs(delays[:, None] - delays) + 1j * (delays[:, None] - delays))
-    c = motion_csm(H, incoherent_motion(np.diag([1.0, 1.5, 0.8]) * 100, coherency))
+    c = motion_csm(H, incoherent(np.diag([1.0, 1.5, 0.8]) * 100, coherency))
     noise_psd = rng.uniform(0.5, 2, (4, 3 * n_sensors))
     csm = c + noise_psd[:, :, None] * np.eye(3 * n_sensors)
     found = self_noise(method, csm, dims=dims, n_effective=1e9, correct=False).noise_psd

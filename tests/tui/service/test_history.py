@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.results.change_test import DECIBEL, changes, evidence
+from daq.results.change_test import DECIBEL, changes, course
 from tests.tui.service.bench_files import START
 from tui.cli.main import app
 from tui.service.history.series import history
@@ -41,8 +41,8 @@ def test_false_alarms_are_as_rare_as_stated() -> None:
 def test_the_evidence_is_a_martingale() -> None:
     """Its mean stays 1 where nothing changes; small widths of change keep its variance small."""
     rng = np.random.default_rng(15)
-    values = [evidence(rng.normal(size=6), np.full(6, 1.0))[-1] for _ in range(1500)]
-    assert np.mean(values) == pytest.approx(1.0, abs=4 * np.std(values) / math.sqrt(1500))
+    values = [list(course(rng.normal(size=6), np.full(6, 1.0)))[-1][0] for _ in range(1500)]
+    assert np.mean(values) == pytest.approx(1.0, abs=4 * float(np.std(values)) / math.sqrt(1500))
 
 
 @pytest.mark.parametrize(("shift_db", "within"), [(1.0, 8), (-3.0, 3)])
