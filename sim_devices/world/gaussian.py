@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from scipy import fft
+from numpy import fft
 
 from sim_devices.world.tables import LONGEST_BLOCK
 
@@ -88,7 +88,7 @@ class GaussianSeries:
     ) -> None:
         self._sources = sources
         block = sources.block
-        frequency = fft.rfftfreq(2 * block, 1 / sampling_rate)
+        frequency = np.asarray(fft.rfftfreq(2 * block, 1 / sampling_rate), np.float64)
         amplitude = np.sqrt(sampling_rate / 2) * response(frequency)  # white unit variance: 2 / fs
         self._used = [np.flatnonzero(row) for row in np.any(amplitude, axis=0)]
         self._filters: list[ComplexArray] = []
