@@ -183,3 +183,34 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
     assert "✗ FAIL: 1 of 9 channels above data sheet: C.Z." in text
     assert "C.Z fails 'data sheet'" in text
     assert "✓ +9." in next(line for line in text.splitlines() if line.startswith("  A.X"))
+
+
+async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
+    told: ProgressCallback,
+) -> None:
+    """After 1000 s together, 100 s without C in the motion are lost in the averages."""
+    before = diagnosed(n_effective=1000.0)
+    assert before.diagnostics.diagnosis is not None
+    diagnosis = replace(before.diagnostics.diagnosis, advice=())
+    diagnostics = replace(before.diagnostics, diagnosis=diagnosis)
+    before = replace(before, closed=False, elapsed=1000.0, diagnostics=diagnostics)
+    alone = before.csm.copy()
+    alone[:, 6:, :6] = alone[:, :6, 6:] = 0
+    n_new = before.n_segments // 10
+    n_segments = before.n_segments + n_new
+    csm = (before.n_segments * before.csm + n_new * alone) / n_segments
+    now = replace(before, csm=csm, n_segments=n_segments, n_effective=1100.0, elapsed=1100.0)
+    same = replace(now, csm=before.csm)
+    app = HuddleApp(told)
+    for second, is_named in ((same, False), (now, True)):
+        async with app.run_test(size=WIDE) as pilot:
+            status = StatusUpdated(made_now(elapsed=1100.0))
+            await shown(pilot, app, status, SnapshotReady(before, SETTINGS))
+            await shown(pilot, app, status, SnapshotReady(second, SETTINGS))
+            words = "last minute: C records none of the motion that A and B share"
+            assert (words in screen_text(app)) == is_named
+            await app.workers.wait_for_complete()
+        app = HuddleApp(told)
+    assert [each for each in told.announced if words in each] == [
+        f"trouble: {words}: check its input or its place"
+    ]
