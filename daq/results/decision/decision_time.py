@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 
 LIKELY = 0.9
 """Probability with which the predicted length decides."""
-CAUTIOUS = 0.95
-"""The same where mean and variance of the true margins are known: they are estimated."""
+CAUTIOUS = 0.99
+"""The same where mean and variance of the true margins are known: they are estimated.
+
+With 0.95, 85 % of 424 simulated tests were decided by the predicted length; with 0.99, 91 % of 387.
+"""
 LONGEST = 86400.0
 """Seconds: the longest recording considered, or `LONGER` times the present one."""
 LONGER = 4.0

@@ -37,7 +37,7 @@ def test_tests_are_decided_where_they_can_be(found: list[Outcome]) -> None:
 def test_the_predicted_time_decides(found: list[Outcome]) -> None:
     prolonged = [each for each in found if each.second is not None]
     held = sum(each.second is not Verdict.NOT_DECIDED for each in prolonged)
-    assert len(prolonged) >= 15
+    assert len(prolonged) >= 12
     assert held >= 0.7 * len(prolonged)  # nine in ten are stated
 
 
