@@ -76,7 +76,7 @@ async def play(n_sensors: int, sampling_rate: float) -> None:
     from sim_devices.server import serve  # noqa: PLC0415  (only the process that plays them)
     from sim_devices.server.world_clock import WorldClock  # noqa: PLC0415
 
-    serve.LEAST_INTERVAL = SEND_INTERVAL
+    serve.MIN_INTERVAL = SEND_INTERVAL
     clock = WorldClock(time.monotonic_ns())
     source: Any = Noise(sampling_rate)
     channels = tuple(ChannelSpec(axis, commands.COUNTS_PER_UNIT) for axis in "xyz")

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _GROWTH = 0.02  # fraction by which a recording grows before its clocks are set again
 _FIRST_GROWTH = 0.25  # the same for a short recording, up to
-_ENOUGH = 10.0  # this time in s: the clock's filter takes one observation per 10 s
+_MIN_SECONDS = 10.0  # this time in s: the clock's filter takes one observation per 10 s
 _LATEST = 5.0  # maximum delay in s of the blocks of a device with UTC
 
 
@@ -292,7 +292,7 @@ class AlignedRecording:
         n_samples = sum(source.end_sample for source in self._sources)
         n_runs = sum(len(source.runs) for source in self._sources)
         before, runs_before = self._set_at
-        enough = _ENOUGH * sum(source.record.sampling_rate for source in self._sources)
+        enough = _MIN_SECONDS * sum(source.record.sampling_rate for source in self._sources)
         growth = max(_GROWTH * before, min(_FIRST_GROWTH * before, enough))
         if n_runs > runs_before or n_samples > before + growth:
             self._set_at = (n_samples, n_runs)

@@ -96,7 +96,7 @@ class DelayEstimator:
     _frames: dict[int, _Frame] = field(default_factory=dict)
 
     @property
-    def fewest(self) -> int:
+    def min_segments(self) -> int:
         """Minimum number of segments in the batch that defines the frame."""
         reference: slice = self.columns[0]
         return _MIN_SEGMENTS * int(reference.stop - reference.start)
@@ -130,7 +130,7 @@ class DelayEstimator:
         """
         shape = (len(starts), len(self.columns))
         delays, std = np.full(shape, np.nan), np.full(shape, np.inf)
-        if len(starts) == 0 or (not self.has_frame and len(starts) < self.fewest):
+        if len(starts) == 0 or (not self.has_frame and len(starts) < self.min_segments):
             return delays, std
         sensors = self._spectra(samples, starts)
         if self.has_frame:

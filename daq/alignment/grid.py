@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.resampling import SPAN, all_there, reach, resample
+from daq.alignment.resampling import SPAN, all_present, reach, resample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -106,7 +106,7 @@ class Grid:
             inside = np.arange(low, high)
             present &= (inside >= epoch.first_sample) & (inside < epoch.end_sample)
             inputs[~present] = 0.0
-            usable = all_there(present, positions - low, ratio=ratio)
+            usable = all_present(present, positions - low, ratio=ratio)
             if usable.any():
                 samples[usable] = resample(inputs, positions - low, ratio=ratio)[usable]
                 valid |= usable

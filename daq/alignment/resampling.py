@@ -59,7 +59,7 @@ def reach(ratio: float = 1.0) -> int:
     return math.ceil(HALF_WIDTH * max(1.0, ratio)) + 1
 
 
-def all_there(present: BoolArray, positions: FloatArray, *, ratio: float = 1.0) -> BoolArray:
+def all_present(present: BoolArray, positions: FloatArray, *, ratio: float = 1.0) -> BoolArray:
     """Return whether all samples under the kernel are present, for each position.
 
     Parameters

@@ -14,7 +14,7 @@ import numpy as np
 
 from daq.archive.averages import Average, Estimator, converted
 from daq.archive.changes import Changes, Drift, changes, drift
-from daq.archive.density import FEWEST_BINS, DensityCounter
+from daq.archive.density import MIN_BINS, DensityCounter
 from daq.archive.spectra_file import SpectraFile
 from daq.errors import ArchiveError
 from daq.results.band_summary import band_within, channel_means, judged_method
@@ -321,7 +321,7 @@ def _bands(one: Estimator, usable: float) -> tuple[tuple[float, float], ...]:
     centre = 2.0 ** np.ceil(np.log2(whole[0]) + 0.5)
     while centre * np.sqrt(2) <= whole[1]:
         edges = (float(centre / np.sqrt(2)), float(centre * np.sqrt(2)))
-        if np.count_nonzero((frequency >= edges[0]) & (frequency <= edges[1])) >= FEWEST_BINS:
+        if np.count_nonzero((frequency >= edges[0]) & (frequency <= edges[1])) >= MIN_BINS:
             octaves.append(edges)
         centre *= 2
     return (whole, *octaves)

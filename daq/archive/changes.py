@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
 
-FEWEST_DAYS = 8
+MIN_DAYS = 8
 """With fewer, neither drift nor change is decided."""
 DAYS_PER_YEAR = 365.25
 _AT_AN_END = 2  # days, at least, on either side of a change
@@ -99,7 +99,7 @@ def drift(days: FloatArray, level: FloatArray, spread: FloatArray) -> Drift:
     for series in range(level.shape[1]):
         known = _known(level[:, series], spread[:, series])
         n = int(known.sum())
-        if n < FEWEST_DAYS:
+        if n < MIN_DAYS:
             continue
         at, y, s = days[known], level[known, series], spread[known, series]
         weight = 1 / s**2
@@ -160,7 +160,7 @@ def changes(level: FloatArray, spread: FloatArray, *, false_alarm: float = 0.01)
     groups: dict[bytes, list[int]] = {}
     for series in range(n_series):
         known = _known(level[:, series], spread[:, series])
-        if known.sum() >= FEWEST_DAYS:
+        if known.sum() >= MIN_DAYS:
             groups.setdefault(known.tobytes(), []).append(series)
     n_tested = sum(map(len, groups.values()))
     for members in groups.values():

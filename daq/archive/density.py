@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 POINTS_PER_OCTAVE = 8
 """Each is a mean over an octave (McNamara and Buland 2004)."""
 LOWEST_DB, HIGHEST_DB = -320, 80
-FEWEST_BINS = 4
+MIN_BINS = 4
 """Frequencies in an octave."""
 
 
@@ -116,7 +116,7 @@ def _octaves(frequency: FloatArray) -> IntArray:
     centre = frequency[1] * np.sqrt(2)
     while centre * np.sqrt(2) <= frequency[-1] * (1 + 1e-9):
         low, high = np.searchsorted(frequency, [centre / np.sqrt(2), centre * np.sqrt(2)])
-        if high - low >= FEWEST_BINS:
+        if high - low >= MIN_BINS:
             edges.append((int(low), int(high)))
         centre *= 2 ** (1 / POINTS_PER_OCTAVE)
     return np.array(edges, dtype=np.int64).reshape(-1, 2)

@@ -23,7 +23,7 @@ from daq.estimation.snapshot_diagnostics import (
 from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
-from estimator.responses.equalisation import correction, matters, surely
+from estimator.responses.equalisation import correction, leakage_threshold, significant_minimum
 from estimator.spectra.equaliser import Equaliser, bounded, design, tail_leakage, with_short_tails
 from estimator.spectra.windows import get_window
 
@@ -47,7 +47,7 @@ _ASSUMED_SNR = 1e6  # of known responses that differ
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
 _IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
 _AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
-_FEWEST = 20.0  # averages, below which responses are too uncertain to estimate filters from
+_MIN_AVERAGES = 20.0  # averages, below which responses are too uncertain to estimate filters from
 _FINE = 4  # points of known responses for each of a spectrum
 
 
@@ -150,7 +150,9 @@ class Equalisation:
         if found is None or not bands:
             return False
         n_effective = min(band.n_effective for band in bands)
-        if n_effective < _FEWEST or not found.share.max(initial=0.0) > matters(n_effective):
+        if n_effective < _MIN_AVERAGES or not found.share.max(initial=0.0) > leakage_threshold(
+            n_effective
+        ):
             return False
         frequency = np.concatenate([band.frequencies for band in bands])
         csm = np.concatenate([band.csm for band in bands])
@@ -248,7 +250,9 @@ class Equalisation:
                 motion, factor, n_effective=band.n_effective
             )
             shares = band_shares(left, deviation, np.abs(noise), band.frequencies)
-            parts.append(_Leaks(noise, motion, left, surely(*shares, band.frequencies)))
+            parts.append(
+                _Leaks(noise, motion, left, significant_minimum(*shares, band.frequencies))
+            )
         return _Leaks(
             *(
                 np.concatenate([getattr(part, name) for part in parts])

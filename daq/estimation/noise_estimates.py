@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 ALL_METHODS = tuple(sorted(METHODS, key=lambda name: name != "three-sensor"))
 """The first is what limits, c.o.v. and clocks are judged by: one that needs no alignment."""
-FEWEST_AVERAGES = 20
+MIN_AVERAGES = 20
 """Of an octave with its own segments: with fewer it goes with the octave above."""
 
 
@@ -74,7 +74,7 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
             if each.octaves is not None:
                 octaves.merge(each.octaves)
         highest = octaves.bands()[-1]
-        wanted = max(FEWEST_AVERAGES, first.n_channels + 2)
+        wanted = max(MIN_AVERAGES, first.n_channels + 2)
         return octaves.bands(min(wanted, highest.n_effective))
     spectra = CrossSpectra(first.welch, first.n_channels)
     for each in passes:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 
-MOST_ADDED = 4.0
+CLOCK_FACTOR = 4.0
 """What clocks add goes with the square of what is left between them: twice its rms is allowed."""
 
 
@@ -90,7 +90,7 @@ def added_by_clocks(
     if share is None or not results:
         return None
     psd = np.abs(next(iter(results.values())).noise_psd)
-    added = MOST_ADDED * share * psd
+    added = CLOCK_FACTOR * share * psd
     return np.where(np.isfinite(added), np.clip(added, 0.0, psd), 0.0)
 
 

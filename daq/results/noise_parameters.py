@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.types import FloatArray
 
-MOSTLY = 0.5
+QUANTISATION_SHARE = 0.5
 """Share of the noise from which on it is said that most of it is quantisation."""
 THIRD = 2 ** (1 / 6)
 """Half a third of an octave: a density is the mean over so much to either side."""
@@ -205,10 +205,10 @@ def _compared(
     for at, stated in sheet.noise_density:
         band = (at / THIRD, at * THIRD)
         values = tuple(_root(value) for value in mean(*band))
-        rows.append(_beside(Quantity.NOISE_DENSITY, band, f"({unit})/√Hz", stated, values))
+        rows.append(_compare(Quantity.NOISE_DENSITY, band, f"({unit})/√Hz", stated, values))
     for low, high, stated in sheet.integrated_noise:
         values = tuple(_root(value * (high - low)) for value in mean(low, high))
-        rows.append(_beside(Quantity.INTEGRATED_NOISE, (low, high), unit, stated, values))
+        rows.append(_compare(Quantity.INTEGRATED_NOISE, (low, high), unit, stated, values))
     for low, high, stated in sheet.dynamic_range:
         rms = [_root(value * (high - low)) for value in mean(low, high)]
         sine = (sheet.full_scale or math.nan) / math.sqrt(2)
@@ -217,7 +217,7 @@ def _compared(
             for v in (rms[0], rms[2], rms[1])
         )
         rows.append(
-            _beside(Quantity.DYNAMIC_RANGE, (low, high), "dB", stated, (middle, worst, best))
+            _compare(Quantity.DYNAMIC_RANGE, (low, high), "dB", stated, (middle, worst, best))
         )
     return rows
 
@@ -226,7 +226,7 @@ def _root(power: float) -> float:
     return math.sqrt(max(power, 0.0)) if math.isfinite(power) else math.nan
 
 
-def _beside(
+def _compare(
     quantity: Quantity,
     band: tuple[float, float],
     unit: str,

@@ -34,7 +34,7 @@ from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     ModelTest,
-    calmed,
+    deflated,
     model_test,
     p_values,
     pool,
@@ -216,7 +216,7 @@ def diagnose(
             )
         if steady is not None:
             steady = steady.among(there.channels, sum(dims))
-            found = tuple(replace(b, test=calmed(b.test, steady.inflation)) for b in found)
+            found = tuple(replace(b, test=deflated(b.test, steady.inflation)) for b in found)
         shared = shared_noise(
             tested,
             [number == b for b in np.unique(number)],

@@ -39,7 +39,7 @@ DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
-SURE = 2.0
+SIGNIFICANCE = 2.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
 
 
@@ -275,8 +275,8 @@ class _Parts:
         for group, steady in zip(groups, self.scatter(groups).expected, strict=True):
             level = 1 + self._noise[:, group].mean(axis=1)
             together = (level[:, i] * level[:, j]).mean(axis=0)
-            surely = together > 1 + 2 * SURE * steady[i] * steady[j]
-            found.append(np.where(surely, together, 1.0))
+            significant = together > 1 + 2 * SIGNIFICANCE * steady[i] * steady[j]
+            found.append(np.where(significant, together, 1.0))
         product = np.array(found)
         # The largest single number would mostly be chance: use means of rows and columns.
         return float(max(product.mean(axis=0).max(), product.mean(axis=1).max()))
@@ -302,4 +302,4 @@ class _Parts:
         ratio = float(np.mean(found[known] / theory[known]))
         # The number of independent scores is about the number of channels.
         error = float(np.sqrt(2 / ((self._n_parts - 1) * projector.shape[1])))
-        return ratio if ratio > 1 + SURE * error else 1.0
+        return ratio if ratio > 1 + SIGNIFICANCE * error else 1.0

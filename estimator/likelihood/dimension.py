@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 LEVEL = 0.05
 """A dimension is accepted if its pooled p value is above this. An unneeded factor costs precision
 (in one band in twenty), a missing one causes a bias."""
-SURE = 0.01
+MISFIT_LEVEL = 0.01
 """p value below which the misfit of a band is not explained by chance."""
 ENOUGH_SENSORS = 5
 """Number of sensors from which further dimensions still determine the noise of each sensor."""
@@ -40,8 +40,8 @@ EQUATIONS = 1.5
 """Minimum number of equations, ``(p - q)**2``, per channel, with more factors than usual.
 With 16 for 15 channels, wrong noise also explains the averages: waves seen by five triaxial sensors
 biased it by up to 57 %."""
-LEAST_BINS = 8
-MOST_BINS = 64
+MIN_BINS = 8
+MAX_BINS = 64
 """Maximum number of tested frequencies per band: of more, every second, third, …"""
 
 
@@ -100,10 +100,10 @@ class BandDimension:
     @property
     def is_biased(self) -> bool:
         """Whether no dimension explains the band, at a level of one in a hundred."""
-        return not self.accepted and self.test.p_value < SURE
+        return not self.accepted and self.test.p_value < MISFIT_LEVEL
 
 
-def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = LEAST_BINS) -> IntArray:
+def bands(frequency: FloatArray, *, per_octave: int = 3, least: int = MIN_BINS) -> IntArray:
     """Divide frequencies into bands of constant ratio with at least `least` frequencies each.
 
     Parameters
@@ -208,7 +208,7 @@ def choose_dimension(
     usual = max(dims)
     most = _most_testable(n_channels, usual)
     most = most if len(there.sensors) > 3 else min(usual, most)
-    stride = {int(b): -(-int(np.sum(number == b)) // MOST_BINS) for b in np.unique(number)}
+    stride = {int(b): -(-int(np.sum(number == b)) // MAX_BINS) for b in np.unique(number)}
     taken = np.concatenate([np.flatnonzero(number == b)[::step] for b, step in stride.items()])
     search = _Search(
         matrix[taken],

@@ -81,7 +81,7 @@ def less(test: BandTest, explained: float) -> BandTest:
     return replace(test, statistic=statistic, p_value=p_value)
 
 
-def calmed(test: BandTest, inflation: float) -> BandTest:
+def deflated(test: BandTest, inflation: float) -> BandTest:
     """Return the test for residuals with `inflation` times the variance for steady noise."""
     if inflation == 1 or not math.isfinite(test.p_value):
         return test

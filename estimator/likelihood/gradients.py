@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.likelihood import fisher
-from estimator.likelihood.dimension import ENOUGH_SENSORS, LEAST_BINS, MOST_BINS, SURE
+from estimator.likelihood.dimension import ENOUGH_SENSORS, MAX_BINS, MIN_BINS, MISFIT_LEVEL
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.known_loadings import known_loadings_test, maximise_known
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from estimator.likelihood.known_loadings import KnownLoadings
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
-LEAST_SENSORS = 4
+MIN_SENSORS = 4
 """Three span every plane: whatever their positions, there is nothing to test."""
 RESPONSES_TO = 8.0
 """Responses are taken up to this multiple of the highest frequency at which no gradient is seen.
@@ -40,7 +40,7 @@ What is not seen there is a few per cent of the noise, nine times that here, and
 SHAPE_TO = 20.0
 """The same for the space that positions span."""
 _STEPS = 3  # of delays and responses in turn
-_CLEARLY = 1.0  # standard deviations of the test by which gradients explain a band better
+_BETTER_BY = 1.0  # standard deviations of the test by which gradients explain a band better
 _HARMLESS = 0.5  # of the c.o.v. by free factors
 
 
@@ -114,7 +114,7 @@ def with_gradients(
     """
     d, n_sensors = dims[0], len(dims)
     given = coherency(csm, dims)
-    if len(set(dims)) > 1 or n_sensors < LEAST_SENSORS or not choices:
+    if len(set(dims)) > 1 or n_sensors < MIN_SENSORS or not choices:
         return None, choices
     kind = kinds(given, dims)
     whole = given.valid & (given.flags == 0).all(axis=1) & (frequency > 0)
@@ -125,9 +125,9 @@ def with_gradients(
     low = np.flatnonzero(whole & (frequency <= RESPONSES_TO * top))
     above = whole & (frequency > top)
     middle = np.flatnonzero(above & (frequency <= SHAPE_TO * top))
-    if len(middle) < LEAST_BINS:
-        middle = np.flatnonzero(above)[:LEAST_BINS]
-    if seen == len(choices) or len(low) < LEAST_BINS or len(middle) < LEAST_BINS:
+    if len(middle) < MIN_BINS:
+        middle = np.flatnonzero(above)[:MIN_BINS]
+    if seen == len(choices) or len(low) < MIN_BINS or len(middle) < MIN_BINS:
         return None, choices
     calm = whole & (frequency <= top)
     noise = np.full_like(given.psd, np.nan)
@@ -148,7 +148,7 @@ def with_gradients(
         if not len(rows):
             found.append(choice)
             continue
-        stride = -(-len(rows) // MOST_BINS)
+        stride = -(-len(rows) // MAX_BINS)
         some = rows[::stride]
         fit = maximise_known(
             csm[some], loadings[some], expected[some], kind=kind, n_effective=n_effective
@@ -240,12 +240,12 @@ def _chosen(
     pooled = pool(test, np.ones(len(csm), np.bool_), neighbours=neighbours)
     enough = choice.n_sensors >= ENOUGH_SENSORS
     harmless = misfit(pooled, csm.shape[1], n_effective) < _HARMLESS * choice.cov
-    if not (pooled.p_value > SURE or (enough and harmless)):
+    if not (pooled.p_value > MISFIT_LEVEL or (enough and harmless)):
         return choice
     if _is_usual(choice):
         one = model_test(maximise(csm, choice.usual), n_effective=n_effective)
         better = _excess(one) - _excess(test)
-        if not better > _CLEARLY * np.sqrt(2 * pooled.degrees * pooled.spread):
+        if not better > _BETTER_BY * np.sqrt(2 * pooled.degrees * pooled.spread):
             return choice
     return replace(
         choice,

@@ -24,7 +24,7 @@ from estimator.errors import EstimatorError, InsufficientDataError
 if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray, IntArray
 
-LEAST_BINS = 24
+MIN_BINS = 24
 """Minimum number of frequencies for a fit of four terms."""
 BAND_BINS = 32
 """Number of frequencies of a band with constant relative scatter."""
@@ -34,7 +34,7 @@ OUTLIER = 3.0
 """Standard deviations beyond which a frequency has a reduced weight, until lines are found."""
 LINE = 6.0
 """Standard deviations from which a frequency is a line, and excluded."""
-BESIDE = 2
+LINE_REACH = 2
 """Number of frequencies excluded on either side of a line, because the window spreads it."""
 LOWEST = 4
 """Lowest fitted frequency over the resolution: the factor of the window then fits all terms."""
@@ -169,8 +169,8 @@ def fit(
     terms = terms_at(f, resolution(frequency)[used])
     every = np.ones(len(f), dtype=np.bool_)
     values, sigma = _converged(terms, y, sd, groups, keep=every, most=OUTLIER)
-    lines = _beside(np.abs(y - terms @ values) > LINE * sigma)
-    keep = ~lines if (~lines).sum() >= LEAST_BINS else every
+    lines = _with_neighbours(np.abs(y - terms @ values) > LINE * sigma)
+    keep = ~lines if (~lines).sum() >= MIN_BINS else every
     values, sigma = _converged(terms, y, sd, groups, keep=keep)
     chi_square = float(np.mean(((y - terms @ values) / sigma)[keep] ** 2))
     chi_square *= keep.sum() / (keep.sum() - len(Term))
@@ -212,19 +212,19 @@ def usable(
     InsufficientDataError
         If they are fewer than 24.
     """
-    if len(frequency) < LEAST_BINS:
+    if len(frequency) < MIN_BINS:
         raise InsufficientDataError(
-            f"{len(frequency)} frequencies; expected at least {LEAST_BINS} for noise parameters"
+            f"{len(frequency)} frequencies; expected at least {MIN_BINS} for noise parameters"
         )
     low, high = (0.0, frequency[-1]) if band is None else band
     low = max(low, LOWEST * frequency[1] * (1 - 1e-9))
     inside = np.isfinite(noise_psd) & (frequency >= low) & (frequency <= high)
     inside &= frequency < frequency[-1]
     n_known = int((inside & np.isfinite(cov)).sum())
-    if n_known < LEAST_BINS:
+    if n_known < MIN_BINS:
         raise InsufficientDataError(
             f"{n_known} frequencies with an estimate between {low:g} and {high:g} Hz; expected at "
-            f"least {LEAST_BINS} for noise parameters: use longer segments or a wider band"
+            f"least {MIN_BINS} for noise parameters: use longer segments or a wider band"
         )
     return np.asarray(inside)
 
@@ -296,8 +296,8 @@ def _converged(
     return values, sigma
 
 
-def _beside(lines: BoolArray) -> BoolArray:
-    reach = np.ones(2 * BESIDE + 1)
+def _with_neighbours(lines: BoolArray) -> BoolArray:
+    reach = np.ones(2 * LINE_REACH + 1)
     return np.asarray(np.convolve(lines, reach, mode="same") > 0)
 
 

@@ -29,33 +29,35 @@ if TYPE_CHECKING:
     from estimator.responses.edge_leakage import ChannelResponses
     from estimator.types import ComplexArray, FloatArray
 
-MATTERS = 0.01
+THRESHOLD = 0.01
 """Leakage from which channels are filtered, as a share of the noise in a third of an octave."""
 PER_AVERAGE = 1.0
-"""Addition to `MATTERS`, divided by the number of averages, for the noise of the prediction."""
+"""Addition to `THRESHOLD`, divided by the number of averages, for the noise of the prediction."""
 LARGE = 0.3
 """Leakage from which an estimate is wrong, as a share of the noise."""
 WITH_MOST = 0.1
 """Share of the largest leakage from which a sensor is reported with the one that leaks most."""
-SURE = 3.0
+SIGNIFICANCE = 3.0
 """Standard deviations by which leakage must exceed the threshold."""
 _EQUAL_ENOUGH = 0.5  # fraction of the threshold below which a channel is not filtered
 _STIFFNESS = 1.0
 _MORE_CHANNELS = 0.02  # cost of each filtered channel, in units of `tail_leakage`
 
 
-def matters(n_effective: float) -> float:
-    """Return the share of the noise from which leakage matters."""
-    return MATTERS + PER_AVERAGE / max(n_effective, 1.0)
+def leakage_threshold(n_effective: float) -> float:
+    """Return the share of the noise from which leakage leakage_threshold."""
+    return THRESHOLD + PER_AVERAGE / max(n_effective, 1.0)
 
 
-def surely(share: FloatArray, deviation: FloatArray, frequency: FloatArray) -> FloatArray:
+def significant_minimum(
+    share: FloatArray, deviation: FloatArray, frequency: FloatArray
+) -> FloatArray:
     """Return the significant minimum of a share, given its standard deviation.
 
     The minimum is 0 above `estimator.spectra.equaliser.USABLE` of the largest frequency (Hz, shape
     (n_freqs,)), where responses are not equalised.
     """
-    least = np.maximum(share - SURE * deviation, 0.0)
+    least = np.maximum(share - SIGNIFICANCE * deviation, 0.0)
     return np.where((frequency <= USABLE * frequency[-1])[:, None], least, 0.0)
 
 
@@ -75,13 +77,13 @@ def leakage_advice(
     frequency : float64, shape (n_freqs,)
         Hz.
     share, share_without : float64, shape (n_freqs, n_channels)
-        As from `surely`, with and without equalisation.
+        As from `significant_minimum`, with and without equalisation.
     dims : tuple of int
         Channels of each sensor.
     n_effective : float
     equalised_by : tuple of str
     """
-    least = matters(n_effective)
+    least = leakage_threshold(n_effective)
     most = np.maximum(share, share_without)
     where = most.max(axis=1, initial=0.0) > least
     if not where.any():
@@ -174,8 +176,8 @@ def _towards(
     wanted = np.ones((len(grid), ratio.shape[1]), dtype=np.complex128)
     slopes = responses.slopes()[:, :, sensor]
     leakage = np.where(np.isfinite(slopes), factor * np.abs(slopes) ** 2 * snr, 0.0)
-    share = surely(*band_shares(leakage, np.zeros_like(snr), np.ones_like(snr), f), f)
-    least = _EQUAL_ENOUGH * matters(n_effective)
+    share = significant_minimum(*band_shares(leakage, np.zeros_like(snr), np.ones_like(snr), f), f)
+    least = _EQUAL_ENOUGH * leakage_threshold(n_effective)
     for channel in range(ratio.shape[1]):
         own = channel in own_channels(dims, sensor)
         if own or not share[:, channel].max(initial=0.0) > least:

@@ -32,9 +32,9 @@ NEIGHBOURS = 16
 """Number of sampled frequencies on either side whose variances are averaged."""
 DENSE = 32
 """Below this bin all are sampled, above it one in bin / 32: 22 per octave."""
-BESIDE = 1
+EXCLUDED_BINS = 1
 """Number of excluded bins on either side of a frequency: they share its scatter."""
-FEWEST = 8
+MIN_NEIGHBOURS = 8
 """Minimum number of neighbours; with fewer, pairs have equal weights."""
 EQUAL = 1.5
 """Ratio of variances up to which pairs have equal weights."""
@@ -157,7 +157,9 @@ class PairWeights:
             Symmetric; their sum is one, or zero if no pair is usable.
         """
         at = first + np.arange(len(usable))
-        near = [np.searchsorted(self._bins, at + step) for step in (-BESIDE, BESIDE + 1)]
+        near = [
+            np.searchsorted(self._bins, at + step) for step in (-EXCLUDED_BINS, EXCLUDED_BINS + 1)
+        ]
         low = np.maximum(near[0] - NEIGHBOURS, 0)
         high = np.minimum(near[1] + NEIGHBOURS, len(self._bins))
 
@@ -168,7 +170,7 @@ class PairWeights:
         mean = np.where(usable, total(self._sums) / np.maximum(count, 1), np.inf)
         least = mean.min(axis=2, keepdims=True)
         ratio = np.where(usable, mean, 0.0) - np.where(np.isfinite(least), least, 0.0)
-        ratio *= usable & ((count >= FEWEST) | ~usable).all(axis=2, keepdims=True)
+        ratio *= usable & ((count >= MIN_NEIGHBOURS) | ~usable).all(axis=2, keepdims=True)
         equal, unequal = np.log(EQUAL), np.log(UNEQUAL)
         if not (ratio > equal).any():
             return None

@@ -32,11 +32,11 @@ from estimator.self_noise.coherency import check_averages
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
 
-LEAST = 0.9
+MAX_NEGATIVE = 0.9
 """Largest magnitude of a negative estimate, as a fraction of the power."""
 QUIETER = 0.2
 """Maximum noise of the target, as a fraction of the second-best partner's residuals."""
-SMALLEST = 1e-12
+MIN_EIGENVALUE = 1e-12
 """Smallest usable eigenvalue of the normal matrix, as a fraction of the largest."""
 
 
@@ -116,7 +116,7 @@ def quiet_sensor_noise(
         normal += (free[j] * free[k].swapaxes(1, 2)).real.sum(axis=0)
         spread += (seen[j] * seen[k].swapaxes(1, 2)).real / (2 * (n - d))[:, None, None]
     w = np.linalg.eigvalsh(normal)
-    if not w[0] > SMALLEST * abs(w[-1]):
+    if not w[0] > MIN_EIGENVALUE * abs(w[-1]):
         return unknown, unknown, unknown
     regression = np.linalg.inv(normal)
     inflation = 1 + 2 * float(
@@ -130,6 +130,8 @@ def quiet_sensor_noise(
         return unknown, unknown, unknown
     # the solution is psi (1 + psi / motion), where the motion is the power minus psi
     level = 1 / np.einsum("fii->fi", inverse).real.mean(axis=0)
-    ends = (np.maximum(noise + z * error, -LEAST * level) for z in (0.0, -quantile, quantile))
+    ends = (
+        np.maximum(noise + z * error, -MAX_NEGATIVE * level) for z in (0.0, -quantile, quantile)
+    )
     middle, low, high = (scale**2 * end * level / (level + end) for end in ends)
     return middle, low, high

@@ -21,7 +21,7 @@ RAMPS = 200
 SHORTEST_RAMP = 4
 ITERATIONS = 8
 """Number of iterations for the PSD without leakage."""
-LEAST = 0.02
+MIN_OWN_SHARE = 0.02
 """Minimum share of the PSD that is attributed to its own frequency."""
 
 
@@ -128,7 +128,7 @@ class Leakage:
             for _ in range(ITERATIONS):
                 lags = np.fft.irfft(true, 2 * length)
                 brought_in = np.fft.rfft(lags * (with_gaps - whole)).real
-                true = np.maximum(seen - brought_in, LEAST * seen)
+                true = np.maximum(seen - brought_in, MIN_OWN_SHARE * seen)
             found[:, column] = (brought_in / seen)[::2][: len(psd)]
         return found
 

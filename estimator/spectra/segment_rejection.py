@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
-STILL = 32  # consecutive equal samples of a dead channel
+FLATLINE_SAMPLES = 32  # consecutive equal samples of a dead channel
 LONGER = 2.0  # ratio to the usual time for channels that are often constant, at threshold 6
-FEWEST = 5  # minimum number of segments for a median
+MIN_FOR_MEDIAN = 5  # minimum number of segments for a median
 SEGMENTS_PER_BLOCK = 32
 REPORTED = 1000  # maximum number of excluded segments kept individually
 
@@ -79,10 +79,11 @@ class RejectionSettings:
     def __post_init__(self) -> None:
         if not self.threshold > 0:
             raise EstimatorError(f"rejection threshold {self.threshold}: expected above 0")
-        if self.start_up < FEWEST or self.memory < self.start_up or self.renewal < 1:
+        if self.start_up < MIN_FOR_MEDIAN or self.memory < self.start_up or self.renewal < 1:
             raise EstimatorError(
                 f"rejection start_up {self.start_up}, memory {self.memory}, renewal "
-                f"{self.renewal}: expected {FEWEST} or more, no less than that, and 1 or more"
+                f"{self.renewal}: expected {MIN_FOR_MEDIAN} or more, no less than that, and 1 or"
+                " more"
             )
 
 
@@ -272,7 +273,7 @@ class SelectedSpectra:
 
     def _agreeing(self, held: list[_Held]) -> tuple[list[_Held], list[Rejected]]:
         """Return the segments near the median of all, and the others."""
-        if len(held) < FEWEST:
+        if len(held) < MIN_FOR_MEDIAN:
             return held, []
         normal = self._median([segment.levels for segment in held])
         off = [_deviation(segment.levels, *normal) for segment in held]
@@ -311,19 +312,20 @@ class _Held:
 
 
 def _longest_still(segment: FloatArray) -> FloatArray:
-    """Return the longest time for which each channel is nearly constant, at least half of `STILL`.
+    """Return the longest time for which each channel is nearly constant.
 
     Returns
     -------
     float64, shape (n_channels,)
-        In samples; the length of the segment for a constant channel; NaN for a channel with NaN.
+        In samples, not below half of `FLATLINE_SAMPLES`; the length of the segment for a constant
+        channel; NaN for a channel with NaN.
     """
     steps = np.abs(np.diff(segment, axis=0))
     limit = 1e-3 * np.sqrt(np.mean(steps**2, axis=0))  # resampling blurs the ends
     place = np.arange(1, len(steps) + 1, dtype=np.int32)[:, None]
     last_moved = np.maximum.accumulate(np.where(steps > limit, place, 0), axis=0)
     longest = (place - last_moved).max(axis=0) + 1.0
-    return np.where(np.isnan(limit), np.nan, np.maximum(longest, (STILL - 1) / LONGER))
+    return np.where(np.isnan(limit), np.nan, np.maximum(longest, (FLATLINE_SAMPLES - 1) / LONGER))
 
 
 def _deviation(levels: FloatArray, median: FloatArray, scatter: FloatArray) -> FloatArray:

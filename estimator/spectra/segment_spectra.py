@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from estimator.types import ComplexArray, IntArray
 
 KEPT_FREQUENCIES = 48
-MOST_SEGMENTS, MOST_VALUES = 4096, 1 << 21
+MAX_SEGMENTS, MAX_VALUES = 4096, 1 << 21
 """Maximum numbers of kept segments and values; beyond, every second segment is kept, then every
 fourth, and so on."""
 
@@ -55,7 +55,7 @@ class SegmentSpectra:
     def __init__(self, bins: IntArray, n_channels: int) -> None:
         self.bins = bins
         self.every = 1
-        self.most = max(1, min(MOST_SEGMENTS, MOST_VALUES // max(1, len(bins) * n_channels)))
+        self.most = max(1, min(MAX_SEGMENTS, MAX_VALUES // max(1, len(bins) * n_channels)))
         self._n_channels = n_channels
         self._n_seen = 0
         self._parts: list[NDArray[np.complex64]] = []

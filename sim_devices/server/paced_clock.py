@@ -43,7 +43,7 @@ LOOKS = 2
 """Minimum number of times that an idle participant reads the clock in this lead."""
 LONGEST_PAUSE = 0.01
 """Maximum interval between two reads of a stopped clock, s of the system's clock."""
-MOST_PARTICIPANTS = 1024
+MAX_PARTICIPANTS = 1024
 _FREE = 2**63 - 1
 _LOOK_FOR_THE_DEAD = NS // 10
 _ORIGIN, _RATE, _UTC, _LEFT_OUT, _N_SLOTS, _SLOTS = range(6)
@@ -81,7 +81,7 @@ class PacedClock:
         """Create a clock that starts at the system's monotonic time and runs at ``rate``."""
         now = time.monotonic_ns()
         head = [now, round(rate * 1e6), utc_of(now) - now, 0, 0]
-        table = memoryview(bytearray(8 * (_SLOTS + MOST_PARTICIPANTS))).cast("q")
+        table = memoryview(bytearray(8 * (_SLOTS + MAX_PARTICIPANTS))).cast("q")
         for place, value in enumerate(head):
             table[place] = value
         Path(path).write_bytes(table)
@@ -158,7 +158,7 @@ class PacedClock:
         while joining is None:  # one process at a time, because each may add a slot
             joining = _locked(f"{self.path}.join")
         try:
-            for slot in range(MOST_PARTICIPANTS):
+            for slot in range(MAX_PARTICIPANTS):
                 lock = _locked(self._lock_path(slot))
                 if lock is not None:
                     self._table[_SLOTS + slot] = _FREE
@@ -166,7 +166,7 @@ class PacedClock:
                     return slot, lock
         finally:
             os.close(joining)
-        raise OSError(f"{self.path}: {MOST_PARTICIPANTS} participants have this clock already")
+        raise OSError(f"{self.path}: {MAX_PARTICIPANTS} participants have this clock already")
 
     def _lock_path(self, slot: int) -> str:
         return f"{self.path}.{slot}"

@@ -73,7 +73,7 @@ FAMILIES = {
 }
 """Driver name → ``module:function`` that creates its simulated device."""
 
-LEAST_INTERVAL = 0.004
+MIN_INTERVAL = 0.004
 """Minimum time between two sends of one line, s: units due in between are sent together.
 
 Replies are not delayed.
@@ -169,7 +169,7 @@ class Served:
         if self._down:
             when = min(when, self._faults.down_until)
         if when < NEVER:
-            at = max(self._clock.monotonic(when), self._last + LEAST_INTERVAL)
+            at = max(self._clock.monotonic(when), self._last + MIN_INTERVAL)
             self._timer = self._loop.call_at(at, self._tick)
 
     def _tick(self) -> None:

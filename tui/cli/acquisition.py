@@ -46,8 +46,8 @@ def tui(
         typer.Option(
             "--baud",
             min=1200,
-            help="Rate of the line to the terminal: what changed is sent no faster"
-            " (default: that of a serial port, else unlimited).",
+            help="Baud rate of the line to the terminal, which limits the output (default: that of"
+            " a serial port, otherwise unlimited).",
         ),
     ] = None,
     models: ModelsOption = "",

@@ -45,7 +45,7 @@ JsonOption: TypeAlias = Annotated[
 ]
 CsvOption: TypeAlias = Annotated[
     str | None,
-    typer.Option("--csv", metavar="FILE", help="Write the curves as CSV; - is standard output."),
+    typer.Option("--csv", metavar="FILE", help="Write the result as CSV; - is standard output."),
 ]
 DurationOption: TypeAlias = Annotated[
     float | None,

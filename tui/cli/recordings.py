@@ -224,7 +224,7 @@ def import_(
         typer.Option(
             "--response",
             metavar="FILE",
-            help="Response, RESP or StationXML. A file with one response applies to all channels.",
+            help="Instrument response, RESP or StationXML. A single one applies to all channels.",
         ),
     ] = None,
     sampling_rate: Annotated[

@@ -197,7 +197,7 @@ def plan(
             metavar="RATIO",
             min=1e-6,
             max=1e9,
-            help="Ratio of motion to noise, of their PSDs.",
+            help="PSD of the motion divided by that of the noise.",
         ),
     ] = 1000.0,
     cov: Annotated[

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording, ReadableSensor
 
 PathLike: TypeAlias = "str | os.PathLike[str]"
-_LEAST = {"two-channel": 2, "all": 2}
+_MIN_SENSORS = {"two-channel": 2, "all": 2}
 """Sensors that a method takes; three if it is not named here."""
 
 
@@ -211,7 +211,7 @@ def _check_sensors(sensors: Sequence[ReadableSensor], settings: Settings) -> Non
     ArrayError
         With the sensors, or the segment, that there are.
     """
-    least = min(_LEAST.get(method, 3) for method in settings.methods)
+    least = min(_MIN_SENSORS.get(method, 3) for method in settings.methods)
     if len(sensors) < least:
         names = ", ".join(sensor.name for sensor in sensors)
         way_out = ", or method='two-channel' where they are alike" if len(sensors) == 2 else ""

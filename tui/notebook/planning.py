@@ -18,7 +18,7 @@ from daq.estimation.noise_estimates import responses
 from daq.estimation.settings import Settings
 from estimator import planning
 from estimator.responses.edge_leakage import slope_factor
-from estimator.responses.equalisation import MATTERS
+from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
 from estimator.spectra.windows import get_window
 from tui.notebook.options import settings_of
@@ -232,14 +232,14 @@ def _leakage(bench: Bench, settings: Settings, snr: float) -> Leakage | None:
     share = factor * snr * np.abs(slopes - usual[:, None]) ** 2
     place = np.unravel_index(int(np.argmax(share)), share.shape)
     most = float(share[place])
-    if most < MATTERS:
+    if most < THRESHOLD:
         return None
     sensor, channel = channels[int(place[1])]
     return Leakage(
         channel=f"{sensor}.{channel.name}",
         frequency=float(frequency[place[0]]),
         share=most,
-        segment=settings.segment * math.sqrt(most / MATTERS),
+        segment=settings.segment * math.sqrt(most / THRESHOLD),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimator import planning
 from estimator.likelihood.dimension import ENOUGH_SENSORS
-from estimator.likelihood.gradients import LEAST_SENSORS
+from estimator.likelihood.gradients import MIN_SENSORS
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Waves:
             f" {10 * self.one_percent:.2g} Hz."
         )
         six = _SIX.format(radius=100 * self.radius)
-        if self.n_sensors < LEAST_SENSORS:
+        if self.n_sensors < MIN_SENSORS:
             text += (
                 f" {self.n_sensors} sensors cannot tell gradients of the motion from noise; the"
                 " model test can only warn. Put them closer together, or use six sensors:"

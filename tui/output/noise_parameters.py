@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.results.noise_parameters import MOSTLY, Outcome, Quantity
+from daq.results.noise_parameters import QUANTISATION_SHARE, Outcome, Quantity
 from estimator.noise_parameters.fit import Term
 from tui.output.formatting import level, percent, span
 
@@ -39,7 +39,7 @@ QUANTITIES = {
     Quantity.INTEGRATED_NOISE: "integrated noise",
     Quantity.DYNAMIC_RANGE: "dynamic range",
 }
-MOST_TIMES = 5
+MAX_TIMES = 5
 """Averaging times in the table of Allan deviations: what a terminal is wide."""
 
 
@@ -69,7 +69,7 @@ def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tu
     if not known or known[0].allan is None:
         return (), []
     tau = known[0].allan.tau
-    shown = tau[np.unique(np.linspace(0, len(tau) - 1, min(MOST_TIMES, len(tau))).astype(int))]
+    shown = tau[np.unique(np.linspace(0, len(tau) - 1, min(MAX_TIMES, len(tau))).astype(int))]
     rows = []
     for each in known:
         times = [] if each.allan is None else each.allan.tau.tolist()
@@ -147,7 +147,7 @@ def quantisation_notes(
     mostly = [
         f"{label.name} ({percent(min(share, 1.0))})"
         for label, (_, share) in zip(channels, shares, strict=True)
-        if share > MOSTLY
+        if share > QUANTISATION_SHARE
     ]
     if not mostly:
         return []

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from daq.results.decision.decision_time import LIKELY
-from daq.results.decision.limits import FEWEST_AVERAGES
+from daq.results.decision.limits import MIN_AVERAGES
 from daq.results.decision.verdict import Obstacle, Verdict
 from tui.output.exit_codes import ExitCode
 from tui.output.formatting import level, listed, roughly, several, signed
@@ -168,7 +168,7 @@ def _obstacle(obstacle: Obstacle, found: TestVerdict) -> str:
     return OBSTACLES[obstacle].format(
         channels=listed(_channels(concerned)) if concerned else "the channels",
         limits=listed(list(dict.fromkeys(each.limit for each in concerned)) or ["the limits"]),
-        averages=FEWEST_AVERAGES,
+        averages=MIN_AVERAGES,
     )
 
 

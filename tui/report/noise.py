@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from estimator.self_noise.band_means import BandMeans
     from tui.report.parts import Tone
 
-MOST_BANDS = 7
+MAX_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
 _TONES: Mapping[Verdict, Tone] = {
     Verdict.FAIL: "bad",
@@ -206,7 +206,7 @@ def _octaves(low: float, high: float) -> Iterator[tuple[float, float]]:
     first, last = math.ceil(math.log2(low) - 1e-9), math.floor(math.log2(high) + 1e-9)
     if last <= first:
         return
-    step = -(-(last - first) // MOST_BANDS)
+    step = -(-(last - first) // MAX_BANDS)
     for exponent in range(first, last, step):
         yield 2.0**exponent, 2.0 ** min(exponent + step, last)
 

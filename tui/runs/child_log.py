@@ -8,7 +8,7 @@ from collections import deque
 from tui.output.logs import lines as logs
 
 _LOGGER = logging.getLogger(__name__)
-MOST_LINES = 20
+MAX_LINES = 20
 """Lines that are no log records, of which the last are kept: a traceback of the interpreter's."""
 
 
@@ -25,7 +25,7 @@ class ChildLog:
         self._name = name
         self._pending = b""
         self._errors: list[str] = []
-        self._others: deque[str] = deque(maxlen=MOST_LINES)
+        self._others: deque[str] = deque(maxlen=MAX_LINES)
 
     def feed(self, content: bytes) -> None:
         """Take output, in pieces of any length."""

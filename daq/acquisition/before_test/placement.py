@@ -26,7 +26,7 @@ ALONE, TOGETHER = 0.3, 0.7
 """Correlation below which a sensor moves by itself, and from which on two others move together."""
 SLOW = 10.0
 """Hz up to which sensors are correlated: their clocks differ by milliseconds."""
-LEAST_OFFSET = 0.5
+MIN_OFFSET = 0.5
 """Difference in m/s² from gravity, and from none, that is called an offset."""
 ALONG = 0.8
 """Part of a direction from which on it is that of one channel."""
@@ -48,14 +48,14 @@ def gravity(each: SensorPreview) -> Iterator[Finding]:
     felt = np.array([means[n] * (factors[n] or 0.0) for n in main])
     most = float(np.linalg.norm(felt))
     is_whole = len(main) >= 3
-    too_little = is_whole and LEAST_OFFSET < most < STANDARD_GRAVITY - LEAST_OFFSET
-    if too_little or most > STANDARD_GRAVITY + LEAST_OFFSET:
+    too_little = is_whole and MIN_OFFSET < most < STANDARD_GRAVITY - MIN_OFFSET
+    if too_little or most > STANDARD_GRAVITY + MIN_OFFSET:
         yield Finding(Problem.OFFSET, each.sensor.name, value=most)
         return
     up = [n for n in main if _is_vertical(channels[n])]
     strongest = main[int(np.argmax(np.abs(felt)))]
     is_elsewhere = np.abs(felt).max() > ALONG * most and up not in ([], [strongest])
-    if is_whole and most > LEAST_OFFSET and is_elsewhere:
+    if is_whole and most > MIN_OFFSET and is_elsewhere:
         both = f"{channels[up[0]].name} and {channels[strongest].name}"
         yield Finding(Problem.SWAPPED, each.sensor.name, both)
 

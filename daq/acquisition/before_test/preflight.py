@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from daq.acquisition.before_test.preview import SensorPreview
 
-ENOUGH = 4.0
+MIN_SECONDS = 4.0
 """Seconds of samples that the checks need."""
 RATE_ERROR = 0.02
 """Difference from the sampling rate of the bench file, as a fraction, from which on it is wrong."""
@@ -24,7 +24,7 @@ MAINS = (50.0, 60.0)
 """Frequencies of mains in Hz."""
 HUM_SHARE = 0.5
 """Share of a channel's power above 1 Hz at a frequency of mains from which on it hums."""
-CLOCK_ERROR, SURELY = 1e-3, 4.0
+CLOCK_ERROR, SIGNIFICANCE = 1e-3, 4.0
 """Difference of a rate, as a fraction, from which on the clock is poor; standard errors it takes.
 """
 UNEVEN = 0.1
@@ -34,7 +34,8 @@ UNEVEN = 0.1
 def is_complete(sensors: Sequence[SensorPreview]) -> bool:
     """Return whether each sensor has enough samples, or a reason why it has none."""
     return all(
-        each.trouble or len(each.samples) >= ENOUGH * each.sensor.sampling_rate for each in sensors
+        each.trouble or len(each.samples) >= MIN_SECONDS * each.sensor.sampling_rate
+        for each in sensors
     )
 
 
@@ -44,7 +45,7 @@ def check_before_test(sensors: Sequence[SensorPreview]) -> tuple[Finding, ...]:
     able = [
         each
         for each in sensors
-        if not each.trouble and len(each.samples) >= ENOUGH * each.sensor.sampling_rate
+        if not each.trouble and len(each.samples) >= MIN_SECONDS * each.sensor.sampling_rate
     ]
     return (*found, *(one for each in able for one in gravity(each)), *placed_wrongly(able))
 
@@ -60,7 +61,7 @@ def _of_sensor(each: SensorPreview) -> Iterator[Finding]:
     off = 0.0 if each.measured_rate is None else each.measured_rate / rate - 1
     if each.measured_rate is not None and abs(off) > RATE_ERROR:
         yield Finding(Problem.RATE, name, value=each.measured_rate)
-    elif abs(off) > max(CLOCK_ERROR, SURELY * each.rate_error):
+    elif abs(off) > max(CLOCK_ERROR, SIGNIFICANCE * each.rate_error):
         yield Finding(Problem.CLOCK, name, value=off * 1e6)
     if each.arrival_scatter > UNEVEN:
         yield Finding(Problem.UNEVEN, name, value=each.arrival_scatter)
@@ -79,7 +80,7 @@ def _of_sensor(each: SensorPreview) -> Iterator[Finding]:
 
 def _hum(values: NDArray[np.float64], rate: float) -> float | None:
     """Return the frequency of mains that has most of the power above 1 Hz; None if none has."""
-    if len(values) < ENOUGH * rate:
+    if len(values) < MIN_SECONDS * rate:
         return None
     window = np.hanning(len(values))
     power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2

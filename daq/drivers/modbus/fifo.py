@@ -238,7 +238,7 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
             if reply.exception is not None:
                 why = rtu.EXCEPTIONS.get(reply.exception, f"exception {reply.exception}")
                 raise WrongDeviceError(
-                    f"{stream.label}: the device refused {_said(settings)}: {why}"
+                    f"{stream.label}: the device refused {_settings_text(settings)}: {why}"
                 )
             if settings.set_rate and reply.payload != request[2:-2]:
                 raise WrongDeviceError(
@@ -248,13 +248,13 @@ async def _set_up(stream: ByteStream, sensor: Sensor, settings: FifoSettings) ->
             return
         unexpected = finder.unexpected or unexpected
     raise NoAnswerError(
-        f"{stream.label}: no answer to {_said(settings)} of unit {settings.unit}:"
+        f"{stream.label}: no answer to {_settings_text(settings)} of unit {settings.unit}:"
         f" {unexpected or 'nothing received'};"
         " check cable, power, settings.baud_rate and settings.unit"
     )
 
 
-def _said(settings: FifoSettings) -> str:
+def _settings_text(settings: FifoSettings) -> str:
     return "setting the sampling rate" if settings.set_rate else "reading the FIFO's level"
 
 

@@ -287,7 +287,7 @@ class Pass:
     @property
     def awaited(self) -> int:
         """Segments with which delays could be measured first; 0 where they are, or need not be."""
-        return 0 if self._meter is None or self._meter.has_frame else self._meter.fewest
+        return 0 if self._meter is None or self._meter.has_frame else self._meter.min_segments
 
     def moved(self) -> FloatArray:
         """Return by how much clocks, as known now, differ from those that segments were taken by.
@@ -314,7 +314,7 @@ class Pass:
         if not len(self._taken_at) or self.aligned.is_exact:
             return False
         if self._meter is not None and not self._meter.has_frame:
-            return self.n_seen >= self._meter.fewest
+            return self.n_seen >= self._meter.min_segments
         moved = self.moved()
         constant = moved.mean(axis=0)
         varying = float(np.sqrt(np.mean((moved - constant) ** 2)))

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from estimator.self_noise.band_means import FloatArray
 
 BANDS_PER_OCTAVE = 3
-FEWEST_AVERAGES = 20.0
+MIN_AVERAGES = 20.0
 """Averages below which the far tails of the interval have not been verified by simulation."""
 
 
@@ -67,7 +67,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     n_bands = sum(max(0, edges[limit.name].size - 1) for limit, _ in pairs)
     quantile = NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
     found = [
-        _beside(
+        _compare(
             bench, limit, column, snapshot, settings, edges=edges[limit.name], quantile=quantile
         )
         for limit, column in pairs
@@ -106,10 +106,10 @@ def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatAr
 
 
 @dataclass(frozen=True, slots=True)
-class _Beside:
+class _Comparison:
     """One channel beside one mask in all bands of it; arrays of shape (n_bands,).
 
-    `surely_low` and `surely_high` are the ends of the interval with all that widens it; `low` and
+    `outer_low` and `outer_high` are the ends of the interval with all that widens it; `low` and
     `high` those by the scatter of the estimate alone. NaN in bands without an estimate.
     """
 
@@ -130,12 +130,12 @@ class _Beside:
     is_faulty: bool
 
     @property
-    def surely_low(self) -> FloatArray:
+    def outer_low(self) -> FloatArray:
         low = (self.low - self.added) * np.where(self.low > self.added, 1 - self.error, 1.0)
         return np.full_like(low, -math.inf) if self.is_faulty else low
 
     @property
-    def surely_high(self) -> FloatArray:
+    def outer_high(self) -> FloatArray:
         return np.asarray(self.high * np.where(self.high > 0, 1 + self.error, 1.0))
 
     def result(self, method: str) -> LimitResult:
@@ -152,8 +152,8 @@ class _Beside:
                 method=method,
                 frequency=number(self.centre),
                 noise_psd=number(self.mean),
-                low=number(self.surely_low),
-                high=number(self.surely_high),
+                low=number(self.outer_low),
+                high=number(self.outer_high),
                 limit_psd=number(self.mask),
                 verdict=verdict,
                 covers=self.covers,
@@ -165,11 +165,11 @@ class _Beside:
         if not known.any():
             why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM
             return in_band(None, Verdict.NOT_DECIDED, why)
-        trusted = known & (self.averages >= FEWEST_AVERAGES) & ~self.is_alone
-        above = np.where(trusted, self.surely_low / self.mask, -math.inf)
+        trusted = known & (self.averages >= MIN_AVERAGES) & ~self.is_alone
+        above = np.where(trusted, self.outer_low / self.mask, -math.inf)
         if above.max() > 1:
             return in_band(int(above.argmax()), Verdict.FAIL, None)
-        highest = np.where(known, self.surely_high / self.mask, -math.inf)
+        highest = np.where(known, self.outer_high / self.mask, -math.inf)
         worst = int(highest.argmax())
         if trusted.all() and highest.max() <= 1:
             return in_band(worst, Verdict.PASS, None)
@@ -205,7 +205,7 @@ class _Beside:
         )
 
 
-def _beside(
+def _compare(
     bench: Bench,
     limit: Limit,
     column: int,
@@ -214,7 +214,7 @@ def _beside(
     *,
     edges: NDArray[np.int64],
     quantile: float,
-) -> _Beside:
+) -> _Comparison:
     label, frequency = snapshot.channels[column], snapshot.frequency
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
@@ -237,7 +237,7 @@ def _beside(
         mean, spread = means.mean, means.spread
         low, high = decision_interval(means, quantile, averages)
     diagnostics = snapshot.diagnostics
-    return _Beside(
+    return _Comparison(
         limit=limit,
         label=label,
         covers=(limit.mask.frequency[0], limit.mask.frequency[-1]),
@@ -296,7 +296,9 @@ def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
     return found
 
 
-def _prediction(found: Sequence[_Beside], snapshot: Snapshot, quantile: float) -> Prediction | None:
+def _prediction(
+    found: Sequence[_Comparison], snapshot: Snapshot, quantile: float
+) -> Prediction | None:
     parts = [each.margins() for each in found]
     return predict(
         Margins(
@@ -308,7 +310,7 @@ def _prediction(found: Sequence[_Beside], snapshot: Snapshot, quantile: float) -
         quantile=quantile,
         elapsed=snapshot.elapsed,
         averages=min(float(each.averages.min()) for each in found),
-        least=FEWEST_AVERAGES,
+        least=MIN_AVERAGES,
     )
 
 

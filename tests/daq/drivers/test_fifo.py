@@ -130,7 +130,7 @@ async def test_every_sample_is_received_at_the_factory_rate() -> None:
 
 async def test_replies_are_not_delayed(monkeypatch: pytest.MonkeyPatch) -> None:
     """However rarely a device sends what is due."""
-    monkeypatch.setattr("sim_devices.server.serve.LEAST_INTERVAL", 1e3)
+    monkeypatch.setattr("sim_devices.server.serve.MIN_INTERVAL", 1e3)
     described = device_spec(table("A"))
     (line,) = create(described, Source(scenario("A", sampling_rate=RATE), described))
     clock = WorldClock(paced_clock().now_ns(), monotonic_ns=paced_clock().now_ns)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from daq.estimation.segment_course import keep_few
-from estimator.spectra.segment_spectra import MOST_SEGMENTS, SegmentSpectra
+from estimator.spectra.segment_spectra import MAX_SEGMENTS, SegmentSpectra
 
 
 def _recordings(n_recordings: int, n_segments: int) -> list[SegmentSpectra]:
@@ -20,10 +20,10 @@ def _recordings(n_recordings: int, n_segments: int) -> list[SegmentSpectra]:
 
 @pytest.mark.parametrize("n_recordings", [1, 2, 5, 11])
 def test_segments_of_all_recordings_are_kept_within_the_limit_of_one(n_recordings: int) -> None:
-    n_segments = MOST_SEGMENTS - 5
+    n_segments = MAX_SEGMENTS - 5
     kept = _recordings(n_recordings, n_segments)
-    assert sum(map(len, kept)) <= MOST_SEGMENTS
-    assert sum(map(len, kept)) > MOST_SEGMENTS / 2 - n_recordings
+    assert sum(map(len, kept)) <= MAX_SEGMENTS
+    assert sum(map(len, kept)) > MAX_SEGMENTS / 2 - n_recordings
     (every,) = {each.every for each in kept}
     for each in kept:
         assert np.array_equal(each.values().real.ravel(), np.arange(0, n_segments, every))

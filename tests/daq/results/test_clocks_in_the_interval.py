@@ -10,7 +10,7 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot_diagnostics import (
-    MOST_ADDED,
+    CLOCK_FACTOR,
 )
 from daq.results.band_summary import channel_means
 from daq.results.clock_effect import added_in_bands
@@ -40,7 +40,7 @@ def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> Non
         band = slice(10, 30)
         noise = snapshot.results["three-sensor"].noise_psd[band, column]
         assert added_in_bands(snapshot, SETTINGS, edges, column) == pytest.approx(
-            MOST_ADDED * 0.01 * noise.mean()
+            CLOCK_FACTOR * 0.01 * noise.mean()
         )
 
 

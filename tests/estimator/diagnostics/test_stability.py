@@ -11,8 +11,8 @@ from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges
 from estimator.diagnostics.stability import PARTS, SegmentCourse
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.segment_spectra import (
-    MOST_SEGMENTS,
-    MOST_VALUES,
+    MAX_SEGMENTS,
+    MAX_VALUES,
     SegmentSpectra,
     kept_bins,
 )
@@ -102,9 +102,9 @@ def test_kept_segments_are_bounded_in_number() -> None:
     assert bins.min() >= 2
     assert bins.max() <= 1800
     kept = SegmentSpectra(bins[:1], 1)
-    n = 2 * MOST_SEGMENTS + 5
+    n = 2 * MAX_SEGMENTS + 5
     for part in np.array_split(np.arange(n, dtype=np.complex128), 7):
         kept.add(part[:, None, None])
     assert kept.every == 4
     assert np.array_equal(kept.values()[:, 0, 0].real, np.arange(0, n, 4))
-    assert 64 <= SegmentSpectra(bins, 192).most <= MOST_VALUES / (192 * len(bins))
+    assert 64 <= SegmentSpectra(bins, 192).most <= MAX_VALUES / (192 * len(bins))

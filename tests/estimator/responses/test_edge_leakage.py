@@ -10,7 +10,12 @@ import pytest
 from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise
 from estimator.responses.edge_leakage import band_shares, channel_responses, slope_factor
-from estimator.responses.equalisation import correction, leakage_advice, matters, surely
+from estimator.responses.equalisation import (
+    correction,
+    leakage_advice,
+    leakage_threshold,
+    significant_minimum,
+)
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -114,7 +119,7 @@ def test_shares_are_of_bands_and_allow_for_scatter() -> None:
     # 0.2 times the root of 2 over the number of frequencies: 8 at first, 206 in the last band
     assert deviation[1, 0] == pytest.approx(0.1)
     assert deviation[-1, 0] == pytest.approx(0.2 * np.sqrt(2 / 206), rel=0.3)
-    least = surely(share, deviation, FREQUENCY)[:, 0]
+    least = significant_minimum(share, deviation, FREQUENCY)[:, 0]
     assert least[1] == 0
     assert 0.1 < least[880] < 0.2
     assert least[-1] == 0  # near half the sampling rate
@@ -141,4 +146,4 @@ def test_advice_names_the_sensor_that_leaks_and_how_much() -> None:
     assert better.level is Level.NOTE
     assert better.share_without == 0.4
     assert not advised(0.01 * share, 0.01 * share)
-    assert matters(1e9) == pytest.approx(0.01)
+    assert leakage_threshold(1e9) == pytest.approx(0.01)

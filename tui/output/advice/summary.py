@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     Pairwise = TypeVar("Pairwise", bound=Advice)
 
-MOST_PAIRS = 10
+MAX_PAIRS = 10
 """Pairs of sensors in one sentence; five sensors have this many."""
 LEVEL_DEG = 0.1
 """A rotation may exceed its horizontal part by this, and is still called horizontal."""
@@ -117,9 +117,9 @@ def _listed(
 ) -> str:
     """Return pairs of sensors with a number each; of many pairs those furthest from the usual."""
     shown = found
-    if len(found) > MOST_PAIRS:
+    if len(found) > MAX_PAIRS:
         by_size = sorted(found, key=lambda each: abs(number(each) - usual), reverse=True)
-        shown = by_size[:MOST_PAIRS]
+        shown = by_size[:MAX_PAIRS]
     text = ", ".join(f"{names.pair(each)} {words(number(each))}" for each in shown)
     left = len(found) - len(shown)
     return text + (f" and less in {left} more pairs" if left else "")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from daq.archive.changes import FEWEST_DAYS
+from daq.archive.changes import MIN_DAYS
 from daq.results.band_summary import decibels
 from tui.output.formatting import percent, several, signed, span
 
@@ -86,7 +86,7 @@ def remarks(answer: Answer, zone: str) -> Iterator[str]:
     else:
         yield (
             f"Drift and change are not decided: {several(len(answer.days_utc_ns), 'day')}, and"
-            f" {FEWEST_DAYS} with an estimate are needed."
+            f" {MIN_DAYS} with an estimate are needed."
         )
     found = [
         series for series in range(n_channels, len(changes.found)) if bool(changes.found[series])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 POINTS = 400
 HEIGHT = 1.5
-LEAST = 1e-7
+NEGLIGIBLE = 1e-7
 """Seconds: less is drawn as none."""
 JUMP, STEEP = 1e-4, 5e-5
 """Seconds, and seconds per second, by which no clock changes but at a restart."""
@@ -88,8 +88,8 @@ def _draw(seconds: FloatArray, left: FloatArray, names: list[str], axes: Axes) -
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 1.5, 2, 3, 5, 6, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(0, float(time[0] + time[-1]))
-    if largest < LEAST:
-        axes.set_ylim(-size * LEAST, size * LEAST)
+    if largest < NEGLIGIBLE:
+        axes.set_ylim(-size * NEGLIGIBLE, size * NEGLIGIBLE)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
     axes.set_xlabel(f"time since the first sample ({word})")

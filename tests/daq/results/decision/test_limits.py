@@ -12,7 +12,7 @@ import pytest
 
 from daq.bench.loading import parse
 from daq.results.band_summary import channel_means, dimension_error
-from daq.results.decision.limits import FEWEST_AVERAGES, judge
+from daq.results.decision.limits import MIN_AVERAGES, judge
 from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
@@ -75,12 +75,12 @@ def test_what_is_not_known_well_enough_neither_passes_nor_fails() -> None:
 def test_too_few_averages_decide_nothing() -> None:
     """However far the estimate is from the limit."""
     for psd in (1e-14, 1e-9):
-        found = verdict_on(made_snapshot(n_effective=FEWEST_AVERAGES - 1), psd)
+        found = verdict_on(made_snapshot(n_effective=MIN_AVERAGES - 1), psd)
         assert found.verdict is Verdict.NOT_DECIDED
         assert found.obstacles == (Obstacle.TOO_FEW_AVERAGES,)
         assert found.prediction is not None
         assert found.prediction.seconds is not None
-        assert found.prediction.seconds >= FEWEST_AVERAGES  # one a second here
+        assert found.prediction.seconds >= MIN_AVERAGES  # one a second here
     assert verdict_on(made_snapshot(n_effective=100), 1e-14).verdict is Verdict.FAIL
     assert verdict_on(made_snapshot(n_effective=100), 1e-9).verdict is Verdict.PASS
 
