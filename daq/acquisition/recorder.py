@@ -52,7 +52,7 @@ COMMIT_INTERVAL, MIN_COMMIT_INTERVAL = 1.0, 0.25
 """Seconds between commits: usually, and if a complete chunk of samples is waiting."""
 CANCEL_TIMEOUT = CLOSE_TIMEOUT + 2.0
 """Seconds that all connections may take to end."""
-_BATCH_INTERVAL = 0.15
+_BATCH_INTERVAL = 0.25
 MIN_CONTINUATION = 60.0
 """Seconds that a continuation file must last; a disk that fails sooner ends the run."""
 _LAST_BLOCKS = 1.0
