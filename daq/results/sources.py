@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from daq.estimation.recording_set import continuations
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from daq.bench.model import Bench, Channel
     from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000
+State: TypeAlias = Literal["closed", "growing", "continued", "left open"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +62,9 @@ class Source:
         UTC.
     last : datetime
         UTC of the last block received.
-    state : {"closed", "growing", "left open"}
-        Left open by a recorder that was killed, and not repaired since.
+    state : {"closed", "growing", "continued", "left open"}
+        Continued in the file that follows, because the disk refused this one. Left open by a
+        recorder that was killed, and not repaired since.
     bench : Bench or None
     sensors : tuple of RecordedSensor
     happenings : tuple of Happening
@@ -76,63 +80,73 @@ class Source:
     location: str
     started: datetime
     last: datetime
-    state: Literal["closed", "growing", "left open"]
+    state: State
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
     happenings: tuple[Happening, ...]
 
 
 def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
-    """Read what recordings say, growing ones up to now.
+    """Read what recordings, and those that continue them, say; growing ones up to now.
 
     Raises
     ------
     RecordingError
         If one cannot be read.
     """
-    return tuple(_source(Path(path)) for path in paths)
+    with contextlib.ExitStack() as opened:
+        recordings = [opened.enter_context(Recording.open(path)) for path in paths]
+        for recording in tuple(recordings):
+            following = continuations(recording, recordings)
+            recordings.extend(map(opened.enter_context, following))
+        continued = {recording.continues for recording in recordings}
+        return tuple(_source(each, continued=each.run_id in continued) for each in recordings)
 
 
-def _source(path: Path) -> Source:
-    with Recording.open(path) as recording:
-        created = recording.created_at.utc_ns
-        last = max(
-            (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),
-            default=created,
-        )
-        happenings = [
-            Happening(event.received.utc_ns, event.sensor, event.kind, event.text)
-            for event in recording.events
-        ]
-        for sensor in recording.sensors:
-            happenings += _gaps(sensor, created)
-        happenings.sort(key=lambda each: each.utc_ns)
-        growing = not recording.closed and is_being_written(path)
-        return Source(
-            path=path,
-            sha256="" if growing else _sha256(path),
-            n_bytes=path.stat().st_size,
-            run_id=recording.run_id,
-            software=recording.software,
-            operator=recording.operator,
-            location=recording.location,
-            started=recording.created.astimezone(UTC),
-            last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
-            state="closed" if recording.closed else "growing" if growing else "left open",
-            bench=recording.bench,
-            sensors=tuple(
-                RecordedSensor(
-                    sensor.name,
-                    sensor.model,
-                    sensor.serial_number,
-                    sensor.driver,
-                    sensor.sampling_rate,
-                    sensor.channels,
-                )
-                for sensor in recording.sensors
-            ),
-            happenings=tuple(happenings),
-        )
+def _source(recording: Recording, *, continued: bool) -> Source:
+    path = recording.path
+    created = recording.created_at.utc_ns
+    last = max(
+        (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),
+        default=created,
+    )
+    happenings = [
+        Happening(event.received.utc_ns, event.sensor, event.kind, event.text)
+        for event in recording.events
+    ]
+    for sensor in recording.sensors:
+        happenings += _gaps(sensor, created)
+    happenings.sort(key=lambda each: each.utc_ns)
+    state: State = "closed"
+    if not recording.closed:
+        state = "continued" if continued else "left open"
+        if is_being_written(path):
+            state = "growing"
+    return Source(
+        path=path,
+        sha256="" if state == "growing" else _sha256(path),
+        n_bytes=path.stat().st_size,
+        run_id=recording.run_id,
+        software=recording.software,
+        operator=recording.operator,
+        location=recording.location,
+        started=recording.created.astimezone(UTC),
+        last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
+        state=state,
+        bench=recording.bench,
+        sensors=tuple(
+            RecordedSensor(
+                sensor.name,
+                sensor.model,
+                sensor.serial_number,
+                sensor.driver,
+                sensor.sampling_rate,
+                sensor.channels,
+            )
+            for sensor in recording.sensors
+        ),
+        happenings=tuple(happenings),
+    )
 
 
 def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _STATES = {
     "closed": "closed",
     "growing": "still being written",
+    "continued": "refused by the disk and continued in another file",
     "left open": "not closed: its recorder was killed",
 }
 _CLOCKS = {

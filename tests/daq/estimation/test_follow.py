@@ -24,6 +24,7 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.recording.monitor import RecordingMonitor, RecordingStatus, SensorStatus
 from daq.recording.reader import Recording
+from daq.results.sources import sources
 from estimator.errors import InsufficientDataError
 from tests.tui.example_snapshot import SETTINGS, growing
 
@@ -392,6 +393,8 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
     alone = [estimate([tmp_path / name], SETTINGS) for name in ("run.h5", "run-3.h5")]
     assert alone[0].n_segments == result.n_segments  # given the first, it finds the other
     assert result.n_segments > alone[1].n_segments > 10
+    said = [(source.path.name, source.state) for source in sources([path])]
+    assert said == [("run.h5", "continued"), ("run-3.h5", "closed")]
     both = estimate([path, tmp_path / "run-3.h5"], SETTINGS)
     assert both.n_segments == result.n_segments
     np.testing.assert_array_equal(both.csm, result.csm)
