@@ -1,11 +1,12 @@
 """All of the torture: ``python -m tests.torture``, or ``make torture``.
 
-Writes the counts to docs/validation/torture.md. The numbers of cases can be multiplied, as in
-``python -m tests.torture 0.1``.
+Writes the counts to docs/validation/torture.md. A share of the cases, as in
+``python -m tests.torture 0.1``, leaves the page alone.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from collections import Counter
@@ -94,7 +95,17 @@ def torture(share: float, folder: Path) -> list[Row]:
 
 def main() -> int:
     """Do it, and write the page if it was all of it."""
-    share = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.torture",
+        description="Kills recorders, cuts the power, lets the disk fail, and flips bits.",
+        epilog=f"The counts of all cases are written to {PAGE.name}; those of a share are not.",
+    )
+    parser.add_argument(
+        "share", nargs="?", type=float, default=1.0, help="share of all cases, above 0 (default 1)"
+    )
+    share = parser.parse_args().share
+    if not 0 < share <= 100:
+        parser.error(f"share {share}; expected a number above 0, such as 0.1")
     with tempfile.TemporaryDirectory(prefix="huddle-torture-") as folder:
         rows = torture(share, Path(folder))
     if share == 1.0:
