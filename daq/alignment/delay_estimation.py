@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 
 _FIRST_ITERATIONS = 5
 _NEWTON_STEPS = 3
-_MIN_SEGMENTS = 6  # of the first batch, per channel of the reference: P is their mean
+MIN_SEGMENTS = 6
+"""Segments of the first batch for each channel of the reference: P is their mean."""
 _SHARED = 0.1  # samples; precision of delays in most segments, for sensors with common motion
 _REFERENCES = 3  # maximum number of sensors tried as reference, to bound the cost
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
@@ -99,7 +100,7 @@ class DelayEstimator:
     def min_segments(self) -> int:
         """Minimum number of segments in the batch that defines the frame."""
         reference: slice = self.columns[0]
-        return _MIN_SEGMENTS * int(reference.stop - reference.start)
+        return MIN_SEGMENTS * int(reference.stop - reference.start)
 
     @property
     def has_frame(self) -> bool:
@@ -222,13 +223,16 @@ class DelayEstimator:
 
     def _spectra(self, samples: FloatArray, starts: IntArray) -> list[ComplexArray]:
         """Return the spectra of each sensor, shape (n_freqs, n_segments, n_channels)."""
-        length = len(self.window)
-        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)[starts]
-        frames -= frames.mean(axis=-1, keepdims=True)
-        frames *= self.window
-        spectra = np.fft.rfft(frames, axis=-1)[:, :, 1 : len(self.omega) + 1].transpose(2, 0, 1)
-        # Contiguous values of one sensor make products fast.
-        return [np.ascontiguousarray(spectra[:, :, columns]) for columns in self.columns]
+        length, end = len(self.window), len(self.omega) + 1
+        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)
+        spectra = []
+        for columns in self.columns:  # one by one, to bound memory
+            own = frames[:, columns][starts]
+            own -= own.mean(axis=-1, keepdims=True)
+            own *= self.window
+            found = np.fft.rfft(own, axis=-1)[:, :, 1:end].transpose(2, 0, 1)
+            spectra.append(np.ascontiguousarray(found))  # makes products fast
+        return spectra
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
         return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -10,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.aligned_recording import AlignedRecording
-from daq.alignment.delay_estimation import DelayEstimator
+from daq.alignment.delay_estimation import MIN_SEGMENTS, DelayEstimator
 from daq.alignment.growing_rows import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
 from daq.estimation.segments.read_ahead import read_ahead
+from daq.estimation.segments.usable_samples import surrounded, whole_segments
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_VALUES_AT_ONCE = 1 << 20  # samples times channels read together: 8 MB
+_VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _MOST_PASSES = 4
@@ -44,7 +46,7 @@ _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgiv
 
 
 class Pass:
-    """Segments of one recording, taken in order."""
+    """Segments of one recording, taken in order; other processors read ahead."""
 
     def __init__(self, recording: ReadableRecording, settings: Settings) -> None:
         self.recording = recording
@@ -84,7 +86,6 @@ class Pass:
             )
         elif wanted.reject:
             self._undisturbed = SelectedSpectra(self.welch, self.n_channels)
-        # The other processors read ahead.
         single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
         self.single = None if wanted.octaves or wanted.reject else single
         self._kept_at = GrowingRows(np.int64)
@@ -163,8 +164,8 @@ class Pass:
     @property
     def n_complete(self) -> int:
         """Segments of the lattice that are available now."""
-        beyond = self.aligned.n_available - self.welch.segment_length - 2 * self.reach
-        return max(0, beyond // self.welch.hop + 1)
+        length = self.welch.segment_length + 2 * self.reach
+        return max(0, (self.aligned.n_available - length) // self.welch.hop + 1)
 
     @property
     def elapsed(self) -> float:
@@ -181,9 +182,9 @@ class Pass:
         hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
         at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
         total = self.n_complete if most is None else min(most, self.n_complete)
-        pieces = [
-            (first, min(at_once, total - first)) for first in range(self.n_seen, total, at_once)
-        ]
+        begin = self.n_seen
+        bounds = [begin, *range(begin + max(at_once, self._fewest), total, at_once), total]
+        pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
 
         def read(piece: tuple[int, int]) -> _Samples:
             first, count = piece
@@ -195,16 +196,16 @@ class Pass:
             raw, flat = samples[reach : reach + count * hop], usable[reach : reach + count * hop]
             if self.filters is not None:
                 samples = self.filters.apply(np.where(usable[:, None], samples, 0.0))
-                usable = _surrounded(usable, reach)
-                clipped = None if clipped is None else ~_surrounded(~clipped, reach)
+                usable = surrounded(usable, reach)
+                clipped = None if clipped is None else ~surrounded(~clipped, reach)
             return _Samples(samples, usable, clipped, raw, flat)
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             samples, usable, clipped = part.samples, part.usable, part.clipped
             self.stillness.add(part.raw, part.raw_usable)
             starts = np.arange(count) * hop
-            whole = _whole(usable, starts, length)
-            clean = whole if clipped is None else _whole(usable & ~clipped, starts, length)
+            whole = whole_segments(usable, starts, length)
+            clean = whole if clipped is None else whole_segments(usable & ~clipped, starts, length)
             self.left_out[Reason.GAP] += count - int(whole.sum())
             self.left_out[Reason.CLIPPED] += int((whole & ~clean).sum())
             starts = starts[clean]
@@ -285,6 +286,17 @@ class Pass:
         return in_clipped_blocks(self._sensors, lambda: seconds[:, None] - self.aligned.delays(at))
 
     @property
+    def _measures(self) -> bool:
+        """Whether delays are measured."""
+        return self._settings.clocks == "refined" and bool(self.aligned.measurable)
+
+    @property
+    def _fewest(self) -> int:
+        """Segments to take together so that delays can be measured, some of them with gaps."""
+        needed = self._measures and (self._meter is None or not self._meter.has_frame)
+        return 2 * MIN_SEGMENTS * max(self.aligned.dims) if needed else 0
+
+    @property
     def awaited(self) -> int:
         """Segments with which delays could be measured first; 0 where they are, or need not be."""
         return 0 if self._meter is None or self._meter.has_frame else self._meter.min_segments
@@ -317,8 +329,7 @@ class Pass:
             return self.n_seen >= self._meter.min_segments
         moved = self.moved()
         constant = moved.mean(axis=0)
-        varying = float(np.sqrt(np.mean((moved - constant) ** 2)))
-        return varying > tolerance or bool(
+        return float(np.sqrt(np.mean((moved - constant) ** 2))) > tolerance or bool(
             np.max(np.abs(constant)) * self.welch.sampling_rate > _MATERIAL_CONSTANT
         )
 
@@ -335,12 +346,12 @@ class Pass:
 
         Segments are at `starts` of the samples, and at `begin` of the grid.
         """
-        measurable = self.aligned.measurable if self._settings.clocks == "refined" else ()
-        if not measurable:
+        if not self._measures:
             return
         if self._meter is None:
             edges = np.cumsum([0, *self.aligned.dims])
-            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in measurable)
+            sensors = self.aligned.measurable
+            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
             window = get_window(self.welch.window, self.welch.segment_length)
             self._meter = DelayEstimator(self.welch.sampling_rate, window, columns)
         delays, std = self._meter.measure(samples, starts)
@@ -372,11 +383,6 @@ class _Samples:
     raw_usable: NDArray[np.bool_]
 
 
-def _surrounded(usable: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return which samples, `reach` from either end, have usable ones as far as that around."""
-    return _whole(usable, np.arange(len(usable) - 2 * reach), 2 * reach + 1)
-
-
 def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:
     """Return for how long channels stood still in segments that count, in seconds, by column.
 
@@ -387,12 +393,6 @@ def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, f
     least = lasting if settings.reject else 0.0
     seconds = np.atleast_1d(sum(each.stillness.for_a_while() for each in passes))
     return {column: float(still) for column, still in enumerate(seconds) if still > least}
-
-
-def _whole(usable: NDArray[np.bool_], starts: NDArray[np.int64], length: int) -> NDArray[np.bool_]:
-    """Return which segments have usable samples only."""
-    missing = np.concatenate([[0], np.cumsum(~usable)])
-    return np.asarray(missing[starts + length] == missing[starts])
 
 
 def _utc_ns(at: datetime | None) -> int | None:

@@ -12,6 +12,7 @@ from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.resampling import reach
 from daq.errors import CannotAlignError
 from daq.estimation.estimation import estimate
+from daq.estimation.segments import segment_pass
 from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
@@ -289,8 +290,9 @@ def test_the_motion_gives_the_offset_of_shared_clocks_if_arrivals_cannot(tmp_pat
 
 
 def test_a_first_sensor_with_noise_only_does_not_prevent_refinement_of_others(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(segment_pass, "_VALUES_AT_ONCE", 1)  # as if there were very many sensors
     motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
 
     def seen(seed: int) -> NDArray[np.int32]:
