@@ -390,6 +390,8 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
     assert result is not None
     assert result.closed
     assert noted.seen[-1].closed
+    if started_here:  # the same files again
+        return
     alone = [estimate([tmp_path / name], SETTINGS) for name in ("run.h5", "run-3.h5")]
     assert alone[0].n_segments == result.n_segments  # given the first, it finds the other
     assert result.n_segments > alone[1].n_segments > 10

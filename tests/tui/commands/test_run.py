@@ -244,7 +244,7 @@ def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> No
 
 
 def test_demo_shows_which_estimate_is_right() -> None:
-    document = huddle("demo", "--duration", "60s", "--speed", "4", "--json", "-").stdout
+    document = huddle("demo", "--duration", "40s", "--speed", "8", "--json", "-").stdout
     channels = json.loads(document)["channels"]
     covers = {
         method: [entry["covers"] for entry in channels if entry["method"] == method]
