@@ -8,6 +8,7 @@ world by its value, and every gap a true length. What went onto the wires stands
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -68,9 +69,13 @@ class Log:
                 log.utc_ns[sensor] = told["utc_ns"]
         return log
 
-    def kinds(self, sensor: str) -> set[str]:
-        """Return the kinds of faults that struck a sensor's device."""
-        return {told["kind"] for told in self.struck if told["sensors"] == [sensor]}
+    def kinds(self, sensor: str, *, since: float = -math.inf) -> set[str]:
+        """Return the kinds of faults that struck a sensor's device after a world time."""
+        return {
+            told["kind"]
+            for told in self.struck
+            if told["sensors"] == [sensor] and told["at"] > since
+        }
 
 
 def true_counts(spec: Mapping[str, Any], log: Log, sensor: str) -> Counts:
