@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from daq.errors import ImportFormatError
+from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
 
 if TYPE_CHECKING:
@@ -38,17 +39,6 @@ def _is_header(head: bytes) -> bool:
     return len(head) >= _HEADER_BYTES and head[6] in _QUALITIES and head[:6].strip().isdigit()
 
 
-def _pymseed() -> Any:  # noqa: ANN401 - its classes are made at run time
-    try:
-        import pymseed  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise ImportFormatError(
-            "miniSEED is read by pymseed, which is not installed; run: pip install"
-            " 'huddle-bench[formats]'"
-        ) from error
-    return pymseed
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MiniSeedPart:
     """Records of a file, from one byte to another; `record_length` is 0 if it varies."""
@@ -65,7 +55,7 @@ class MiniSeedPart:
 
     def load(self) -> Sequence[Trace]:
         """Return the traces in these records; text, such as a log, is left out."""
-        pymseed = _pymseed()
+        pymseed = load("pymseed", reads="miniSEED is", extra="formats")
         try:
             with self.path.open("rb") as file:
                 file.seek(self.offset)
@@ -126,7 +116,7 @@ def miniseed_parts(path: Path) -> Iterator[MiniSeedPart]:
     ImportFormatError
         pymseed is not installed, or the file begins with no record.
     """
-    pymseed = _pymseed()
+    pymseed = load("pymseed", reads="miniSEED is", extra="formats")
     size = path.stat().st_size
     with path.open("rb") as file:
         try:

@@ -14,6 +14,7 @@ import numpy as np
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S
+from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
 
 if TYPE_CHECKING:
@@ -21,17 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _SAMPLES = 1 << 18
-
-
-def _nptdms() -> Any:  # noqa: ANN401 - it has no types
-    try:
-        import nptdms  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise ImportFormatError(
-            "TDMS is read by npTDMS, which is not installed; run: pip install"
-            " 'huddle-bench[vibration]'"
-        ) from error
-    return nptdms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +40,7 @@ class TdmsPart:
 
     def load(self) -> list[Trace]:
         """Read the samples."""
-        nptdms = _nptdms()
+        nptdms = load("npTDMS", reads="TDMS is", extra="vibration")
         try:
             with nptdms.TdmsFile.open(self.path) as file:
                 return [
@@ -102,7 +92,7 @@ def tdms_parts(path: Path, sampling_rate: float | None) -> Iterator[TdmsPart]:
     ImportFormatError
         npTDMS is not installed, or cannot read the file.
     """
-    nptdms = _nptdms()
+    nptdms = load("npTDMS", reads="TDMS is", extra="vibration")
     try:
         with nptdms.TdmsFile.open(path) as file:
             n_samples = max((len(c) for g in file.groups() for c in g.channels()), default=0)

@@ -14,6 +14,7 @@ import numpy as np
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, finite_stretches
+from daq.formats.readers.packages import load
 from daq.formats.traces import Trace
 
 if TYPE_CHECKING:
@@ -25,17 +26,6 @@ _DIRECTIONS = {0: "S", 1: "X", 2: "Y", 3: "Z", 4: "RX", 5: "RY", 6: "RZ"}
 _UINT8_ZERO = 128
 
 
-def _pyuff() -> Any:  # noqa: ANN401 - it has no types
-    try:
-        import pyuff  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise ImportFormatError(
-            "universal files are read by pyuff, which is not installed; run: pip install"
-            " 'huddle-bench[vibration]'"
-        ) from error
-    return pyuff
-
-
 def read_uff(path: Path) -> list[Trace]:
     """Read the time responses of a universal file.
 
@@ -44,7 +34,7 @@ def read_uff(path: Path) -> list[Trace]:
     ImportFormatError
         pyuff is not installed or cannot read the file, or it holds no time response.
     """
-    pyuff = _pyuff()
+    pyuff = load("pyuff", reads="universal files are", extra="vibration")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

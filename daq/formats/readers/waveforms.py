@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from daq.errors import ImportFormatError
+from daq.formats.readers.packages import load
 from daq.formats.traces import FilePart, LoadedPart, Trace
 
 if TYPE_CHECKING:
@@ -41,16 +42,7 @@ def load_obspy() -> Any:  # noqa: ANN401 - ObsPy has no types
     ImportFormatError
         It is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its own, about importlib.metadata
-            import obspy  # noqa: PLC0415 - takes 0.2 s, and is an extra
-    except ImportError as error:
-        raise ImportFormatError(
-            "this format is read by ObsPy, which is not installed; "
-            "run: pip install 'huddle-bench[formats]'"
-        ) from error
-    return obspy
+    return load("ObsPy", reads="this format is", extra="formats")
 
 
 def waveform_format(path: Path) -> str:
