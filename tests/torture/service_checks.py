@@ -13,6 +13,7 @@ from daq.recording.repair import verify
 from daq.recording.storage.journal import journal_path
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 
@@ -33,8 +34,14 @@ def fault_of_recording(path: Path, truth: Path | None = None) -> str:
     return ""
 
 
-def faults_of_results(recording: Path, *, report: bool = False) -> list[str]:
-    """Return which results of a run are not there, or cut in the middle."""
+def faults_of_results(parts: Sequence[Path], *, report: bool = False) -> list[str]:
+    """Return which results of a run are not there, or cut in the middle.
+
+    They stand with the last part that holds a segment: a part that a kill or a power cut ended
+    after a few seconds is left out of the estimate.
+    """
+    holding = [part for part in parts if part.with_suffix(".json").exists()]
+    recording = (holding or parts)[-1]
     found = []
     with Recording.open(recording) as opened:
         if not opened.result_attributes():

@@ -200,8 +200,8 @@ def faults(
         found += filter(None, [fault_of_recording(bench.recording_directory / part)])
     for run in runs:
         if run.state is RunState.DONE and run.removed is None:
-            last = bench.recording_directory / run.parts[-1]
-            found += faults_of_results(last, report=has_reports)
+            own = [bench.recording_directory / part for part in run.parts]
+            found += faults_of_results(own, report=has_reports)
     there = {path.name for path in bench.recording_directory.glob("*.h5")}
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
 

@@ -167,7 +167,7 @@ def faults(disk: Path, acknowledged: bytes, truth: Path, bench_path: Path) -> It
             elif not is_going:
                 yield f"{part}: lost"
         if not is_going:
-            yield from faults_of_results(disk / run.parts[-1])
+            yield from faults_of_results([disk / part for part in run.parts])
     known = {part for run in runs for part in run.parts}
     yield from (f"{p.name}: of no run" for p in disk.glob("[!.]*.h5") if p.name not in known)
 
