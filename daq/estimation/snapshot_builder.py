@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording
     from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
+    from estimator.types import FloatArray
 
 _RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
 _DIAGNOSIS_SHARE = 0.01  # of the time, that diagnoses of a growing recording may take
@@ -140,14 +142,15 @@ class SnapshotBuilder:
             diagnostics = self._findings.added_to(diagnostics)
         too_much = added(diagnostics, estimates.results)
         gaps = _bridged(passes, estimates.results)
+        found = diagnostics.diagnosis
+        steady = None if found is None else found.stability
+        factor = 1.0 if steady is None else math.sqrt(steady.inflation)
         return Snapshot(
             frequency=frequency,
             csm=csm,
             results={
-                name: _widened(
-                    found if too_much is None else replace(found, low=found.low - too_much), gaps
-                )
-                for name, found in estimates.results.items()
+                name: _widened(each, factor=factor, too_much=too_much, gaps=gaps)
+                for name, each in estimates.results.items()
             },
             refused=estimates.refused,
             channels=tuple(
@@ -249,14 +252,33 @@ def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridge
     )
 
 
-def _widened(result: SelfNoise, found: Bridged | None) -> SelfNoise:
-    """Return an estimate whose interval includes what segments with gaps bring in."""
-    if found is None:
-        return result
-    psd = np.abs(result.noise_psd)
-    too_high = np.clip(np.nan_to_num(found.leakage), 0.0, 1.0) * psd
-    too_low = np.clip(np.nan_to_num(-found.leakage), 0.0, 1.0) * psd
-    return replace(result, low=result.low - too_high, high=result.high + too_low)
+def _widened(
+    result: SelfNoise, *, factor: float, too_much: FloatArray | None, gaps: Bridged | None
+) -> SelfNoise:
+    """Return an estimate whose intervals include what its method does not know.
+
+    Parameters
+    ----------
+    result : SelfNoise
+    factor : float
+        Standard error over that for steady noise.
+    too_much : float64, shape (n_freqs, n_channels), optional
+        What the clocks may have added, unit**2/Hz.
+    gaps : Bridged, optional
+        What segments with gaps bring in.
+    """
+    psd, low, high = result.noise_psd, result.low, result.high
+    if factor > 1:
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            in_log = (low > 0) & (psd > 0)
+            low = np.where(in_log, psd * (low / psd) ** factor, psd - factor * (psd - low))
+            high = np.where(in_log, psd * (high / psd) ** factor, psd + factor * (high - psd))
+    if too_much is not None:
+        low = low - too_much
+    if gaps is not None:
+        low = low - np.clip(np.nan_to_num(gaps.leakage), 0.0, 1.0) * np.abs(psd)
+        high = high + np.clip(np.nan_to_num(-gaps.leakage), 0.0, 1.0) * np.abs(psd)
+    return replace(result, cov=factor * result.cov, low=low, high=high)
 
 
 def _counting_rates(recording: ReadableRecording) -> dict[str, float]:

@@ -77,17 +77,18 @@ def _disturbed(advice: DisturbedSegments, names: Names) -> Explanation:
 
 @explain.register(NoiseChanges)
 def _changes(advice: NoiseChanges, names: Names) -> Explanation:
-    corrected = (
-        f" Tests allow for it: residuals scatter {advice.inflation:.2g} times as much."
+    intervals = (
+        f"Intervals and tests allow for it: the variance is {advice.inflation:.2g} times that of "
+        "steady noise"
         if advice.inflation > 1
-        else ""
+        else "Intervals are those of steady noise"
     )
     return Explanation(
         f"The noise changes during the recording, most in {names.channels[advice.channel]} at "
         f"{where(advice)}: by {percent(advice.deviation)} between {advice.n_parts} parts "
-        f"({percent(advice.expected)} if it were steady). The estimate is the mean. Intervals are "
-        f"those of steady noise; another recording of this length would differ by "
-        f"{percent(advice.deviation / math.sqrt(advice.n_parts))} (standard error).{corrected}",
+        f"({percent(advice.expected)} if it were steady). The estimate is the mean. "
+        f"{intervals}; another recording of this length would differ by "
+        f"{percent(advice.deviation / math.sqrt(advice.n_parts))} (standard error).",
         "Estimate parts of the recording by themselves (--start, --end).",
     )
 

@@ -136,8 +136,8 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
         ),
         (
             "most in b.y at 2–8 Hz: by 45 % between 12 parts (10 % if it were steady)",
-            "scatter 1.4 times as much",
-            "Intervals are those of steady noise",
+            "the variance is 1.4 times that of steady noise",
+            "Intervals and tests allow for it",
             "by 13 % (standard error)",
         ),
     ),
