@@ -1,18 +1,11 @@
-"""The front door: ``import huddle``, its numbers, what it refuses, and ``python -m huddle``."""
+"""``import huddle``: its numbers, what it refuses, and its results."""
 
 from __future__ import annotations
 
-import ast
-import doctest
-import importlib
-import importlib.metadata
 import json
-import re
-import subprocess
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,18 +15,10 @@ from scipy import signal
 from typer.testing import CliRunner
 
 import huddle
-from daq.bench.estimate_settings import table_keys
 from daq.errors import WrongSettingError
-from daq.python_process import python_command
 from estimator.errors import BandError
-from tests.test_architecture import modules_after
 from tui.cli.main import app
-from tui.notebook import estimates, planning, recording, simulation
-from tui.notebook.options import EstimateOptions
 from tui.output import extras
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 FloatArray = NDArray[np.float64]
 
@@ -369,223 +354,3 @@ def test_a_package_that_is_missing_is_named_with_its_extra(
             extras.MissingPackageError, match=r"is not installed; run: pip install 'huddle-bench\["
         ):
             call()
-
-
-# --------------------------------------------------------------- recordings, simulations, plans
-
-
-def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
-    sensors = triaxial()
-    sensors["A"][100:103] = np.nan
-    path = imported(tmp_path, sensors)
-    with huddle.open(path) as recording:
-        assert recording.sensors == ("A", "B", "C")
-        assert recording.channels("A") == ("1", "2", "3")
-        assert recording.sampling_rate("A") == RATE
-        assert recording.closed
-        for name, array in sensors.items():
-            np.testing.assert_array_equal(recording.samples(name), array)
-        assert "A: 1 2 3 at 100 Hz, 19997 samples" in repr(recording)
-        assert "1 gap" in repr(recording)
-        with pytest.raises(WrongSettingError, match="sensor='Z': expected one of A, B, C"):
-            recording.samples("Z")
-        assert [event.kind for event in recording.events] == []
-        created = recording.created
-        result = recording.estimate(start="20s", end=created.replace(minute=2))
-        same = huddle.estimate(recording, start="20s", end="2min")
-        np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
-    assert created == datetime(1970, 1, 1, tzinfo=UTC)
-    assert result.snapshot.elapsed == pytest.approx(100)
-    same = huddle.estimate([path], start=20.0, end="1970-01-01T00:02:00")
-    np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
-    with pytest.raises(WrongSettingError, match="start='soon': expected UTC as in"):
-        huddle.estimate(path, start="soon")
-
-
-def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: Path) -> None:
-    simulation = huddle.simulate("fig9", duration="4min")
-    assert simulation.fs == {"i": 200.0, "j": 200.0, "k": 200.0}
-    assert {array.shape for array in simulation.values()} == {(48_000, 2)}
-    result = huddle.self_noise(simulation, fs=simulation.fs, unit="m/s²", segment="2s")
-    band = result.band(5, 60)
-    inside = (result.frequency >= 5) & (result.frequency <= 60)
-    truth = simulation.true_noise_psd(result.frequency[inside]).mean(axis=0)
-    assert np.mean((band.noise_low < truth) & (truth < band.noise_high)) >= 5 / 6
-    simulation.write(tmp_path / "fig9.h5")
-    recording = huddle.open(tmp_path / "fig9.h5")
-    assert recording.bench is not None
-    for sensor in recording.bench.sensors:
-        half_a_count = 0.5001 / sensor.channels[0].sensitivity
-        found = recording.samples(sensor.name)
-        np.testing.assert_allclose(found, simulation[sensor.name], rtol=0, atol=half_a_count)
-    of_file = huddle.estimate(recording, segment="2s")
-    np.testing.assert_allclose(of_file.band(5, 60).noise_psd, band.noise_psd, rtol=1e-3)
-
-
-def test_a_simulation_has_a_seed_and_may_be_a_table() -> None:
-    table = {
-        "motion": {"spectra": [{"shape": "white", "level": 1e-9}]},
-        "sensors": {name: {"noise": {"shape": "white", "level": 1e-13}} for name in "ABC"},
-    }
-    first, second, again = (
-        huddle.simulate(table, duration=10, fs=50, seed=seed)["A"] for seed in (1, 2, 1)
-    )
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, second)
-    with pytest.raises(ValueError, match="'fig99' is neither a file nor a scenario; expected"):
-        huddle.simulate("fig99")
-    with pytest.raises(ValueError, match="sampling_rate"):
-        huddle.simulate(table, duration=10)
-    with pytest.raises(WrongSettingError, match="duration='long': expected a positive duration"):
-        huddle.simulate("fig9", duration="long")
-    with pytest.raises(WrongSettingError, match="fs=50: fig9 has its own; expected no fs"):
-        huddle.simulate("fig9", fs=50)
-
-
-def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
-    bench = tmp_path / "bench.toml"
-    command("init", "--out", str(bench))
-    arguments = ("--snr", "250", "--cov", "0.05")
-    printed = json.loads(command("plan", str(bench), *arguments, "--json", "-"))
-    found = huddle.plan(bench, snr=250, cov=0.05)
-    assert [entry.method for entry in found.values()] == [m["method"] for m in printed["methods"]]
-    for entry, document in zip(found.values(), printed["methods"], strict=True):
-        assert entry.duration == document["duration"]
-        assert entry.bias.tolist() == document["bias"]
-    assert repr(found).split() == command("plan", str(bench), *arguments).split()
-    aligned = huddle.plan(snr=250, fs=200, segment="10s")
-    assert "or use six sensors: five on a circle of 12 cm" in aligned.remarks[-1]
-    four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)
-    assert "no band is called accepted" in four.remarks[-1]
-    six = huddle.plan(snr=250, fs=200, segment="10s", sensors=6)
-    assert "six sensors" not in six.remarks[-1]
-    assert aligned.waves is not None
-    assert six.waves is not None
-    # long waves: bias in parts of the noise over SNR times (2 pi radius / wavelength)**2
-    share = 0.01 / (250 * (2 * np.pi * 0.12 * aligned.waves.one_percent / 150) ** 2)
-    assert 0.1 < share < 10
-    # as good as six where they are best, to 10 %; three sensors have no bound
-    assert abs(six.waves.cost / six.waves.cost_of_six - 1) < 0.1
-    assert aligned.waves.cost == np.inf
-    assert max(map(abs, aligned["three-channel"].bias)) < 1e-3
-    for wrong, said in (
-        ({"fs": None}, "fs=None: expected a sampling rate"),
-        ({"fs": 200, "sensors": 0}, "sensors=0: expected a number from 1"),
-        ({"bench": bench, "fs": 200, "overlap": 0}, "fs, overlap: expected in the bench file"),
-    ):
-        with pytest.raises(WrongSettingError, match=said):
-            huddle.plan(snr=250, **wrong)
-
-
-# ------------------------------------------------------------------------------ the door itself
-
-
-@pytest.mark.parametrize("module", [huddle, estimates, planning, recording, simulation])
-def test_the_examples_in_the_documentation_run(
-    module: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found = doctest.testmod(module)
-    assert found.attempted >= 3
-    assert found.failed == 0
-
-
-def test_the_front_door_loads_nothing_until_it_is_used() -> None:
-    loaded = modules_after("import huddle") - modules_after(
-        "import importlib.util, pathlib, typing"
-    )
-    assert loaded - {"__future__"} == {"huddle"}
-
-
-def test_only_what_is_asked_for_is_loaded() -> None:
-    call = "import huddle; huddle.self_noise({k: [float(ord(k)) * n % 97 for n in range(4000)]"
-    loaded = modules_after(f"{call} for k in 'ABC'}}, fs=100, segment=1)")
-    assert "numpy" in loaded
-    assert not loaded & {"xarray", "pandas", "matplotlib", "textual", "obspy", "asyncio", "serial"}
-
-
-def imports_of(path: Path) -> dict[str, str]:
-    """Return the module of each name of ours that a file imports."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {
-        name.name: node.module
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module
-        for name in node.names
-        if node.module.partition(".")[0] in {"daq", "estimator", "sim_devices", "tui"}
-    }
-
-
-def test_names_types_and_modules_of_the_front_door_agree() -> None:
-    imported = imports_of(ROOT / "huddle.py")
-    assert imported.pop("main") == "tui.cli.main"
-    assert sorted(imported) == sorted(huddle.__all__) == sorted(set(dir(huddle)) & set(imported))
-    assert imports_of(ROOT / "tui" / "resources" / "huddle.pyi") == imported
-    for name, module in imported.items():
-        assert getattr(huddle, name) is getattr(importlib.import_module(module), name)
-
-
-def test_every_option_is_typed_and_explained() -> None:
-    typed = set(EstimateOptions.__annotations__)
-    assert typed == set(table_keys())
-    text = str(huddle.estimate.__doc__)
-    explained = re.findall(r"^    (\w+) : ", text[text.index("Other Parameters") :], re.MULTILINE)
-    assert typed <= set(explained)
-
-
-def test_public_names_are_there() -> None:
-    for name in huddle.__all__:
-        assert getattr(huddle, name).__doc__
-    assert huddle.__version__ == importlib.metadata.version("huddle-bench")
-    with pytest.raises(AttributeError, match="no attribute 'selfnoise'"):
-        huddle.selfnoise  # type: ignore[attr-defined]  # noqa: B018 - what is tested
-
-
-def test_the_module_is_the_command() -> None:
-    of_module, of_command = (
-        subprocess.run([*start, "--version"], capture_output=True, text=True, check=True).stdout
-        for start in (python_command("huddle"), [Path(sys.executable).with_name("huddle")])
-    )
-    assert of_module == of_command
-    assert of_module.startswith("huddle ")
-
-
-@pytest.fixture
-def crowded(tmp_path: Path) -> Path:
-    """Make a folder with modules of the user's own; each ends the process that imports it."""
-    for name in ("random", "cronsim", "json", "numpy"):
-        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('own {name}')", encoding="utf-8")
-    for name in ("tui", "daq"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text(f"raise SystemExit('own {name}')")
-    (tmp_path / "script.py").write_text("import huddle; print(huddle.plan(snr=1e3, fs=200))")
-    return tmp_path
-
-
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Python in a folder."""
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False
-    )
-
-
-def test_the_module_runs_as_a_command_in_a_crowded_folder(crowded: Path) -> None:
-    done = run(crowded, "-m", "huddle", "--version")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("huddle ")
-    assert "Usage: huddle plan" in run(crowded, "-m", "huddle", "plan", "--help").stdout
-
-
-def test_packages_that_hide_ours_are_named(crowded: Path) -> None:
-    done = run(crowded, "script.py")
-    assert done.returncode == 1
-    said = done.stderr.splitlines()[-1]
-    own = crowded / "daq" / "__init__.py"
-    assert said.startswith(f"ImportError: {own}: hides the package 'daq' of huddle; expected")
-    assert "-P" in said
-
-
-def test_a_script_beside_them_runs_with_its_folder_off_the_path(crowded: Path) -> None:
-    done = run(crowded, "-P", "script.py")
-    assert done.returncode == 0, done.stderr
-    assert "three-sensor" in done.stdout

@@ -1,0 +1,120 @@
+"""``import huddle``: recordings, simulations and plans."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+import huddle
+from daq.errors import WrongSettingError
+from tests.test_huddle import RATE, command, imported, triaxial
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
+    sensors = triaxial()
+    sensors["A"][100:103] = np.nan
+    path = imported(tmp_path, sensors)
+    with huddle.open(path) as recording:
+        assert recording.sensors == ("A", "B", "C")
+        assert recording.channels("A") == ("1", "2", "3")
+        assert recording.sampling_rate("A") == RATE
+        assert recording.closed
+        for name, array in sensors.items():
+            np.testing.assert_array_equal(recording.samples(name), array)
+        assert "A: 1 2 3 at 100 Hz, 19997 samples" in repr(recording)
+        assert "1 gap" in repr(recording)
+        with pytest.raises(WrongSettingError, match="sensor='Z': expected one of A, B, C"):
+            recording.samples("Z")
+        assert [event.kind for event in recording.events] == []
+        created = recording.created
+        result = recording.estimate(start="20s", end=created.replace(minute=2))
+        same = huddle.estimate(recording, start="20s", end="2min")
+        np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
+    assert created == datetime(1970, 1, 1, tzinfo=UTC)
+    assert result.snapshot.elapsed == pytest.approx(100)
+    same = huddle.estimate([path], start=20.0, end="1970-01-01T00:02:00")
+    np.testing.assert_array_equal(same.noise_psd, result.noise_psd)
+    with pytest.raises(WrongSettingError, match="start='soon': expected UTC as in"):
+        huddle.estimate(path, start="soon")
+
+
+def test_a_simulation_is_estimated_from_memory_and_from_its_recording(tmp_path: Path) -> None:
+    simulation = huddle.simulate("fig9", duration="4min")
+    assert simulation.fs == {"i": 200.0, "j": 200.0, "k": 200.0}
+    assert {array.shape for array in simulation.values()} == {(48_000, 2)}
+    result = huddle.self_noise(simulation, fs=simulation.fs, unit="m/s²", segment="2s")
+    band = result.band(5, 60)
+    inside = (result.frequency >= 5) & (result.frequency <= 60)
+    truth = simulation.true_noise_psd(result.frequency[inside]).mean(axis=0)
+    assert np.mean((band.noise_low < truth) & (truth < band.noise_high)) >= 5 / 6
+    simulation.write(tmp_path / "fig9.h5")
+    recording = huddle.open(tmp_path / "fig9.h5")
+    assert recording.bench is not None
+    for sensor in recording.bench.sensors:
+        half_a_count = 0.5001 / sensor.channels[0].sensitivity
+        found = recording.samples(sensor.name)
+        np.testing.assert_allclose(found, simulation[sensor.name], rtol=0, atol=half_a_count)
+    of_file = huddle.estimate(recording, segment="2s")
+    np.testing.assert_allclose(of_file.band(5, 60).noise_psd, band.noise_psd, rtol=1e-3)
+
+
+def test_a_simulation_has_a_seed_and_may_be_a_table() -> None:
+    table = {
+        "motion": {"spectra": [{"shape": "white", "level": 1e-9}]},
+        "sensors": {name: {"noise": {"shape": "white", "level": 1e-13}} for name in "ABC"},
+    }
+    first, second, again = (
+        huddle.simulate(table, duration=10, fs=50, seed=seed)["A"] for seed in (1, 2, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, second)
+    with pytest.raises(ValueError, match="'fig99' is neither a file nor a scenario; expected"):
+        huddle.simulate("fig99")
+    with pytest.raises(ValueError, match="sampling_rate"):
+        huddle.simulate(table, duration=10)
+    with pytest.raises(WrongSettingError, match="duration='long': expected a positive duration"):
+        huddle.simulate("fig9", duration="long")
+    with pytest.raises(WrongSettingError, match="fs=50: fig9 has its own; expected no fs"):
+        huddle.simulate("fig9", fs=50)
+
+
+def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
+    bench = tmp_path / "bench.toml"
+    command("init", "--out", str(bench))
+    arguments = ("--snr", "250", "--cov", "0.05")
+    printed = json.loads(command("plan", str(bench), *arguments, "--json", "-"))
+    found = huddle.plan(bench, snr=250, cov=0.05)
+    assert [entry.method for entry in found.values()] == [m["method"] for m in printed["methods"]]
+    for entry, document in zip(found.values(), printed["methods"], strict=True):
+        assert entry.duration == document["duration"]
+        assert entry.bias.tolist() == document["bias"]
+    assert repr(found).split() == command("plan", str(bench), *arguments).split()
+    aligned = huddle.plan(snr=250, fs=200, segment="10s")
+    assert "or use six sensors: five on a circle of 12 cm" in aligned.remarks[-1]
+    four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)
+    assert "no band is called accepted" in four.remarks[-1]
+    six = huddle.plan(snr=250, fs=200, segment="10s", sensors=6)
+    assert "six sensors" not in six.remarks[-1]
+    assert aligned.waves is not None
+    assert six.waves is not None
+    # long waves: bias in parts of the noise over SNR times (2 pi radius / wavelength)**2
+    share = 0.01 / (250 * (2 * np.pi * 0.12 * aligned.waves.one_percent / 150) ** 2)
+    assert 0.1 < share < 10
+    # as good as six where they are best, to 10 %; three sensors have no bound
+    assert abs(six.waves.cost / six.waves.cost_of_six - 1) < 0.1
+    assert aligned.waves.cost == np.inf
+    assert max(map(abs, aligned["three-channel"].bias)) < 1e-3
+    for wrong, said in (
+        ({"fs": None}, "fs=None: expected a sampling rate"),
+        ({"fs": 200, "sensors": 0}, "sensors=0: expected a number from 1"),
+        ({"bench": bench, "fs": 200, "overlap": 0}, "fs, overlap: expected in the bench file"),
+    ):
+        with pytest.raises(WrongSettingError, match=said):
+            huddle.plan(snr=250, **wrong)
