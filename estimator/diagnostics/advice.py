@@ -81,12 +81,15 @@ class NoSharedMotion(Advice):
         Largest share of the motion that the sensor has in common with one of them; 0 for none.
     share_of_partners : float
         Smallest share of the motion that two partners have in common.
+    for_part : bool
+        Whether it shared the motion for another part of the test; `share` is then 0.
     """
 
     kind: ClassVar[AdviceKind] = AdviceKind.NO_SHARED_MOTION
     partners: tuple[int, ...]
     share: float
     share_of_partners: float
+    for_part: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

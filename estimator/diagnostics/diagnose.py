@@ -22,7 +22,7 @@ from estimator.diagnostics.relative_response import (
     relative_response,
 )
 from estimator.diagnostics.rules import advise
-from estimator.diagnostics.shared_motion import shared_motion
+from estimator.diagnostics.shared_motion import may_have_moved, moved, shared_motion
 from estimator.diagnostics.shared_noise import shared_noise
 from estimator.diagnostics.stability import Stability, stability
 from estimator.diagnostics.time_rules import changes
@@ -206,13 +206,18 @@ def diagnose(
         )
         for inside in (number == b for b in np.unique(number))
     )
-    shared, steady = None, None
+    shared, steady, left = None, None, frozenset[int]()
+    if course is not None:
+        course = replace(course, spectra=course.spectra[:, :, list(there.channels)])
+        if any(may_have_moved(each.shared) for each in found):
+            gone = moved(course.spectra, there.dims, n_effective)
+            left = frozenset(there.sensors[sensor] for sensor in gone)
+            found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
     between = HANN_HALF if neighbours is None else neighbours
     if isinstance(tested, Maximum) and q >= d:
         if course is not None:
-            alive_course = replace(course, spectra=course.spectra[:, :, list(there.channels)])
             steady = stability(
-                alive_course, tested, frequency, n_effective=n_effective, neighbours=between
+                course, tested, frequency, n_effective=n_effective, neighbours=between
             )
         if steady is not None:
             steady = steady.among(there.channels, sum(dims))
@@ -249,6 +254,7 @@ def diagnose(
             n_effective=n_effective,
             nyquist=float(frequency[-1]),
             shared=shared,
+            moved=left,
             further=(
                 ()
                 if steady is None or course is None
@@ -257,6 +263,14 @@ def diagnose(
         ),
         stability=steady,
     )
+
+
+def _without(shared: FloatArray, sensors: frozenset[int]) -> FloatArray:
+    """Return shares of common motion of which these sensors have none."""
+    shared = shared.copy()
+    for sensor in sensors:
+        shared[sensor] = shared[:, sensor] = np.where(np.isnan(shared[sensor]), np.nan, 0.0)
+    return shared
 
 
 def _shared(

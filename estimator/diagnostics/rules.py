@@ -70,6 +70,7 @@ def advise(
     nyquist: float,
     shared: SharedPairs | None = None,
     further: tuple[Advice, ...] = (),
+    moved: frozenset[int] = frozenset(),
 ) -> tuple[Advice, ...]:
     """Return the advice on a test, most severe first.
 
@@ -90,13 +91,18 @@ def advise(
         Pairs of channels that share noise: their part of the statistic is no further misfit.
     further : tuple of Advice
         Other advice to include.
+    moved : frozenset of int
+        Sensors that left their place for a part of the test.
 
     Returns
     -------
     tuple of Advice
     """
     alive = presence(given, dims).dims
-    strangers = list(_strangers(bands, len(dims), n_effective))
+    strangers = [
+        replace(each, for_part=not moved.isdisjoint(each.sensors))
+        for each in _strangers(bands, len(dims), n_effective)
+    ]
     others = [
         *(
             _too_few_dimensions(bands, n_factors)
@@ -129,7 +135,7 @@ def _overlap(one: Advice, other: Advice) -> bool:
 
 def _strangers(
     bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
-) -> Iterator[Advice]:
+) -> Iterator[NoSharedMotion]:
     """Yield advice on sensors that record none of the motion shared by others.
 
     Other findings in these bands are consequences, and not reported.

@@ -1,8 +1,12 @@
-"""Sensors that share a motion, and sensors that record none of it.
+"""Sensors that share a motion, and sensors that record none of it, throughout or for a while.
 
 The share of motion that two sensors have in common is the mean of their canonical coherences over
 all directions and the frequencies of a band. For independent sensors with d channels and n averages
 its mean is d / n, which is subtracted.
+
+A sensor that is moved during a test shares the motion in some parts of it, and none in others. What
+it records besides the motion of the others is then that of another place. A noisy sensor in a
+motion that fades shares less as well, but its noise is as before.
 """
 
 from __future__ import annotations
@@ -12,13 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import own_channels
+from estimator.diagnostics.relative_response import CanonicalCoherence, own_channels
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from estimator.diagnostics.relative_response import CanonicalCoherence
-    from estimator.types import BoolArray, FloatArray
+    from numpy.typing import NDArray
+
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 AGREE = 0.3
 """Share of common motion from which two sensors agree."""
@@ -26,6 +31,15 @@ NONE = 0.1
 """Share of common motion, relative to that of the other sensors, below which a sensor has none."""
 ERRORS = 3.0
 """Standard errors of a share below which a sensor has none."""
+
+PARTS = 12
+"""Number of parts of a test, at most."""
+FREQUENCIES = 8
+"""Number of frequencies that are averaged in a part."""
+LESS = 0.9
+"""Share of common motion, relative to that of others, above which a sensor left for no part."""
+GROWN = 4.0
+"""Factor from which on a sensor records more besides the motion of the others."""
 
 
 def shared_motion(
@@ -83,3 +97,90 @@ def outsiders(
     for i in range(n_sensors):
         if i not in group and max(share[i, j] for j in group) < NONE * least + error:
             yield i, group
+
+
+def may_have_moved(share: FloatArray) -> bool:
+    """Return whether a sensor shares less motion with others than these do, as one that left.
+
+    Of motion of constant power, a sensor that was away for a twelfth shares 84 %.
+    """
+    share = np.nan_to_num(share)  # of sensors without signal
+    for sensor in range(len(share)):
+        others = [each for each in range(len(share)) if each != sensor]
+        most = max((share[j, k] for j, k in combinations(others, 2)), default=0.0)
+        if most >= AGREE and min(share[sensor, each] for each in others) < LESS * most:
+            return True
+    return False
+
+
+def moved(
+    spectra: NDArray[np.complexfloating], dims: tuple[int, ...], n_effective: float
+) -> list[int]:
+    """Return the sensors that left their place for a part of the test.
+
+    Parameters
+    ----------
+    spectra : complex, shape (n_segments, n_kept, n_channels)
+        Of single segments in order of time, channels grouped by sensor, all with signal.
+    dims : tuple of int
+        Channels of each sensor.
+    n_effective : float
+        Number of independent averages of all segments.
+    """
+    known = min(n_effective, float(len(spectra)))
+    n_parts = min(PARTS, int(known // (2 * max(1, sum(dims)))))
+    n_groups = spectra.shape[1] // FREQUENCIES
+    if len(dims) < 3 or n_parts < 2 or n_groups == 0:
+        return []
+    parts = [
+        np.einsum("sfp,sfq->fpq", part, part.conj(), optimize=True) / len(part)
+        for part in np.array_split(spectra.astype(np.complex128), n_parts)
+    ]
+    groups = np.array_split(np.arange(spectra.shape[1]), n_groups)
+    looks = [[_Look(csm[group], dims, known / n_parts) for group in groups] for csm in parts]
+    return [sensor for sensor in range(len(dims)) if _is_moved(sensor, looks)]
+
+
+class _Look:
+    """Averages of one part of a test in a group of frequencies."""
+
+    def __init__(self, csm: ComplexArray, dims: tuple[int, ...], n_effective: float) -> None:
+        self._csm, self._dims = csm, dims
+        inside = np.ones(len(csm), dtype=bool)
+        self.share = shared_motion(CanonicalCoherence(csm), dims, inside, n_effective)
+        self.outside = dict(outsiders(self.share, n_effective, len(csm)))
+
+    def besides(self, sensor: int, others: tuple[int, ...]) -> float:
+        """Return the power that a sensor records besides the motion of others, in any unit."""
+        own = np.array(own_channels(self._dims, sensor))
+        rest = np.concatenate([own_channels(self._dims, other) for other in others])
+        between = self._csm[:, rest[:, None], own]
+        inverse = np.linalg.pinv(self._csm[:, rest[:, None], rest], rcond=1e-9, hermitian=True)
+        common = between.conj().swapaxes(1, 2) @ inverse @ between
+        left = self._csm[:, own[:, None], own] - common
+        return float(np.trace(left, axis1=1, axis2=2).real.mean())
+
+
+def _is_moved(sensor: int, looks: list[list[_Look]]) -> bool:
+    """Return whether a sensor shares no motion in a part, and shared it in another one."""
+    for part in looks:
+        here = [number for number, look in enumerate(part) if sensor in look.outside]
+        judged = [number for number, look in enumerate(part) if _agreeing(look.share, sensor)]
+        if not here or here != judged:
+            continue
+        for number in here:
+            others = part[number].outside[sensor]
+            before = [
+                other[number].besides(sensor, others)
+                for other in looks
+                if min(other[number].share[sensor, each] for each in others) >= AGREE
+            ]
+            if before and part[number].besides(sensor, others) > GROWN * float(np.median(before)):
+                return True
+    return False
+
+
+def _agreeing(share: FloatArray, sensor: int) -> bool:
+    """Return whether two sensors besides this one agree."""
+    others = [each for each in range(len(share)) if each != sensor]
+    return any(share[j, k] >= AGREE for j, k in combinations(others, 2))

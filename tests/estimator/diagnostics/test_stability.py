@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import AdviceKind
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges
+from estimator.diagnostics.relative_response import CanonicalCoherence
+from estimator.diagnostics.shared_motion import may_have_moved, moved, shared_motion
 from estimator.diagnostics.stability import PARTS, SegmentCourse
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.segment_spectra import (
@@ -19,6 +23,9 @@ from estimator.spectra.segment_spectra import (
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from tests.estimator.csm_models import rotation
+
+if TYPE_CHECKING:
+    from estimator.types import ComplexArray
 
 LENGTH, HOP = 256, 128
 N_SEGMENTS = 300
@@ -108,3 +115,42 @@ def test_kept_segments_are_bounded_in_number() -> None:
     assert kept.every == 4
     assert np.array_equal(kept.values()[:, 0, 0].real, np.arange(0, n, 4))
     assert 64 <= SegmentSpectra(bins, 192).most <= MAX_VALUES / (192 * len(bins))
+
+
+def course_of(
+    rng: np.random.Generator, *, snr: float, noise: float = 1.0, fade: float = 1.0, away: float = 0
+) -> ComplexArray:
+    """Return 360 segments of three triaxial sensors; the last one is away at the end.
+
+    Its noise is `noise` times that of the others; the motion fades to `fade` of its amplitude.
+    """
+
+    def white(*shape: int) -> ComplexArray:
+        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+    n, n_kept = 360, 48
+    here, elsewhere = white(2, n, n_kept, 3)
+    level = np.sqrt(snr) * np.linspace(1.0, fade, n)[:, None, None]
+    is_away = (np.arange(n) >= n * (1 - away))[:, None, None]
+    sensors = []
+    for number in range(3):
+        motion = np.where(is_away, elsewhere, here) if number == 2 else here
+        turned = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        own = np.sqrt(noise if number == 2 else 1.0) * white(n, n_kept, 3)
+        sensors.append(level * turned + own)
+    return np.concatenate(sensors, axis=2)
+
+
+@pytest.mark.parametrize("snr", [10.0, 1e4])
+def test_a_sensor_that_leaves_its_place_is_named_and_a_noisy_one_is_not(snr: float) -> None:
+    rng = np.random.default_rng(8)
+    for away in (0.1, 0.5, 0.9):
+        course = course_of(rng, snr=snr, away=away)
+        assert moved(course, DIMS, 340.0) == [2]
+        csm = np.einsum("sfp,sfq->fpq", course, course.conj()) / len(course)
+        inside = np.ones(len(csm), dtype=bool)
+        assert may_have_moved(shared_motion(CanonicalCoherence(csm), DIMS, inside, 340.0))
+    for noise in (1.0, 10.0, 1000.0):
+        fading = course_of(rng, snr=snr, noise=noise, fade=0.02)
+        assert moved(fading, DIMS, 340.0) == []
+    assert moved(course_of(rng, snr=snr, away=0.5)[:30], DIMS, 28.0) == []  # too few

@@ -141,6 +141,14 @@ def _copies(advice: Copies, names: Names) -> Explanation:
 def _no_shared_motion(advice: NoSharedMotion, names: Names) -> Explanation:
     partners = names.list_sensors(advice.partners)
     few = len(advice.partners) < 3
+    if advice.for_part:
+        return Explanation(
+            f"Sensor {names.list_sensors(advice.sensors)} records none of the motion that "
+            f"{partners} share at {where(advice)} for a part of the recording. Averages over the "
+            "whole of it hold motion, not noise.",
+            "Check whether the sensor was moved. Estimate the part before (--end), or record again "
+            "with all sensors in their places.",
+        )
     return Explanation(
         f"Sensor {names.list_sensors(advice.sensors)} records none of the motion that {partners} "
         f"share at {where(advice)}: at most {percent(advice.share)} in common, {partners} "

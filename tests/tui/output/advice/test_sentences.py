@@ -187,6 +187,21 @@ SAID: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
+        NoSharedMotion(
+            level=Level.PROBLEM,
+            sensors=(0,),
+            band=BAND,
+            partners=(1, 2),
+            share=0.0,
+            share_of_partners=0.98,
+            for_part=True,
+        ),
+        (
+            "that b and c share at 2–8 Hz for a part of the recording",
+            "Estimate the part before (--end)",
+        ),
+    ),
+    (
         TooFewSensors(level=Level.PROBLEM, sensors=(0, 1)),
         ("Only sensors a and b have", "--method two-channel", "--method maximum-likelihood"),
     ),
