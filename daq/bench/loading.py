@@ -98,17 +98,17 @@ def parse(
 def _table(text: str, source: str | Path) -> dict[str, Any]:
     """Return the table of a TOML text, in bounded time."""
     if len(text) > _MAX_LENGTH:
-        said = f"{len(text)} characters; expected at most {_MAX_LENGTH}"
+        problem = f"{len(text)} characters; expected at most {_MAX_LENGTH}"
     elif _DOTTED.search(text):
-        said = "a key of more than 64 parts; expected a bench file"
+        problem = "a key of more than 64 parts; expected a bench file"
     else:
         try:
             return tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            said = f"not TOML: {error}"
+            problem = f"not TOML: {error}"
         except RecursionError:
-            said = "tables or arrays nested too deeply; expected a bench file"
-    raise BenchFileError(FileFault("", said), source=source)
+            problem = "tables or arrays nested too deeply; expected a bench file"
+    raise BenchFileError(FileFault("", problem), source=source)
 
 
 def dump(bench: Bench) -> str:

@@ -169,7 +169,7 @@ class Sensor(Table):
     driver: str = Field(description="the name of a driver")
     port: str = Field(min_length=1, description="a port, such as /dev/ttyUSB0")
     sampling_rate: PositiveNumber = Field(description="the sampling rate in Hz")
-    """In Hz; the bench's where the file does not say."""
+    """In Hz; default: that of the bench."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Options of the driver, validated by its own model."""
     channels: tuple[Channel, ...] = Field(min_length=1, description="[[sensors.channels]] tables")
@@ -284,7 +284,7 @@ class Bench(Table):
     operator: str = ""
     location: str = ""
     sampling_rate: PositiveNumber = Field(description="the sampling rate in Hz")
-    """In Hz, of the common grid, and of every sensor that does not say its own."""
+    """In Hz, of the common grid, and of every sensor without a rate of its own."""
     sensors: tuple[Sensor, ...] = Field(min_length=1, description="[[sensors]] tables")
     estimate: Annotated[
         InstanceOf[EstimateSettings],

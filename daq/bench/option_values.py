@@ -52,7 +52,7 @@ def number(value: object) -> float:
 
 
 def to_number(text: str) -> float:
-    """Return the number that a text says."""
+    """Return the number in a text."""
     try:
         return float(text)
     except ValueError:
@@ -154,7 +154,7 @@ def band(value: object) -> tuple[float, float]:
 
 
 def to_band(text: str) -> list[float]:
-    """Return the frequencies that a text says."""
+    """Return the frequencies in a text."""
     try:
         return [float(part) for part in text.split(":")]
     except ValueError:
@@ -171,7 +171,7 @@ def dimension(value: object) -> object:
 
 
 def to_dimension(text: str) -> object:
-    """Return the dimensions that a text says."""
+    """Return the number of dimensions in a text."""
     return int(text) if text.isdecimal() and len(text) <= len(str(_MAX_DIMENSION)) else text
 
 
@@ -186,7 +186,7 @@ def gains(value: object) -> dict[str, float]:
 
 
 def to_gains(texts: Sequence[str]) -> dict[str, float]:
-    """Return the gains that texts such as B=1.02 say."""
+    """Return the gains in texts such as B=1.02."""
     found: dict[str, float] = {}
     for text in texts:
         name, _, number = text.rpartition("=")

@@ -41,7 +41,7 @@ _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What is known of the test itself, as `SnapshotDiagnostics` has it; nothing at first."""
+    """Fields of `SnapshotDiagnostics` that a diagnosis fills in; empty before the first."""
 
     clipped: Mapping[int, float] = field(default_factory=dict)
     stood_still: Mapping[int, float] = field(default_factory=dict)
@@ -105,10 +105,10 @@ def synchronisation(
     csm: ComplexArray,
     results: dict[str, SelfNoise],
 ) -> Synchronisation:
-    """Say what is left between the clocks, and what it does to the noise estimate.
+    """Return the residual between the clocks, and its effect on the noise estimate.
 
-    `is_reference` says which sensors run by the clock that others are measured against; `moved`,
-    shape (n_segments, n_sensors), by how much clocks differ from those that segments were taken by.
+    `is_reference` marks the sensors on the reference clock. `moved`, shape (n_segments, n_sensors),
+    is the difference of the clocks from those that segments were taken by.
     A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common
     motion, and so into its noise.
     """
@@ -172,9 +172,9 @@ def diagnosis(
 ) -> tuple[Diagnosis | None, Untested | None]:
     """Diagnose the test.
 
-    The model tested has as many dimensions as were asked for, or as the largest sensor has
-    channels where `dimensions` were chosen by the motion. Of `faulty` channels, by column, it is
-    known that they are clipped, or were dead for a while: no sensitivity of theirs is called wrong.
+    The tested model has the dimensions of the settings; where `dimensions` were chosen by the
+    motion, as many as the largest sensor has channels. `faulty` channels, by column, are clipped or
+    were dead for a while: their sensitivities are not reported as wrong.
     `course` is that of the segments of the only band.
 
     Returns

@@ -1,16 +1,16 @@
-"""Keeps an estimate up with recordings as they grow.
+"""Updates an estimate while its recordings grow.
 
 Theory of operation
 -------------------
-Segments lie on a fixed lattice of the common grid. One that touches a clipped block is left out,
-for every sensor, and so is one that something disturbed where that is asked for. One that touches
-a gap is left out where half of the segments have none, and else bridged. Each
-new segment is transformed once, with what is known about the clocks by then. When what is known
-has become materially better for segments already taken (looked at whenever their number has grown
-by a quarter), they are taken again.
+Segments begin at fixed samples of the common grid. A segment that touches a clipped block is
+excluded, for every sensor; so is a disturbed one if the settings reject transients. A segment that
+touches a gap is excluded if at least half of the segments have no gap, otherwise it is bridged.
+Each new segment is transformed once, by the clock models of that moment. Whenever the number of
+segments has grown by a quarter, the clock models are compared with those of the segments taken
+before; if they have improved materially, all segments are taken again.
 
 ``finish`` is one pass over the whole recording with the final clocks: a function of the file
-alone. So what is shown when a run ends is what ``huddle estimate`` says about its file.
+alone. So the result at the end of a run equals that of ``huddle estimate`` on its file.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 _LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are taken again
-_REVIEW = 1.25  # growth after which that is looked at
+_REVIEW = 1.25  # growth of the number of segments after which clocks are compared
 _FIRST_REVIEW = 8  # segments
 _MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
 
@@ -61,7 +61,7 @@ class Estimation:
         Several recordings of the same sensors accumulate into one estimate. Those that are open
         already are closed with the estimate.
     settings : Settings, optional
-        What the bench in the first recording says, where not given.
+        Default: those of the bench in the first recording.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class Estimation:
 
     @property
     def n_seen(self) -> int:
-        """Segments looked at so far, those left out for gaps included."""
+        """Segments examined so far, including those excluded for gaps."""
         return sum(each.n_seen for each in self._passes)
 
     @property
@@ -183,12 +183,12 @@ class Estimation:
         Parameters
         ----------
         progress : callable, optional
-            Told how many segments are done, and of how many.
+            Receives the number of finished segments, and of all.
 
         Raises
         ------
         NoResultError
-            If no method can say anything; the message and the snapshot's advice say why.
+            If no method gives a result; the message and the snapshot's advice give the reason.
         WrongSettingError
             If nothing lies between start and end.
         """
@@ -300,9 +300,9 @@ def estimate(
     paths : sequence of path or ReadableRecording
         Several recordings of the same sensors accumulate into one estimate.
     settings : Settings, optional
-        What the bench in the first recording says, where not given.
+        Default: those of the bench in the first recording.
     progress : callable, optional
-        Told how many segments are done, and of how many.
+        Receives the number of finished segments, and of all.
 
     Raises
     ------

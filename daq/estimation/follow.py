@@ -213,7 +213,7 @@ def _result(
 
 
 class _Sensors:
-    """The state of the sensors: as the file has it, and as the recorder says where it is quiet."""
+    """States of the sensors: from the file, and from the recorder where the file is silent."""
 
     def __init__(self, recording: Recording, observer: Observer) -> None:
         self._monitor, self._observer = RecordingMonitor(recording), observer
@@ -232,7 +232,7 @@ class _Sensors:
         self._observer.status(self._monitor.status_with_stuck_channels())
 
     def _recorder_states(self) -> dict[str, str]:
-        """Ask the recorder: only it knows at once that a sensor is late."""
+        """Ask the recorder, the first to know that a sensor is late."""
         try:
             self._address = self._address or control_address(self._path)
             if self._address is None:

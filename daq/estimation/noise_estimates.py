@@ -52,7 +52,7 @@ class Dimensions:
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """What every method says, why others say nothing, and the dimension of the motion."""
+    """Results by method, reasons of refused methods, and the dimension of the motion."""
 
     results: dict[str, SelfNoise]
     refused: dict[str, str]
@@ -141,7 +141,7 @@ def quantisation_psd(
 
 
 def known_gains(settings: Settings, channels: Channels) -> FloatArray:
-    """Return what each channel makes of the motion, as the settings say.
+    """Return the response of each channel to the motion, from the settings.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def noise_estimates(
     dims : tuple of int
     gains : float64, shape (n_channels,)
     dimensions : Dimensions, optional
-        Those chosen before, where they are not to be chosen anew.
+        Those of an earlier estimate, to be kept; default: chosen by the motion.
     positions : float64, shape (n_sensors, 3), optional
         Of the sensors, in metres.
     """

@@ -1,4 +1,4 @@
-"""Which recordings make one estimate, and what to say where they make none."""
+"""Which recordings make one estimate, and the error messages where they do not."""
 
 from __future__ import annotations
 
@@ -55,8 +55,7 @@ def continuations(
 ) -> Iterator[Recording]:
     """Open and yield the recordings that continue this one, but for `others` and empty ones.
 
-    A recorder goes on in another file where the disk refuses to take the first one. The caller
-    closes them.
+    A recorder continues in another file if writing the first one fails. The caller closes them.
     """
     known = {other.run_id for other in others}
     for found in _following(recording):
@@ -155,7 +154,7 @@ def check_span(passes: Sequence[Pass], settings: Settings) -> None:
 def _twice(path: Path, other: ReadableRecording) -> WrongSettingError:
     return WrongSettingError(
         f"{path} and {other.path} are the same recording (run {other.run_id});"
-        " give it once: twice the same samples say no more than once"
+        " give it once: the same samples do not count twice"
     )
 
 

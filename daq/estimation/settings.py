@@ -79,7 +79,7 @@ def with_changes(
     Raises
     ------
     ConflictingOptionError
-        If what was asked for does not go together.
+        If options contradict each other.
     """
     given = {name: value for name, value in changes.items() if value is not None}
     settings = replace(settings, **given)  # type: ignore[arg-type]  # of several types

@@ -159,7 +159,7 @@ class Snapshot:
         Cross-spectral matrix in unit**2/Hz; ``csm[f, p, q] = E[X_p conj(X_q)]``. NaN before the
         first segment.
     results : dict
-        Self-noise by name of the method; without those that cannot say anything (yet).
+        Self-noise by name of the method, of those that give a result.
     refused : dict
         Why, by name of the method.
     channels : tuple of ChannelLabel
@@ -170,15 +170,15 @@ class Snapshot:
     n_effective : float
         Independent averages the segments are worth; with octaves those of the highest.
     elapsed : float
-        Seconds from the start to the end of what was looked at.
+        Seconds from the start to the end of the examined span.
     start_utc_ns : int
         UTC of the first grid sample.
     sensors, clocks : tuple
     drift : float64, shape (n_segments, 1 + n_sensors)
-        Middle of each segment looked at, in seconds from `start_utc_ns`, and by how much each
-        sensor's own count of time then lags, in seconds: what the clocks do. Of the last recording.
+        Middle of each examined segment, in seconds from `start_utc_ns`, and the lag of each
+        sensor's clock then, in seconds. Of the last recording.
     closed : bool
-        Whether nothing more will come.
+        Whether the recordings are complete.
     left_out : mapping of Reason to int
         How many segments were left out, by reason.
     octaves : tuple of Octave
@@ -245,7 +245,7 @@ class Snapshot:
 
 
 class NoResultError(InsufficientDataError):
-    """No method can say anything of any channel.
+    """No method gives a result for any channel.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Snapshots of an estimate: what its passes through the recordings show by now."""
+"""Makes snapshots of an estimate from the segments taken so far."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from estimator.spectra.multiresolution import Band
     from estimator.types import FloatArray
 
-_RECHOICE = 2.0  # growth after which the dimension is chosen anew: with 15 channels that takes 5 s
+_RECHOICE = 2.0  # growth after which the dimension is chosen again: 5 s with 15 channels
 _DIAGNOSIS_SHARE = 0.01  # of the time, that diagnoses of a growing recording may take
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
 
@@ -187,7 +187,7 @@ class SnapshotBuilder:
         bands: tuple[Band, ...],
         estimates: Estimates,
     ) -> Findings:
-        """Say what the averages show of the test itself: costly, and so not at every snapshot."""
+        """Diagnose the test: too costly for every snapshot."""
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
         clipped = clipped_columns(recordings, channels)
         stood_still = still_for_a_while(passes, self._settings)
@@ -213,7 +213,7 @@ class SnapshotBuilder:
         *,
         final: bool,
     ) -> Estimates:
-        """Estimate; while following, the dimension is chosen anew when segments have grown."""
+        """Estimate; while following, the dimension is chosen again after growth by `_RECHOICE`."""
         if not bands:
             return Estimates({}, {}, None)
         keep = not final and n_segments < _RECHOICE * self._chosen_at
@@ -236,7 +236,7 @@ class SnapshotBuilder:
 
 
 def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridged | None:
-    """Return how many segments with gaps count, and what their windows bring in."""
+    """Return the number of bridged segments, and the leakage of their windows."""
     with_gaps = [(each, each.leakage) for each in passes if each.n_bridged]
     if not with_gaps or not results:
         return None

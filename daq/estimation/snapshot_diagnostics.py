@@ -1,4 +1,4 @@
-"""What a snapshot says of the test itself: clocks, leakage, and the diagnosis of the averages."""
+"""The part of a snapshot on the test itself: clocks, leakage, diagnosis of the averages."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SnapshotDiagnostics:
-    """What is known of the test itself.
+    """Clocks, leakage and diagnosis of a test.
 
     Attributes
     ----------

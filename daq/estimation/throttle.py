@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Throttle:
-    """Measures repeated work, and says when it may be done again.
+    """Measures repeated work, and decides when it may be done again.
 
     Enter the throttle as a context manager around the work.
 

@@ -63,7 +63,7 @@ def archive_recordings(
     csv: str | None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
-    """Take new recordings into an archive, and show what it says.
+    """Add new recordings to an archive, and show its answers.
 
     Raises
     ------
@@ -186,8 +186,8 @@ def _take_new(
         for outcome in _with_progress(archive, found, jobs=jobs, scheduler=scheduler):
             if outcome.failure:
                 source = outcome.source
-                said = outcome.failure
-                failures.append(said if source in said else f"{source}: {said}")
+                failure = outcome.failure
+                failures.append(failure if source in failure else f"{source}: {failure}")
             elif not outcome.closed:
                 screen.print(
                     f"{outcome.source}: not closed; taken as far as it goes, and again when it has"

@@ -96,13 +96,13 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
 
 def new_identities(bench: Bench, found: Sequence[SensorCheck]) -> dict[str, dict[str, str]]:
     """Return identities of sensors that the bench file lacks."""
-    told = {entry.information.sensor: entry.information for entry in found}
+    identified = {entry.information.sensor: entry.information for entry in found}
     identities: dict[str, dict[str, str]] = {}
     for sensor in bench.sensors:
-        if sensor.name not in told:
+        if sensor.name not in identified:
             continue
         values = {}
-        serial_number = told[sensor.name].serial_number
+        serial_number = identified[sensor.name].serial_number
         if serial_number and not sensor.serial_number:
             values["serial_number"] = serial_number
         if (port := stable_path(sensor.port)) != sensor.port:
@@ -132,11 +132,11 @@ def check_port(port: str, *, json: str | None) -> None:
     table = _table(["driver", "settings", "device"])
     for device in found:
         about = device.information
-        said = device.remark
+        remark = device.remark
         if about is not None:
-            said = f"{about.model} {about.serial_number} {about.firmware} {said}".strip()
+            remark = f"{about.model} {about.serial_number} {about.firmware} {remark}".strip()
         settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
-        table.add_row(device.driver, settings, said)
+        table.add_row(device.driver, settings, remark)
     screen = for_people(json)
     screen.print(table)
     for device in found:
@@ -179,9 +179,9 @@ def _summary(bench: Bench) -> str:
 
 def _drivers(bench: Bench) -> str:
     """Return a line for each driver of the bench, with its summary."""
-    told = summaries()
+    texts = summaries()
     names = dict.fromkeys(sensor.driver for sensor in bench.sensors)
-    return "".join(f"  driver    {name}: {told[name]}\n" for name in names)
+    return "".join(f"  driver    {name}: {texts[name]}\n" for name in names)
 
 
 def _table(columns: Sequence[str]) -> Table:
@@ -196,15 +196,15 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
         ("sensor", "model", "serial number", "firmware", "rate", "measured", "temperature")
     )
     for entry in found:
-        told = entry.information
+        device = entry.information
         table.add_row(
-            told.sensor,
-            told.model,
-            told.serial_number,
-            told.firmware,
-            "" if told.sampling_rate is None else f"{told.sampling_rate:g} Hz",
+            device.sensor,
+            device.model,
+            device.serial_number,
+            device.firmware,
+            "" if device.sampling_rate is None else f"{device.sampling_rate:g} Hz",
             "" if entry.measured_rate is None else f"{entry.measured_rate:.1f} Hz",
-            "" if told.temperature is None else f"{told.temperature:.1f} °C",
+            "" if device.temperature is None else f"{device.temperature:.1f} °C",
         )
     return table
 

@@ -151,7 +151,7 @@ def result_of(
     """Follow the recording of a recorder to its end, and return its result.
 
     A recording that its recorder left open is repaired and estimated. If the estimate fails while
-    the recorder runs, the recorder goes on to its end, and the whole recording is estimated then.
+    the recorder runs, the recorder continues to its end; then the whole recording is estimated.
 
     Raises
     ------

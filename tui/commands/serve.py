@@ -141,7 +141,7 @@ async def serve(
             except (HuddleError, OSError) as error:
                 _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 
-        def told(run: Run) -> None:
+        def notify(run: Run) -> None:
             metrics.note(run)
             teller.tell(run)
 
@@ -153,7 +153,7 @@ async def serve(
             clock=clock,
             options=options_table(wanted),
             reload=lambda: _again(path, wanted, bench),
-            tell=told,
+            tell=notify,
             tidy=tidied,
         )
         metrics = ServiceMetrics(service, teller)

@@ -58,11 +58,11 @@ def _lines(found: dict[str, Any]) -> Iterator[str]:
             yield f"{title:<10} {run['entry']} of {run['due']}"
     for key in ("last", "next"):
         run = found[key]
-        said = "none" if run is None else f"{run['entry']} of {run['due']}"
+        text = "none" if run is None else f"{run['entry']} of {run['due']}"
         if run is not None and key == "last":
-            said += f": {run['state']}" + (f", {run['verdict']}" if run["verdict"] else "")
-            said += f" ({run['reason']})" if run["reason"] else ""
-        yield f"{key + ' run':<10} {said}"
+            text += f": {run['state']}" + (f", {run['verdict']}" if run["verdict"] else "")
+            text += f" ({run['reason']})" if run["reason"] else ""
+        yield f"{key + ' run':<10} {text}"
     disk = found["disk"]
     yield (
         f"disk       {disk['free_bytes'] / 1e9:.1f} GB free; recordings end below"

@@ -255,8 +255,8 @@ def pin(source: Path, path: Path) -> str:
     try:
         runs = runs_named(place.runs(), path.name)
     except (NoServiceError, RunNotFoundError):
-        said = f"{path.name} was not made by huddle serve: nothing removes it by itself"
-        raise HuddleError(said) from None
+        message = f"{path.name} was not made by huddle serve: nothing removes it by itself"
+        raise HuddleError(message) from None
     pinned = not all(run.pinned for run in runs)
     place.store.pin([run.key for run in runs], pinned=pinned)
     kept = "is kept whatever the limits of storage" if pinned else "is no longer pinned"
@@ -308,8 +308,8 @@ def announce(command: str, event: str, text: str, path: Path | None) -> None:
     except (OSError, ValueError, subprocess.TimeoutExpired) as error:
         raise HuddleError(f"--on-event {command}: {error}") from error
     if ended.returncode:
-        said = ended.stderr.strip() or f"exit code {ended.returncode}"
-        raise HuddleError(f"--on-event {command}: {said}")
+        message = ended.stderr.strip() or f"exit code {ended.returncode}"
+        raise HuddleError(f"--on-event {command}: {message}")
 
 
 def save_result(
@@ -320,7 +320,7 @@ def save_result(
     *,
     folder: Path,
 ) -> tuple[Path, ...]:
-    """Write an estimate as CSV and JSON; that of a growing recording says nothing of its file.
+    """Write an estimate as CSV and JSON; that of a growing recording has no entry for its file.
 
     Raises
     ------

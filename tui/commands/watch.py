@@ -80,8 +80,8 @@ class _Lines:
         for event in events:
             at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
             if self._json is None:
-                said = " ".join(part for part in (event.sensor, event.kind, event.text) if part)
-                console().print(f"{clock_time(at)}  {said}", soft_wrap=True)
+                line = " ".join(part for part in (event.sensor, event.kind, event.text) if part)
+                console().print(f"{clock_time(at)}  {line}", soft_wrap=True)
             else:
                 document = {
                     "at": at,

@@ -1,7 +1,7 @@
-"""Channels that stand at the end of their range without their devices having said so.
+"""Finds channels at the end of their range that their devices have not flagged as clipped.
 
-Where a signal is cut off, its largest or smallest count comes far more often than the one beside
-it. That is looked for in stretches spread over the recording, in raw counts.
+Where a signal is cut off, its largest or smallest count is far more frequent than the neighbouring
+count. Stretches spread over the recording are searched for this, in raw counts.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _TIMES = 5  # more often than the count beside it; a sine reaches 2.4
 def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     """Return the share of samples at the end of the range, by name of the channel.
 
-    Only channels of the huddle test that are cut off; blocks that say so themselves (the estimate
-    leaves them out) are not looked at.
+    Only clipped channels of the huddle test. Blocks flagged as clipped are skipped: the estimate
+    excludes them.
     """
     rows = _rows(record)
     if len(rows) == 0:
@@ -71,7 +71,7 @@ def clipped_columns(
 def in_clipped_blocks(
     records: Sequence[ReadableSensor], times: Callable[[], NDArray[np.float64]]
 ) -> NDArray[np.bool_] | None:
-    """Return which samples lie in blocks that say they are clipped; None if no block does.
+    """Return which samples lie in blocks flagged as clipped; None if no block is.
 
     `times` returns, for each sample and sensor, the seconds since the recording's creation.
     """

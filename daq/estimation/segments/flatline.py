@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_PARTS = 8  # of a hop that are looked at one by one
+_PARTS = 8  # of a hop, examined one by one
 _MIN_SAMPLES = 32  # samples of a part
 _STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
 

@@ -169,7 +169,7 @@ class Pass:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of the grid that have been looked at."""
+        """Seconds of the grid examined so far."""
         if self.n_seen == 0:
             return 0.0
         length = (self.n_seen - 1) * self.welch.hop + self.welch.segment_length
@@ -313,7 +313,7 @@ class Pass:
         return np.asarray(moved - moved.mean(axis=1, keepdims=True))
 
     def set_clocks(self) -> None:
-        """Set the clocks by what the segments taken say."""
+        """Set the clocks by the delays measured in the segments taken."""
         if self._meter is not None:
             self.aligned.set_clocks()
 

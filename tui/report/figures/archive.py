@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 2.4, 1.7
 """Of one pair of axes, in inches."""
 RESOLUTION = 200
-_SHARE_SHOWN = 0.999
-"""Of the stretches at each frequency, those that the axis of levels surely holds."""
 _ROOM_DB = 3.0
 
 
