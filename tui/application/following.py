@@ -36,8 +36,7 @@ from tui.application.recordings_view.view import RecordingsView
 from tui.application.reference import reference_of
 from tui.application.result_view.view import ResultView
 from tui.application.state import BENCH, RESULT, TEST, TITLES, VIEWS, State
-from tui.application.test_view.panels import MOVED
-from tui.application.test_view.recent_motion import RecentMotion
+from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.application.test_view.view import TestView
 from tui.application.themes import (
     COLOUR_BLIND,
@@ -104,7 +103,7 @@ class FollowingApp(App[None]):
         self._quitting = threading.Event()
         self._is_stopping = False
         self._lost: frozenset[str] = frozenset()
-        self._recent = RecentMotion()
+        self._recent, self._is_moved = RecentMotion(), False
         self._bench = controls.bench
         self._reading = threading.Lock()  # HDF5 shares what it knows of a file among its readers
         views: tuple[type[View], ...] = (BenchView, TestView, ResultView, RecordingsView)
@@ -190,7 +189,7 @@ class FollowingApp(App[None]):
             settings = replace(settings, target_cov=message.plan.cov)
         self._is_stopping = False
         self._lost = frozenset()
-        self._recent = RecentMotion()
+        self._recent, self._is_moved = RecentMotion(), False
         self._ended.set()
         self._ended = threading.Event()
         self._follow(message.path, settings, self._ended, is_kept=message.is_kept)
@@ -233,8 +232,10 @@ class FollowingApp(App[None]):
     async def _on_fresh(self, message: SnapshotReady) -> None:
         snapshot, before = message.snapshot, self.snapshot
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
-        if moved and not self.state.moved:
-            self.announce("trouble", MOVED.format(alert(moved[0], Names.of(snapshot))))
+        if moved and not self._is_moved:
+            self.announce("trouble", alert(moved[0], Names.of(snapshot)))
+        self._is_moved = bool(moved)
+        snapshot = with_advice(snapshot, moved)
         self.state = replace(
             self.state,
             snapshot=snapshot,
@@ -242,10 +243,7 @@ class FollowingApp(App[None]):
             judged_by=self._bench,
             verdict=judge(self._bench, snapshot, message.settings),
             note="",
-            moved=moved,
         )
-        if moved:  # a verdict would be of motion, not of noise
-            return
         if not snapshot.closed:
             self._end_if_reached(snapshot, message.settings)
         elif before is not None and not before.closed:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus
     from daq.results.decision.verdict import TestVerdict
-    from estimator.diagnostics.advice import NoSharedMotion
     from tui.application.plan import TestPlan
 
 BENCH, TEST, RESULT, RECORDINGS = VIEWS = ("bench", "test", "result", "recordings")
@@ -65,8 +64,6 @@ class State:
         What the recording is compared with.
     models : tuple of Mask
         Noise models to show.
-    moved : tuple of NoSharedMotion
-        Sensors that left their place during the test, as the last minute shows.
     """
 
     name: str
@@ -86,7 +83,6 @@ class State:
     plan: TestPlan | None = None
     reference: Reference | None = None
     models: tuple[Mask, ...] = ()
-    moved: tuple[NoSharedMotion, ...] = ()
 
     @property
     def has_result(self) -> bool:

@@ -18,6 +18,7 @@ from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, 
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
+    demo_bench,
     diagnosed,
     made_now,
     made_snapshot,
@@ -201,14 +202,18 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
     csm = (before.n_segments * before.csm + n_new * alone) / n_segments
     now = replace(before, csm=csm, n_segments=n_segments, n_effective=1100.0, elapsed=1100.0)
     same = replace(now, csm=before.csm)
+    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(1e-12, 1e-12))
+    told.bench = demo_bench().model_copy(update={"limits": (limit,)})
     app = HuddleApp(told)
     for second, is_named in ((same, False), (now, True)):
         async with app.run_test(size=WIDE) as pilot:
             status = StatusUpdated(made_now(elapsed=1100.0))
             await shown(pilot, app, status, SnapshotReady(before, SETTINGS))
             await shown(pilot, app, status, SnapshotReady(second, SETTINGS))
-            words = "last minute: C records none of the motion that A and B share"
-            assert (words in screen_text(app)) == is_named
+            words = "C records none of the motion that A and B share"
+            text = screen_text(app)
+            assert (words in text) == is_named
+            assert ("FAIL" in text, "NOT DECIDED" in text) == (not is_named, is_named)
             await app.workers.wait_for_complete()
         app = HuddleApp(told)
     assert [each for each in told.announced if words in each] == [

@@ -122,8 +122,7 @@ class Board(Vertical):
     def _write_alerts(self, shown: State) -> None:
         alerts = [] if shown.now is None else panels.alerts(shown.now, shown.settings)
         if shown.snapshot is not None and not shown.trouble:
-            width = self.size.width - 10
-            alerts += panels.findings(shown.snapshot, moved=shown.moved, width=width)
+            alerts += panels.findings(shown.snapshot, width=self.size.width - 10)
         if shown.trouble:
             alerts.insert(0, Text(f"▲ {shown.trouble}", BAD))
         room = 3 if self.has_class("-tall") else 1

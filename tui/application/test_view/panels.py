@@ -32,13 +32,11 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
     from daq.results.partners import WithoutPartner
     from daq.results.precision import Precision
-    from estimator.diagnostics.advice import NoSharedMotion
     from estimator.self_noise.band_means import BandMeans
     from tui.application.test_view.plotted import Choice
 
 MUTED = "#9aa5b8"
 MIN_BAR = 6  # cells
-MOVED = "last minute: {}"
 
 
 def noise_in_band(snapshot: Snapshot, settings: Settings, choice: Choice) -> tuple[BandMeans, ...]:
@@ -304,7 +302,7 @@ def _overdue_alert(sensor: SensorStatus, now: RecordingStatus) -> str:
     return alert.format(sensor=sensor.name, time=time, reason=sensor.reason)
 
 
-def findings(snapshot: Snapshot, *, moved: Sequence[NoSharedMotion] = (), width: int) -> list[Text]:
+def findings(snapshot: Snapshot, *, width: int) -> list[Text]:
     """Return what the diagnosis has found wrong with the test, a line each, the worst first."""
     styles = {Level.PROBLEM: "bold #ff6b6b", Level.WARNING: "yellow"}
     names = Names.of(snapshot)
@@ -315,8 +313,7 @@ def findings(snapshot: Snapshot, *, moved: Sequence[NoSharedMotion] = (), width:
     ]
     faulty = [(line, styles[Level.PROBLEM]) for line in faulty_channels(snapshot)]
     unusable = [(line, styles[Level.PROBLEM]) for line in why_no_segment(snapshot)]
-    left = [(MOVED.format(alert(each, names)), styles[Level.PROBLEM]) for each in moved]
-    whole = [*left, *unusable, *found[:1], *faulty, *found[1:]]
+    whole = [*unusable, *found[:1], *faulty, *found[1:]]
     lines = [Text(f"▲ {words}", style) for words, style in whole]
     for line in lines:
         line.truncate(width, overflow="ellipsis")

@@ -6,7 +6,7 @@ since an earlier snapshot are the difference of two sums: ``(n2 S2 - n1 S1) / (n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from estimator.diagnostics.advice import NoSharedMotion
@@ -66,6 +66,15 @@ class RecentMotion:
         return self._found
 
 
+def with_advice(snapshot: Snapshot, found: tuple[NoSharedMotion, ...]) -> Snapshot:
+    """Return a snapshot whose diagnosis has this advice as well: no verdict is given then."""
+    diagnosis = snapshot.diagnostics.diagnosis
+    if diagnosis is None or not found:
+        return snapshot
+    diagnosis = replace(diagnosis, advice=(*found, *diagnosis.advice))
+    return replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
+
+
 def _strangers(snapshot: Snapshot, before: _Sum, now: _Sum) -> tuple[NoSharedMotion, ...]:
     diagnosis, n_new = snapshot.diagnostics.diagnosis, now.n_segments - before.n_segments
     n_effective = snapshot.n_effective * n_new / max(now.n_segments, 1)
@@ -74,6 +83,7 @@ def _strangers(snapshot: Snapshot, before: _Sum, now: _Sum) -> tuple[NoSharedMot
     recent = (now.n_segments * now.csm - before.n_segments * before.csm) / n_new
     canonical = CanonicalCoherence(recent)
     found: dict[int, NoSharedMotion] = {}
+    lowest: dict[int, float] = {}
     for band in diagnosis.bands:
         inside = (snapshot.frequency >= band.low) & (snapshot.frequency <= band.high)
         share = shared_motion(canonical, snapshot.dims, inside, n_effective)
@@ -81,7 +91,7 @@ def _strangers(snapshot: Snapshot, before: _Sum, now: _Sum) -> tuple[NoSharedMot
             found[sensor] = NoSharedMotion(
                 level=Level.PROBLEM,
                 sensors=(sensor,),
-                band=(band.low, band.high),
+                band=(lowest.setdefault(sensor, band.low), band.high),
                 partners=partners,
                 share=max(0.0, *(float(share[sensor, j]) for j in partners)),
                 share_of_partners=min(
