@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import sys
 import uuid
 from dataclasses import dataclass
@@ -48,7 +47,7 @@ from daq.recording.storage.names import (
     sync_file,
     taken,
 )
-from daq.recording.storage.retries import repeated
+from daq.recording.storage.retries import reason_of, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -362,10 +361,8 @@ def _as_recording_error(path: Path) -> Iterator[None]:
     except RecordingError:
         raise
     except (OSError, RuntimeError) as error:
-        # HDF5 raises RuntimeError for a full disk, with the system's message only in its text.
-        found = re.search(r"error message = '([^']+)'", str(error))
-        reason = found[1] if found else error
-        raise DiskError(f"{path}: cannot be written: {reason}") from error
+        # HDF5 raises RuntimeError for a full disk.
+        raise DiskError(f"{path}: cannot be written: {reason_of(error)}") from error
 
 
 def _field(text: str, n_bytes: int) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from typing import TYPE_CHECKING
 
@@ -50,4 +51,10 @@ def repeated(
 
 def report(error: BaseException) -> None:
     """Log a failed write."""
-    _LOGGER.warning("a write to the recording failed and is repeated: %s", error)
+    _LOGGER.warning("a write to the recording failed and is repeated: %s", reason_of(error))
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the system's message, which HDF5 hides among positions and addresses."""
+    found = re.search(r"error message = '([^']+)'", str(error))
+    return found[1] if found else str(error)

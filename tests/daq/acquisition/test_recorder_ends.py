@@ -112,6 +112,8 @@ def test_a_recording_continues_in_another_file_after_a_disk_error(tmp_path: Path
     following = path.with_stem("r-2")
     assert said.stdout.split()[::2] == ["True", str(following)], said.stderr
     assert "cannot be written: File too large; the recording continues in" in said.stderr
+    assert "failed and is repeated: File too large" in said.stderr
+    assert "buf = 0x" not in said.stderr  # an address, as HDF5 has it
     with Recording.open(path) as first, Recording.open(following) as second:
         assert not first.closed
         assert second.closed
