@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
 from daq.estimation.recording_set import is_continued
+from daq.estimation.segments.freed_memory import FreedMemory
 from daq.estimation.snapshot import NoResultError
 from daq.estimation.throttle import Throttle
 from daq.recording.control import ask
@@ -141,7 +142,7 @@ def follow(
             return remote if recorder is None else recorder, sensors
 
         known, sensors = seen(recording)
-        looks, estimates = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE)
+        looks, estimates, memory = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE), FreedMemory()
         bench, wanted = recording.bench, 0.0
         speed = 1.0 if bench is None else bench.speed
         if sensors is not None:
@@ -181,6 +182,7 @@ def follow(
                     observer.snapshot(snapshot, estimation.settings)
                 elif sensors is not None:
                     sensors.look()
+            memory.give_back()
             interval = STATUS_INTERVAL
             if sensors is None:  # before the next segment there is nothing to see
                 coming = (estimation.lacking - COMMIT_DELAY) / speed
