@@ -6,7 +6,7 @@ PEER := tests/peers/async_labjack_peer
 PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
 SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test peers check bench docs torture clean
+.PHONY: demo test peers check bench docs session torture clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -42,6 +42,9 @@ bench: $(VENV)/.installed-dev  ## speed and memory, as ratios within one run
 
 docs: $(VENV)/.installed-docs  ## the documentation as a site in build/site; its examples run
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d build/doctrees docs build/site
+
+session: $(VENV)/.installed-dev  ## drive a whole test on simulated devices; writes docs/session.md
+	$(BIN)/python -m docs.images.session
 
 torture: $(VENV)/.installed-dev  ## kills, power cuts, disk errors, flipped bits; writes docs/validation/torture.md
 	$(BIN)/python -m tests.torture

@@ -8,6 +8,7 @@ come to the screen ends the session with an error, and docs/session.md stays as 
 
 from __future__ import annotations
 
+import re
 import subprocess
 import tempfile
 import time
@@ -25,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "session.md"
 SIZE = (120, 36)
 SPEED = 4.0
+PORT = re.compile(r"/\w+/huddle-\w+/huddle-\w+/tty")
 PATIENCE = 400.0
 """Seconds until a step must have come to the screen."""
 LIMIT = """
@@ -91,7 +93,8 @@ class Session:
         """Keep the screen, once it has come to rest."""
         time.sleep(1.5)
         home = "/home/lab"
-        rows = [row.replace(self._folder, home).rstrip() for row in self._terminal.rows]
+        rows = [row.replace(self._folder, home) for row in self._terminal.rows]
+        rows = [PORT.sub("…/tty", row).rstrip() for row in rows]
         screen = "\n".join(rows).rstrip("\n")
         self.page += f"\n## {title}\n\n{text}\n\n```text\n{screen}\n```\n"
         print(f"{title}\n{screen}\n", flush=True)
@@ -159,10 +162,12 @@ def drive(session: Session) -> None:
         "The next test, without an end. Somebody carries sensor C away: the alert names it.",
     )
     session.press("x", "y")
-    session.see("recording  ", "known to", "channel    data")
-    session.keep("Stopped", "`x`, then `y`. The result does not hide what was wrong.")
+    session.see("recording  ", "channel    data", "w Report")
+    session.keep(
+        "Stopped", "`x`, then `y`. There is no verdict: the averages hold motion, not noise."
+    )
     session.press("4")
-    session.see("enter")
+    session.see("⏎ Open")
     session.keep("All recordings", "`4` lists them.")
 
 
