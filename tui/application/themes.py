@@ -36,8 +36,11 @@ THEMES: Final = {
 }
 SAFE: Mapping[str, str] = {
     "green": "#56b4e9",
+    "#98e024": "#56b4e9",
     "yellow": "#f7f0a0",
+    "#fd971f": "#f7f0a0",
     "red": "#e0461e",
+    "#f4005f": "#e0461e",
     "#ff6b6b": "#e0461e",
     "#4cc9f0": "#56b4e9",
     "#1d6f8c": "#2b5a75",
@@ -51,7 +54,10 @@ SAFE: Mapping[str, str] = {
     "#3f6d4b": "#004f3a",
     "#ff7b9c": "#ffffff",
 }
-"""Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart."""
+"""Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart.
+
+Green, yellow and red are there by name, and as Textual draws these names.
+"""
 
 
 class PlainMonochrome(Monochrome):

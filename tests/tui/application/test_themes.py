@@ -79,7 +79,7 @@ async def test_themes_change_colours_and_nothing_else(tmp_path: Path) -> None:
             said.add(screen_text(app))
             drawn[theme] = set(re.findall(r"fill: (#[0-9a-f]{6})", app.export_screenshot()))
     assert len(said) == 1
-    assert SAFE.keys() & drawn["huddle"] >= {"#4cc9f0", "#f4a261", "#ff6b6b"}
+    assert SAFE.keys() & drawn["huddle"] >= {"#4cc9f0", "#f4a261", "#ff6b6b", "#98e024"}
     assert not SAFE.keys() & drawn[COLOUR_BLIND]
     assert {SAFE[colour] for colour in ("#4cc9f0", "#ff6b6b")} <= drawn[COLOUR_BLIND]
     frame = "#c5c8c6"  # of the picture
