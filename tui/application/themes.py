@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rich.color import Color as RichColor
     from textual.color import Color
 
+ANSI: Mapping[int | None, str] = {1: "red", 2: "green", 3: "yellow"}
+"""Names of the first colours of a terminal, by number."""
 USUAL, COLOUR_BLIND, NO_COLOUR = "huddle", "colour-blind", "no-colour"
 THEMES: Final = {
     name: Theme(
@@ -36,11 +38,8 @@ THEMES: Final = {
 }
 SAFE: Mapping[str, str] = {
     "green": "#56b4e9",
-    "#98e024": "#56b4e9",
     "yellow": "#f7f0a0",
-    "#fd971f": "#f7f0a0",
     "red": "#e0461e",
-    "#f4005f": "#e0461e",
     "#ff6b6b": "#e0461e",
     "#4cc9f0": "#56b4e9",
     "#1d6f8c": "#2b5a75",
@@ -54,10 +53,7 @@ SAFE: Mapping[str, str] = {
     "#3f6d4b": "#004f3a",
     "#ff7b9c": "#ffffff",
 }
-"""Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart.
-
-Green, yellow and red are there by name, and as Textual draws these names.
-"""
+"""Colours in place of the usual ones: after Okabe and Ito, red and yellow farther apart."""
 
 
 class PlainMonochrome(Monochrome):
@@ -88,4 +84,6 @@ def _safe(style: Style) -> Style:
 
 
 def _name(colour: RichColor) -> str:
-    return colour.name if colour.triplet is None else colour.triplet.hex
+    if colour.triplet is not None:
+        return colour.triplet.hex
+    return ANSI.get(colour.number, colour.name)
