@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from daq.errors import HuddleError
 from tui.service.hooks import events_of
 from tui.service.planning import GRACE, missed_runs, next_runs
-from tui.service.processes.finish import Request
+from tui.service.processes.finish import Outcome, Request, is_of_disk
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import StoreError
 from tui.service.window import Window, free_space
@@ -41,8 +41,8 @@ MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
 RETRY = 2.0
 """Seconds until an estimate without an outcome is tried again, doubled each time."""
-DISK_RETRY = 8
-"""By what the seconds grow each time where a disk refused something: to two hours."""
+DISK_WAIT, DISK_PATIENCE = timedelta(hours=1), timedelta(days=2)
+"""Longest time between two tries where the disk refused something, and how long it is tried."""
 REFUSED = "the disk refused a file for a while"
 _LEVELS = {RunState.FAILED: logging.ERROR, RunState.MISSED: logging.WARNING}
 BUSY = "the run before was still recording"
@@ -302,11 +302,16 @@ class Service:
             raise
         except (HuddleError, OSError) as error:
             _LOGGER.error("run %s: %s", run.name, error)  # noqa: TRY400 - its message says all
-            return self._repeated(run.because(str(error)), RETRY * 2**run.attempts)
+            if not is_of_disk(error):
+                return self._repeated(run.because(str(error)), RETRY * 2**run.attempts)
+            outcome = Outcome(error=str(error), refused=True)
         run = replace(run, parts=outcome.parts or run.parts)
-        if outcome.refused and run.attempts < MAX_ATTEMPTS:
+        waited = self._clock.now() - (run.window_end or run.due)
+        if outcome.refused and waited < DISK_PATIENCE:
             _LOGGER.error("run %s: %s", run.name, "; ".join([*outcome.notes, outcome.error]))
-            return self._repeated(run.because(REFUSED), RETRY * DISK_RETRY**run.attempts)
+            run = replace(run, attempts=run.attempts - 1)  # the estimate is not at fault
+            delay = max(RETRY, min(waited / 2, DISK_WAIT).total_seconds())
+            return self._repeated(run.because(REFUSED), delay)
         for note in outcome.notes:
             run = run.because(note)
         if outcome.error:

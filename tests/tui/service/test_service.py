@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from dataclasses import replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -162,17 +163,29 @@ async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -
     place = Place(tmp_path)
     refused = Outcome(error="cannot be rewritten", refused=True)
     kept = Outcome(notes=("the result is not in the recording",), refused=True)
-    place.steps.outcomes = [refused, kept, Outcome()]
-    await place.serve(1.5 * HOUR)
+    full = OSError(errno.ENOSPC, "No space left on device")  # of the lock of the recording
+    place.steps.outcomes = [refused, kept, *[full] * 6, Outcome()]
+    await place.serve(1.9 * HOUR)
     run = place.store.runs()[0]
     assert (run.state, run.reason) == (RunState.DONE, REFUSED)
-    assert len(place.steps.finished) == 3
+    assert len(place.steps.finished) == 9
+
+
+async def test_an_estimate_that_the_disk_refuses_for_long_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tui.service.service.DISK_PATIENCE", timedelta(minutes=20))
+    place = Place(tmp_path)
+    place.steps.outcomes = [Outcome(error="Input/output error", refused=True)] * 50
+    await place.serve(1.8 * HOUR)
+    run = place.store.runs()[0]
+    assert (run.state, run.reason) == (RunState.FAILED, f"{REFUSED}; Input/output error")
 
 
 async def test_an_estimate_that_is_repeated_holds_up_no_other(tmp_path: Path) -> None:
     place = Place(tmp_path)
-    place.steps.outcomes = [Outcome(error="cannot be rewritten", refused=True)] * 4
-    await place.serve(2.2 * HOUR)  # the fifth attempt is due 2 h after the fourth
+    place.steps.outcomes = [Outcome(error="cannot be rewritten", refused=True)] * 12
+    await place.serve(2.2 * HOUR)
     assert [run.state for run in place.store.runs()[:2]] == [RunState.ESTIMATING, RunState.DONE]
     await place.serve(1.0 * HOUR)  # the next service does not wait for it
     assert place.store.runs()[0].state is RunState.DONE

@@ -123,7 +123,7 @@ def finish(request: Request) -> Outcome:
     try:
         outcome = _finished(replace(request, parts=[str(part) for part in parts]))
     except (HuddleError, EstimatorError, OSError) as error:
-        outcome = Outcome(error=str(error) or type(error).__name__, refused=_is_of_disk(error))
+        outcome = Outcome(error=str(error) or type(error).__name__, refused=is_of_disk(error))
     return replace(outcome, parts=tuple(part.name for part in parts))
 
 
@@ -143,26 +143,26 @@ def _finished(request: Request) -> Outcome:
         store_results(last, snapshot)
     except HuddleError as error:
         notes.append(f"the result is not in the recording: {error}")
-        refused |= _is_of_disk(error)
+        refused |= is_of_disk(error)
     found = judge(bench, snapshot, settings)
     result = document(snapshot, settings, sources=sources(paths), verdict=found)
     try:
         write_json(str(last.with_suffix(".json")), result)
     except OSError as error:
         notes.append(f"the result is not in the JSON file: {error}")
-        refused |= _is_of_disk(error)
+        refused |= is_of_disk(error)
     if request.report is not None:
         try:
             _report(snapshot, last, paths, settings, request.report)
         except (HuddleError, OSError) as error:
             notes.append(f"no report: {error}")
-            refused |= _is_of_disk(error)
+            refused |= is_of_disk(error)
     noise = _noise(snapshot, settings, request.bands, about, notes)
     verdict = "" if found is None else str(found.verdict)
     return Outcome(verdict, tuple(notes), noise, refused=refused)
 
 
-def _is_of_disk(error: BaseException | None) -> bool:
+def is_of_disk(error: BaseException | None) -> bool:
     """Return whether an error comes from a disk, or the lack of descriptors: both can pass."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _OF_DISK:
@@ -196,7 +196,7 @@ def _repaired(parts: Sequence[Path]) -> tuple[list[Path], list[str], bool]:
             good.append(part)
     if not good:
         raise NothingRecordedError("; ".join(map(str, errors))) from errors[0]
-    return good, notes + [str(error) for error in errors], any(map(_is_of_disk, errors))
+    return good, notes + [str(error) for error in errors], any(map(is_of_disk, errors))
 
 
 class NothingRecordedError(HuddleError):
