@@ -12,6 +12,7 @@ from estimator.diagnostics.stability import SegmentCourse
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daq.estimation.equalisation import Equalisation
     from daq.estimation.noise_estimates import Channels
     from daq.estimation.segments.segment_pass import Pass
     from estimator.spectra.segment_spectra import SegmentSpectra
@@ -29,10 +30,13 @@ def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:
         every *= 2
 
 
-def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> SegmentCourse | None:
+def segment_course(
+    passes: Sequence[Pass], channels: Channels, unit: str, equalisation: Equalisation
+) -> SegmentCourse | None:
     """Return the segments of all recordings, or None where not all segments are kept.
 
-    Times count from the start of the first recording.
+    Times count from the start of the first recording. What the filters of `equalisation` do to the
+    segments is taken out, as from the averages.
     """
     spectra, times, runs = [], [], []
     every = max((each.single.every for each in passes if each.single is not None), default=1)
@@ -51,6 +55,9 @@ def segment_course(passes: Sequence[Pass], channels: Channels, unit: str) -> Seg
         return None
     bins = first.single.bins
     response = responses(first.welch.frequencies[bins], channels, unit)
+    filters = equalisation.response(first.welch.frequencies[bins])
+    if filters is not None:
+        response = response * filters
     return SegmentCourse(
         spectra=np.concatenate(spectra) / response.astype(np.complex64),
         bins=bins,

@@ -197,7 +197,7 @@ class SnapshotBuilder:
             channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
-            course=segment_course(passes, channels, self._unit),
+            course=segment_course(passes, channels, self._unit, self._equalisation),
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)
         return Findings.of(

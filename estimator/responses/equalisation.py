@@ -45,7 +45,7 @@ _MORE_CHANNELS = 0.02  # cost of each filtered channel, in units of `tail_leakag
 
 
 def leakage_threshold(n_effective: float) -> float:
-    """Return the share of the noise from which leakage leakage_threshold."""
+    """Return the share of the noise from which leakage is equalised."""
     return THRESHOLD + PER_AVERAGE / max(n_effective, 1.0)
 
 

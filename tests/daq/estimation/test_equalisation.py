@@ -137,6 +137,9 @@ def test_equalised_by_the_bench_file_the_noise_is_the_true_one(tmp_path: Path) -
     assert edges is not None
     assert edges.sources == ("known",)
     assert abs(excess(snapshot, 1, 8, known=True)).max() < 0.08
+    stability = snapshot.diagnostics.diagnosis.stability if snapshot.diagnostics.diagnosis else None
+    assert stability is not None
+    assert stability.inflation < 1.5  # the filters are taken out of single segments, too
 
 
 def test_equal_sensors_are_left_alone(tmp_path: Path) -> None:
