@@ -44,6 +44,7 @@ SETTLED = 240
 ROUNDS = 3
 _METHOD = "three-sensor"  # whose noise the leakage is compared with: it takes little time
 _ASSUMED_SNR = 1e6  # of known responses that differ
+_PREDICTION = 0.2  # above 0.14, the noise of a prediction under Hann (`ChannelResponses.leakage`)
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
 _IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
 _AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
@@ -249,10 +250,10 @@ class Equalisation:
             left, deviation = channel_responses(csm, band.frequencies, dims=self._dims).leakage(
                 motion, factor, n_effective=band.n_effective
             )
-            shares = band_shares(left, deviation, np.abs(noise), band.frequencies)
-            parts.append(
-                _Leaks(noise, motion, left, significant_minimum(*shares, band.frequencies))
-            )
+            share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
+            share = share - _noise_of_prediction(band, factor)
+            least = significant_minimum(share, deviation, band.frequencies)
+            parts.append(_Leaks(noise, motion, left, least))
         return _Leaks(
             *(
                 np.concatenate([getattr(part, name) for part in parts])
@@ -267,6 +268,16 @@ def _key(bands: Sequence[Band]) -> tuple[tuple[float, bytes], ...]:
         (band.n_effective, hashlib.sha256(np.ascontiguousarray(band.csm).ravel().data).digest())
         for band in bands
     )
+
+
+def _noise_of_prediction(band: Band, factor: float) -> float:
+    """Return what the noise of the predictions adds to leakage, as a share of the noise.
+
+    Beyond that of a Hann window, which the threshold allows for: a rectangular one, whose slope is
+    two jumps, has 150 times as much with segments of a thousand samples.
+    """
+    length = band.settings.segment_length / band.settings.sampling_rate
+    return _PREDICTION * max(factor * 3 * length**2 - 1, 0.0) / max(band.n_effective, 1.0)
 
 
 def _unseen(band: Band) -> FloatArray:

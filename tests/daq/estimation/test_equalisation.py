@@ -142,7 +142,8 @@ def test_equalised_by_the_bench_file_the_noise_is_the_true_one(tmp_path: Path) -
     assert stability.inflation < 1.5  # the filters are taken out of single segments, too
 
 
-def test_equal_sensors_are_left_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("window", ["hann", "rectangular"])
+def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
     sensors = recorded()
     sensors["b"] = sensors["a"]
     rng = np.random.default_rng(5)
@@ -151,7 +152,9 @@ def test_equal_sensors_are_left_alone(tmp_path: Path) -> None:
         for name in "abc"
     }
     path = write(tmp_path / "r.h5", sensors)
-    plain, automatic = (estimate([path], replace(OFF, equalise=mode)) for mode in ("off", "auto"))
+    plain, automatic = (
+        estimate([path], replace(OFF, window=window, equalise=mode)) for mode in ("off", "auto")
+    )
     np.testing.assert_array_equal(plain.csm, automatic.csm)
 
 
