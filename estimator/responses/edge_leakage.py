@@ -10,7 +10,8 @@ is noise of the channels that differ.
 
 The responses follow from the averages. A constant real combination of the channels of sensor j
 predicts channel c up to one complex factor, ``D_cj = S_cz / S_yz``, where y is the prediction by j,
-and z that by the sensors other than j and the sensor of c. No channel's noise biases it.
+and z that by a third sensor. No channel's noise biases it. Of several third sensors the weighted
+mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any sign and phase.
 """
 
 from __future__ import annotations
@@ -192,9 +193,13 @@ def channel_responses(
         power = np.maximum(csm[:, c, c].real, 0.0)
         for row, j in enumerate(around):
             others = [n for n in range(len(around)) if n != row]
-            S_cz, S_yz = crossed[:, others].sum(axis=1), among[:, row, others].sum(axis=1)
+            S_cz, S_yz = crossed[:, others], among[:, row, others]
+            S_zz = np.array([among[:, n, n].real for n in others]).T
             with np.errstate(invalid="ignore", divide="ignore"):
-                ratio[:, c, j] = np.where(usable & (S_yz != 0), S_cz / S_yz, np.nan)
+                weight = np.where(S_zz > 0, S_yz.conj() / S_zz, 0.0)
+                sizes = (weight * S_yz).sum(axis=1)
+                mean = (weight * S_cz).sum(axis=1) / sizes
+                ratio[:, c, j] = np.where(usable & (sizes != 0), mean, np.nan)
                 found = np.abs(crossed[:, row]) ** 2 / (power * among[:, row, row].real)
             coherence[:, c, j] = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
     return ChannelResponses(frequency, ratio, coherence)

@@ -93,6 +93,21 @@ def test_predicted_leakage_is_that_of_the_three_sensor_estimate() -> None:
     assert deviation[200, 3] == pytest.approx(1.67 / 4 / 3 * own / 200, rel=0.1)
 
 
+@pytest.mark.parametrize("n_sensors", [3, 4, 5])
+def test_equal_sensors_leak_nothing_whatever_the_signs_of_their_predictions(n_sensors: int) -> None:
+    rng = np.random.default_rng(n_sensors)
+    dims, n, f = (3,) * n_sensors, 100, np.arange(301) / T
+    loading = np.vstack([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in dims])
+    amplitude = np.hstack([1e3 * loading, np.eye(len(loading))])  # SNR 1e6
+    draws = rng.standard_normal((2, len(f), amplitude.shape[1], n)) / np.sqrt(2 * n)
+    spectra = amplitude @ (draws[0] + 1j * draws[1])
+    csm = spectra @ spectra.conj().swapaxes(1, 2)
+    motion = np.einsum("fpp->fp", csm).real
+    found = channel_responses(csm, f, dims=dims).leakage(motion, FACTOR, n_effective=n)
+    share, deviation = band_shares(*found, np.ones_like(motion), f)
+    assert significant_minimum(share, deviation, f).max() < leakage_threshold(n)
+
+
 def test_the_sensor_that_differs_is_the_one_filtered() -> None:
     csm, _ = exact()
     noise = self_noise("three-sensor", csm, dims=DIMS, n_effective=1e9).noise_psd
