@@ -120,10 +120,12 @@ class Journal:
 
     def _new_chunks(self, dataset: h5py.Dataset) -> Iterator[tuple[int, bytes]]:
         """Yield filter mask and bytes of the chunks stored since the last call."""
-        length = dataset.chunks[0]
-        corner = (0,) * (dataset.ndim - 1)
         first = self._n_chunks.get(dataset, 0)
-        n_chunks = -(-dataset.shape[0] // length)
+        n_rows, *columns = dataset.id.shape
+        if not n_rows:
+            return
+        length, corner = dataset.chunks[0], (0,) * len(columns)
+        n_chunks = -(-n_rows // length)
         for number in range(first, n_chunks):
             mask, content = dataset.id.read_direct_chunk((number * length, *corner))
             yield int(mask), bytes(content)
