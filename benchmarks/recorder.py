@@ -44,20 +44,28 @@ AXES = tuple(Channel(name=axis, sensitivity=commands.COUNTS_PER_UNIT) for axis i
 
 
 class Noise:
-    """What the played sensors read: white noise of a million counts, the same again every 8 s."""
+    """What the played sensors read: motion of a million counts, repeated after 8000 samples.
+
+    Each sensor adds noise of its own, a hundredth of the motion.
+    """
 
     def __init__(self, sampling_rate: float) -> None:
         self.sampling_rate = sampling_rate
         rng = np.random.default_rng(1)
-        self._counts = rng.normal(0, 1e6, (round(8 * sampling_rate), 3))
+        self._motion = rng.normal(0, 1e6, (8000, 3))
+        self._counts: dict[str, NDArray[np.float64]] = {}
 
     def at_rate(self, sampling_rate: float) -> Noise:
         """Return such noise at another rate."""
         return Noise(sampling_rate)
 
-    def counts(self, _: str, first: int, n: int) -> NDArray[np.float64]:
+    def counts(self, sensor: str, first: int, n: int) -> NDArray[np.float64]:
         """Return counts, shape (n, 3)."""
-        return self._counts.take(np.arange(first, first + n), axis=0, mode="wrap")
+        if sensor not in self._counts:
+            rng = np.random.default_rng([*sensor.encode()])
+            own = rng.normal(0, 1e4, self._motion.shape)
+            self._counts[sensor] = self._motion + own
+        return self._counts[sensor].take(np.arange(first, first + n), axis=0, mode="wrap")
 
     def times(self, _: str, first: int, n: int) -> NDArray[np.float64]:
         """Return when samples are taken, in s."""
