@@ -26,6 +26,8 @@ from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
@@ -33,10 +35,11 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
+    FrameDelays = Callable[[], FloatArray]
 
-_GROWTH = 0.02  # fraction by which a recording grows before its clocks are set again
+_GROWTH = 0.05  # fraction by which a recording grows before its clocks are set again
 _FIRST_GROWTH = 0.25  # the same for a short recording, up to
-_MIN_SECONDS = 10.0  # this time in s: the clock's filter takes one observation per 10 s
+_MIN_SECONDS = 30.0  # this time in s: three observations of the clock's filter
 _LATEST = 5.0  # maximum delay in s of the blocks of a device with UTC
 
 
@@ -88,9 +91,11 @@ class AlignedRecording:
         self._origin = (0, 0)
         self._grid: Grid | None = None
         self._set_at = (0, 0)
+        self.n_settings = 0  # of the clocks, so far
         self._end = math.inf
         self._at_face_value = nominal_clocks
         self._measured_against: int | None = None
+        self._frame_delays: tuple[tuple[int, ...], FrameDelays] | None = None
         self.refresh()
 
     @property
@@ -183,7 +188,7 @@ class AlignedRecording:
         return (reference, *free) if free else ()
 
     def learn(
-        self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FloatArray
+        self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays
     ) -> None:
         """Add delays measured from the samples.
 
@@ -194,11 +199,13 @@ class AlignedRecording:
         delays, std : float64, shape (n, n_measurable)
             Delay of each `measurable` sensor against the sensor with standard deviation zero, and
             its standard deviation, in s; an infinite standard deviation means unknown.
-        frame_delays : float64, shape (n_measurable,)
-            Correction of all delays since `reset_delays`, in s.
+        frame_delays : callable
+            Returns, when the clocks are set, the correction of all delays since `reset_delays`
+            in s, float64, shape (n_measurable,).
         """
         if len(at) == 0:
             return
+        self._frame_delays = self.measurable, frame_delays
         certain = np.flatnonzero((std == 0).all(axis=0))
         if len(certain):
             self._measured_against = self.measurable[int(certain[0])]
@@ -207,20 +214,24 @@ class AlignedRecording:
         for column, number in enumerate(self.measurable):
             source = self._sources[number]
             index = source.known_clock.position(seconds)
-            source.frame_delay = float(frame_delays[column])
             source.learnt.add(
                 np.column_stack([index, at_reference, delays[:, column], std[:, column]])
             )
 
     def reset_delays(self) -> None:
         """Drop all measured delays; the clocks do not change until they are set again."""
+        self._frame_delays = None
         for source in self._sources:
             source.learnt.clear()
 
     def set_clocks(self) -> None:
         """Set every clock from all current data."""
         sources = self._sources
+        self.n_settings += 1
         self._place_stated()
+        numbers, frame_delays = self._frame_delays or ((), list)
+        for number, delay in zip(numbers, frame_delays(), strict=True):
+            sources[number].frame_delay = float(delay)
         if self._at_face_value:
             for source in sources:
                 rate = source.record.sampling_rate
@@ -326,11 +337,9 @@ class AlignedRecording:
             )
         samples = np.zeros((stop - start, len(self.channels)))
         valid = np.ones(stop - start, dtype=bool)
-        column = 0
-        for source in self._sources:
-            part = samples[:, column : column + len(source.columns)]
-            valid &= grid.read(source, start, part)
-            column += len(source.columns)
+        edges = np.cumsum([0, *self.dims])
+        for source, low, high in zip(self._sources, edges[:-1], edges[1:], strict=True):
+            valid &= grid.read(source, start, samples[:, low:high])
         return samples, valid
 
     @property

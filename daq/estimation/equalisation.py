@@ -147,13 +147,11 @@ class Equalisation:
         bands : sequence of Band
             Of samples filtered as now, in the channels' own units.
         """
-        found = None if self.is_settled else self._leaks_as_filtered(bands)
-        if found is None or not bands:
+        n_effective = min((band.n_effective for band in bands), default=0.0)
+        if self.is_settled or n_effective < _MIN_AVERAGES:
             return False
-        n_effective = min(band.n_effective for band in bands)
-        if n_effective < _MIN_AVERAGES or not found.share.max(initial=0.0) > leakage_threshold(
-            n_effective
-        ):
+        found = self._leaks_as_filtered(bands)
+        if found is None or not found.share.max(initial=0.0) > leakage_threshold(n_effective):
             return False
         frequency = np.concatenate([band.frequencies for band in bands])
         csm = np.concatenate([band.csm for band in bands])

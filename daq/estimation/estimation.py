@@ -7,7 +7,8 @@ excluded, for every sensor; so is a disturbed one if the settings reject transie
 touches a gap is excluded if at least half of the segments have no gap, otherwise it is bridged.
 Each new segment is transformed once, by the clock models of that moment. Whenever the number of
 segments has grown by a quarter, the clock models are compared with those of the segments taken
-before; if they have improved materially, all segments are taken again.
+before; if they have improved materially, all segments are taken again. Filters that equalise are
+revised whenever it has doubled.
 
 ``finish`` is one pass over the whole recording with the final clocks: a function of the file
 alone. So the result at the end of a run equals that of ``huddle estimate`` on its file.
@@ -36,7 +37,7 @@ from daq.estimation.segment_course import keep_few
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
-from daq.estimation.snapshot_builder import SnapshotBuilder, why_nothing
+from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, why_nothing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,6 +49,7 @@ Progress = Callable[[int, int], None]
 
 _LIVE_TOLERANCE = 1e-6  # seconds rms that clocks may move before segments are taken again
 _REVIEW = 1.25  # growth of the number of segments after which clocks are compared
+_EQUALISING = 2.0  # growth after which filters are revised: with all segments taken again, seconds
 _FIRST_REVIEW = 8  # segments
 _MOST_LIVE_PASSES = 2  # the first time one measures, and one is freed of what was measured
 
@@ -62,6 +64,8 @@ class Estimation:
         already are closed with the estimate.
     settings : Settings, optional
         Default: those of the bench in the first recording.
+    diagnosis_share : float
+        Of the time, at most, that diagnoses of growing recordings may cost.
 
     Raises
     ------
@@ -74,7 +78,11 @@ class Estimation:
     """
 
     def __init__(
-        self, paths: Sequence[str | Path | ReadableRecording], settings: Settings | None = None
+        self,
+        paths: Sequence[str | Path | ReadableRecording],
+        settings: Settings | None = None,
+        *,
+        diagnosis_share: float = DIAGNOSIS_SHARE,
     ) -> None:
         if not paths:
             raise CannotAlignError("no recording given; expected at least one")
@@ -92,13 +100,17 @@ class Estimation:
                 self.settings.equalise, self._passes[0].welch, aligned.channels, aligned.dims
             )
             self._snapshots = SnapshotBuilder(
-                self.settings, unit, aligned.channels, self._equalisation
+                self.settings,
+                unit,
+                aligned.channels,
+                self._equalisation,
+                diagnosis_share=diagnosis_share,
             )
             self._filter()
         except BaseException:
             self.close()
             raise
-        self._next_review = _FIRST_REVIEW
+        self._next_review = self._next_equalising = _FIRST_REVIEW
 
     def close(self) -> None:
         """Close the recordings."""
@@ -125,6 +137,11 @@ class Estimation:
     def n_seen(self) -> int:
         """Segments examined so far, including those excluded for gaps."""
         return sum(each.n_seen for each in self._passes)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds examined so far."""
+        return sum(each.elapsed for each in self._passes)
 
     @property
     def lacking(self) -> float:
@@ -160,11 +177,12 @@ class Estimation:
                 progress(done, total)
 
         for each in self._passes:
-            each.advance(count)
+            each.advance(count, live=True)
             keep_few([one.single for one in self._passes])
         seen = self.n_seen
         if seen >= self._next_review:
-            if not self._equalisation.is_settled:
+            if not self._equalisation.is_settled and seen >= self._next_equalising:
+                self._next_equalising = math.ceil(_EQUALISING * seen)
                 self._equalise_growing()
             for each in self._passes:
                 for _ in range(_MOST_LIVE_PASSES):

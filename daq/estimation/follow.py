@@ -41,7 +41,7 @@ SHORTEST_INTERVAL, LONGEST_INTERVAL = 0.25, 5.0
 COMMIT_DELAY = 2.0
 """Seconds by which the file lies behind the sensors, at most."""
 LOOK_SHARE, ESTIMATE_SHARE = 0.03, 0.1
-"""Share of the time that looks, and that estimates, may take."""
+"""Share of the time that looks, and that estimates on a screen, may take."""
 SILENCE = 10.0
 """Seconds without a sample after which a recorder in another process is asked whether it runs."""
 
@@ -58,7 +58,11 @@ class Observer(Protocol):
         ...
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Take the estimate after each new segment, and the result of a closed recording."""
+        """Take the estimate after new segments, and the result of a closed recording."""
+        ...
+
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Take how many segments count so far, and the seconds they span, after each new one."""
         ...
 
     def progress(self, done: int, total: int) -> None:
@@ -95,6 +99,7 @@ def follow(
     cancelled: threading.Event | None = None,
     watch_sensors: bool = True,
     growth: float = 0.0,
+    share: float = ESTIMATE_SHARE,
     silence: float = SILENCE,
 ) -> Snapshot | None:
     """Follow a recording until it is closed, and return its result.
@@ -115,6 +120,9 @@ def follow(
         Whether the observer takes the state of the sensors.
     growth : float
         Share by which the number of segments has grown, at least, before the next estimate.
+    share : float
+        Of the time, at most, that estimates of the growing recording may cost; the diagnoses in
+        them a tenth of this.
     silence : float
         In seconds.
 
@@ -134,7 +142,7 @@ def follow(
     """
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = Recording.open(path)
-    with Estimation([recording], settings) as estimation:
+    with Estimation([recording], settings, diagnosis_share=share / 10) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
             remote = _RemoteRecorder(recording, cancelled, silence)
@@ -142,9 +150,8 @@ def follow(
             return remote if recorder is None else recorder, sensors
 
         known, sensors = seen(recording)
-        looks, estimates, memory = Throttle(LOOK_SHARE), Throttle(ESTIMATE_SHARE), FreedMemory()
-        bench, wanted = recording.bench, 0.0
-        speed = 1.0 if bench is None else bench.speed
+        looks, estimates, memory = Throttle(LOOK_SHARE), Throttle(share), FreedMemory()
+        wanted = 0.0
         if sensors is not None:
             sensors.look()
 
@@ -159,7 +166,8 @@ def follow(
                 # Asked before: what it wrote last is seen below.
                 left_open = known.ended and not is_continued(recording)
                 try:
-                    estimation.update(catch_up)
+                    if estimation.update(catch_up):
+                        observer.segments(estimation.n_segments, estimation.elapsed)
                 except _CancelledError:
                     return None
                 newest = estimation.recordings[-1]
@@ -183,16 +191,20 @@ def follow(
                 elif sensors is not None:
                     sensors.look()
             memory.give_back()
-            interval = STATUS_INTERVAL
-            if sensors is None:  # before the next segment there is nothing to see
-                coming = (estimation.lacking - COMMIT_DELAY) / speed
-                interval = max(SHORTEST_INTERVAL, coming)
+            interval = STATUS_INTERVAL if sensors is not None else _until_segment(estimation)
             known.ends_within(min(max(interval, looks.remaining), LONGEST_INTERVAL))
             if cancelled.is_set():
                 return None
         if sensors is not None:
             sensors.look_closely()
         return _result(estimation, observer, cancelled)
+
+
+def _until_segment(estimation: Estimation) -> float:
+    """Return the seconds until there may be a new segment: before, there is nothing to see."""
+    bench = estimation.recordings[0].bench
+    speed = 1.0 if bench is None else bench.speed
+    return max(SHORTEST_INTERVAL, (estimation.lacking - COMMIT_DELAY) / speed)
 
 
 def _result(

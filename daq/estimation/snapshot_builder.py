@@ -50,8 +50,9 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray
 
 _RECHOICE = 2.0  # growth after which the dimension is chosen again: 5 s with 15 channels
-_DIAGNOSIS_SHARE = 0.01  # of the time, that diagnoses of a growing recording may take
 _SEGMENTS_MISSED = 3  # complete, and none that counts: a reason is given
+DIAGNOSIS_SHARE = 0.01
+"""Of the time, that diagnoses of a growing recording may cost, if not stated."""
 
 
 class SnapshotBuilder:
@@ -68,6 +69,8 @@ class SnapshotBuilder:
     channels : sequence of (str, Channel)
     equalisation : Equalisation
         Of the passes.
+    diagnosis_share : float
+        Of the time, at most, that diagnoses of a growing recording may cost.
 
     Raises
     ------
@@ -76,13 +79,19 @@ class SnapshotBuilder:
     """
 
     def __init__(
-        self, settings: Settings, unit: str, channels: Channels, equalisation: Equalisation
+        self,
+        settings: Settings,
+        unit: str,
+        channels: Channels,
+        equalisation: Equalisation,
+        *,
+        diagnosis_share: float = DIAGNOSIS_SHARE,
     ) -> None:
         self._settings, self._unit, self._equalisation = settings, unit, equalisation
         self._gains = known_gains(settings, channels)
         self._dimensions: Dimensions | None = None
         self._findings = Findings()
-        self._diagnoses = Throttle(_DIAGNOSIS_SHARE)
+        self._diagnoses = Throttle(diagnosis_share)
         self._chosen_at = 0
 
     def build(

@@ -12,19 +12,28 @@ if TYPE_CHECKING:
 class Throttle:
     """Measures repeated work, and decides when it may be done again.
 
-    Enter the throttle as a context manager around the work.
+    Enter the throttle as a context manager around the work. Its cost is the time that it takes, or
+    the processor time of all threads where that is longer.
 
     Parameters
     ----------
     share : float
-        Of the time, at most, that the work may take.
+        Of the time, at most, that the work may cost.
     now : callable
         Seconds of a clock that never goes back.
+    used : callable
+        Seconds of processor time so far.
     """
 
-    def __init__(self, share: float, now: Callable[[], float] = time.monotonic) -> None:
-        self._share, self._now = share, now
+    def __init__(
+        self,
+        share: float,
+        now: Callable[[], float] = time.monotonic,
+        used: Callable[[], float] = time.process_time,
+    ) -> None:
+        self._share, self._now, self._used = share, now, used
         self._began = self._next = now()
+        self._used_before = 0.0
 
     @property
     def remaining(self) -> float:
@@ -37,8 +46,9 @@ class Throttle:
         return self._now() >= self._next
 
     def __enter__(self) -> Self:
-        self._began = self._now()
+        self._began, self._used_before = self._now(), self._used()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._next = self._began + (self._now() - self._began) / self._share
+        cost = max(self._now() - self._began, self._used() - self._used_before)
+        self._next = self._began + cost / self._share

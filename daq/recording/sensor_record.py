@@ -221,7 +221,8 @@ class SensorRecord:
         self.gap_rows.extend(int(counts[file_format.GAPS]))
         if self.blocks.n_samples > self.n_samples:
             refresh(self._samples)
-            refresh(self._instants)
+            if self.polled or not self.n_samples:
+                refresh(self._instants)
             check_length(self._samples)
             if self._samples.shape[0] < self.blocks.n_samples:
                 raise OSError(

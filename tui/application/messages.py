@@ -166,6 +166,9 @@ class Messenger:
         self.settings = settings
         self._post(SnapshotReady(snapshot, settings))
 
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Tell nothing: the estimate that follows says it."""
+
     def progress(self, done: int, total: int) -> None:
         """Tell how far the result is."""
         self._post(Progress(done, total))

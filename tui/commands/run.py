@@ -16,7 +16,7 @@ from daq.bench.option_fit import shortest_duration
 from daq.drivers.bench_file import load
 from daq.errors import HuddleError, RecordingError
 from daq.estimation.estimation import estimate
-from daq.estimation.follow import RecordingLeftOpenError, follow
+from daq.estimation.follow import ESTIMATE_SHARE, RecordingLeftOpenError, follow
 from daq.estimation.settings import Settings
 from daq.host_clock import SystemClock
 from daq.recording.reader import Recording
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
 
 _LOGGER = logging.getLogger(__name__)
+LINE_SHARE = 0.01
+"""Share of the time that live estimates may cost where only their c.o.v. is shown."""
 STATUS_INTERVAL = 1.0
 """Seconds between two looks at a recorder whose estimate has failed."""
 
@@ -162,7 +164,12 @@ def result_of(
         observer = _Run(recorder, bar, until_cov)
         try:
             snapshot = follow(
-                recorder.out, settings, observer, recorder=recorder, watch_sensors=False
+                recorder.out,
+                settings,
+                observer,
+                recorder=recorder,
+                watch_sensors=False,
+                share=LINE_SHARE if until_cov is None else ESTIMATE_SHARE,
             )
         except RecordingLeftOpenError:
             snapshot = None
@@ -212,13 +219,17 @@ class _Run:
         """Show the progress of the run."""
         if snapshot.closed:
             return
-        self._bar.recording(snapshot, settings)
+        self._bar.estimated(snapshot, settings)
         reason = " ".join(why_no_segment(snapshot))
         if reason and not self._says_why:
             self._says_why = True
             _LOGGER.warning("%s", reason)
         if self._until_cov is not None and precision(snapshot, settings).is_reached:
             self._recorder.request_stop()
+
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Show the progress of the recording."""
+        self._bar.recording(n_segments, elapsed)
 
     def progress(self, done: int, total: int) -> None:
         """Show the progress of the result."""
@@ -248,24 +259,30 @@ class _Bar:
     def __init__(self, bar: Progress, duration: float | None) -> None:
         self._bar, self._duration = bar, duration
         self._task = bar.add_task("0:00", total=None, state="")
+        self._end = duration
+        self._cov = math.nan
 
-    def recording(self, snapshot: Snapshot, settings: Settings) -> None:
-        """Show the progress of the recording."""
+    def estimated(self, snapshot: Snapshot, settings: Settings) -> None:
+        """Show the progress of the recording with the precision of its estimate."""
         reached = precision(snapshot, settings)
-        left = None if self._duration is None else max(0.0, self._duration - snapshot.elapsed)
+        self._cov = reached.cov
         if settings.target_cov is not None and self._duration is None:
             left = reached.seconds_left
-        cov = reached.cov
-        parts = [f"{snapshot.n_segments} segments"]
-        if not math.isnan(cov):
-            parts.append(f"c.o.v. {cov:.3f}")
+            self._end = None if left is None else snapshot.elapsed + left
+        self.recording(snapshot.n_segments, snapshot.elapsed)
+
+    def recording(self, n_segments: int, elapsed: float) -> None:
+        """Show the progress of the recording."""
+        left = None if self._end is None else max(0.0, self._end - elapsed)
+        parts = [f"{n_segments} segments"]
+        if not math.isnan(self._cov):
+            parts.append(f"c.o.v. {self._cov:.3f}")
         parts.append(time_left(left))
-        total = None if left is None else snapshot.elapsed + left
         self._bar.update(
             self._task,
-            description=clock_time(snapshot.elapsed),
-            completed=snapshot.elapsed,
-            total=total,
+            description=clock_time(elapsed),
+            completed=elapsed,
+            total=self._end,
             state=" · ".join(parts),
         )
 

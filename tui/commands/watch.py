@@ -107,6 +107,9 @@ class _Lines:
         else:
             self._write(_update(snapshot, settings, self._now, self._bench))
 
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        pass
+
     def progress(self, done: int, total: int) -> None:
         pass
 

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.aligned_recording import AlignedRecording
-from daq.alignment.delay_estimation import MIN_SEGMENTS, DelayEstimator
 from daq.alignment.growing_rows import GrowingRows
 from daq.estimation.segments.clipping import in_clipped_blocks
+from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
+from daq.estimation.segments.newest_samples import NewestSamples
 from daq.estimation.segments.read_ahead import read_ahead
 from daq.estimation.segments.usable_samples import surrounded, whole_segments
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -100,7 +100,9 @@ class Pass:
         self.stillness = FlatlineDetector(self.welch.hop, self.n_channels, self.welch.sampling_rate)
         self._taken_at = GrowingRows(np.float64, len(self.aligned.dims))
         self.aligned.reset_delays()
-        self._meter: DelayEstimator | None = None
+        refined = wanted.clocks == "refined"
+        self._newest = NewestSamples(self.aligned)
+        self._delays = DelayMeasurement(self.aligned, self.welch, is_wanted=refined)
 
     @property
     def spectra(self) -> CrossSpectra:
@@ -176,20 +178,29 @@ class Pass:
         return (length + 2 * self.reach) / self.welch.sampling_rate
 
     def advance(
-        self, progress: Callable[[int], None] | None = None, *, most: int | None = None
+        self,
+        progress: Callable[[int], None] | None = None,
+        *,
+        most: int | None = None,
+        live: bool = False,
     ) -> None:
-        """Take every segment that is complete; no more than the first `most` of all."""
+        """Take every segment that is complete; no more than the first `most` of all.
+
+        `live` segments come one by one: their delays are measured later, a few at a time.
+        """
         hop, length, reach = self.welch.hop, self.welch.segment_length, self.reach
         at_once = max(1, _VALUES_AT_ONCE // (hop * self.n_channels))
         total = self.n_complete if most is None else min(most, self.n_complete)
         begin = self.n_seen
-        bounds = [begin, *range(begin + max(at_once, self._fewest), total, at_once), total]
+        bounds = [begin, *range(begin + max(at_once, self._delays.fewest), total, at_once), total]
         pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
+
+        source = self._newest if live and len(pieces) == 1 else self.aligned
 
         def read(piece: tuple[int, int]) -> _Samples:
             first, count = piece
             begin, end = first * hop, (first + count - 1) * hop + length
-            samples, valid = self.aligned.read(begin, end + 2 * reach)
+            samples, valid = source.read(begin, end + 2 * reach)
             usable = valid & self._finite(samples)
             self._silence(samples)
             clipped = self._clipped(begin, len(samples))
@@ -218,12 +229,12 @@ class Pass:
                 self._take(samples, starts, first * hop + reach)
             self._n_taken += len(starts)
             self._taken_at.add(self._positions(np.arange(first, first + count)))
-            self._measure(samples, starts, first * hop + reach + starts)
+            self._delays.measure(samples, starts, first * hop + reach + starts, together=live)
             if self._bridge is not None and not whole.all():
                 touched = np.flatnonzero(~whole) * hop
                 joined, taken = self._bridge.take(samples, usable, clipped, touched)
                 rows = np.arange(len(taken)) * length
-                self._measure(joined, rows, first * hop + reach + taken)
+                self._delays.measure(joined, rows, first * hop + reach + taken, together=live)
             self.n_seen += count
             if progress is not None:
                 progress(count)
@@ -286,20 +297,9 @@ class Pass:
         return in_clipped_blocks(self._sensors, lambda: seconds[:, None] - self.aligned.delays(at))
 
     @property
-    def _measures(self) -> bool:
-        """Whether delays are measured."""
-        return self._settings.clocks == "refined" and bool(self.aligned.measurable)
-
-    @property
-    def _fewest(self) -> int:
-        """Segments to take together so that delays can be measured, some of them with gaps."""
-        needed = self._measures and (self._meter is None or not self._meter.has_frame)
-        return 2 * MIN_SEGMENTS * max(self.aligned.dims) if needed else 0
-
-    @property
     def awaited(self) -> int:
         """Segments with which delays could be measured first; 0 where they are, or need not be."""
-        return 0 if self._meter is None or self._meter.has_frame else self._meter.min_segments
+        return self._delays.awaited
 
     def moved(self) -> FloatArray:
         """Return by how much clocks, as known now, differ from those that segments were taken by.
@@ -314,7 +314,7 @@ class Pass:
 
     def set_clocks(self) -> None:
         """Set the clocks by the delays measured in the segments taken."""
-        if self._meter is not None:
+        if self._delays.has_begun:
             self.aligned.set_clocks()
 
     def is_outdated(self, tolerance: float) -> bool:
@@ -325,8 +325,8 @@ class Pass:
         """
         if not len(self._taken_at) or self.aligned.is_exact:
             return False
-        if self._meter is not None and not self._meter.has_frame:
-            return self.n_seen >= self._meter.min_segments
+        if self.awaited:
+            return self.n_seen >= self.awaited
         moved = self.moved()
         constant = moved.mean(axis=0)
         return float(np.sqrt(np.mean((moved - constant) ** 2))) > tolerance or bool(
@@ -338,30 +338,6 @@ class Pass:
         taken = self._taken_at.values
         middle = self._middles(np.arange(len(taken)))
         return np.column_stack([middle / self.welch.sampling_rate, taken])
-
-    def _measure(
-        self, samples: FloatArray, starts: NDArray[np.int64], begin: NDArray[np.int64]
-    ) -> None:
-        """Measure what delays are left, for the clocks' next setting.
-
-        Segments are at `starts` of the samples, and at `begin` of the grid.
-        """
-        if not self._measures:
-            return
-        if self._meter is None:
-            edges = np.cumsum([0, *self.aligned.dims])
-            sensors = self.aligned.measurable
-            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
-            window = get_window(self.welch.window, self.welch.segment_length)
-            self._meter = DelayEstimator(self.welch.sampling_rate, window, columns)
-        delays, std = self._meter.measure(samples, starts)
-        at = begin + self.welch.segment_length / 2
-        self.aligned.learn(
-            np.asarray(at, dtype=np.float64),
-            delays,
-            std=std,
-            frame_delays=self._meter.frame_delays(),
-        )
 
     def _positions(self, segments: NDArray[np.int64]) -> FloatArray:
         return self.aligned.delays(self._middles(segments))

@@ -1,7 +1,7 @@
 """The committed blocks of a sensor; a long recording has millions.
 
-Rows stay in the file and are read on demand: a reader that follows a recording needs each row once.
-Only the clipped stretches are kept in memory, since they are needed repeatedly.
+Rows stay in the file and are read on demand. Only the newest rows and the clipped stretches are
+kept in memory, since they are needed repeatedly.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _ROWS_PER_READ = 1 << 14  # 900 kB
 _ROWS_PER_MARK = 1 << 8
+_NEWEST_ROWS = 1 << 10  # 57 kB; who follows a recording asks for them again and again
 
 
 class BlockTable:
@@ -38,6 +39,7 @@ class BlockTable:
         self._n_rows = 0
         self._clipped: list[IntArray] = []
         self._marks: list[int] = []
+        self._newest = np.empty(0, dataset.dtype)
         self.n_samples = 0
         """Number of rows of samples in these blocks."""
 
@@ -80,6 +82,7 @@ class BlockTable:
                 self._mark(blocks[:n_whole])
                 self._n_rows, self.n_samples = first + n_whole, int(ends[n_whole - 1])
                 self._note_clipped(blocks[:n_whole])
+                self._keep_newest(blocks[:n_whole])
             if n_whole < len(blocks):
                 break
 
@@ -115,6 +118,9 @@ class BlockTable:
         first = -self._n_rows % _ROWS_PER_MARK
         self._marks += blocks["first_row"][first::_ROWS_PER_MARK].tolist()
 
+    def _keep_newest(self, blocks: NDArray[np.void]) -> None:
+        self._newest = np.concatenate([self._newest, blocks])[-_NEWEST_ROWS:].copy()
+
     def _note_clipped(self, blocks: NDArray[np.void]) -> None:
         blocks = blocks[(blocks["flags"] & int(BlockFlag.CLIPPED)) != 0]
         if len(blocks):
@@ -124,6 +130,10 @@ class BlockTable:
             self._clipped.append(np.column_stack([begins, ends]))
 
     def _read(self, first: int, last: int, field: str | None = None) -> NDArray[Any]:
+        begin = self._n_rows - len(self._newest)
+        if begin <= first < last <= self._n_rows:
+            newest = self._newest[first - begin : last - begin]
+            return newest if field is None else np.asarray(newest[field])
         dataset = self._dataset if field is None else self._dataset.fields(field)
         try:
             rows = np.asarray(dataset[first:last])

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.alignment.aligned_recording import AlignedRecording
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import (
     COMMIT_DELAY,
@@ -20,6 +21,7 @@ from daq.estimation.follow import (
     RecordingLeftOpenError,
     follow,
 )
+from daq.estimation.segments.newest_samples import NewestSamples
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.recording.monitor import RecordingMonitor, RecordingStatus, SensorStatus
@@ -31,6 +33,8 @@ from tests.tui.example_snapshot import SETTINGS, growing
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -71,6 +75,7 @@ class Noted:
     told: list[str] = field(default_factory=list)
     seen: list[RecordingStatus] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
+    taken: list[int] = field(default_factory=list)
 
     def status(self, status: RecordingStatus) -> None:
         """Count it."""
@@ -84,6 +89,11 @@ class Noted:
         assert settings.segment > 0
         self.told.append("snapshot")
         self.snapshots.append(snapshot)
+
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Keep it."""
+        assert elapsed > 0
+        self.taken.append(n_segments)
 
     def progress(self, done: int, total: int) -> None:
         """Check it."""
@@ -342,6 +352,36 @@ def test_a_process_that_ends_without_closing_its_recording_is_an_error(tmp_path:
         with pytest.raises(RecordingLeftOpenError, match="huddle repair"):
             follow(path, SETTINGS, noted, recorder=process, watch_sensors=False)
     assert noted.told == ["snapshot"]  # of the sensors nothing, as they are not watched
+    assert noted.taken == [4]
+
+
+class Spans(AlignedRecording):
+    """Writes down what is read."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.spans: list[tuple[int, int]] = []
+        super().__init__(recording)
+
+    def read(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Read it."""
+        self.spans.append((start, stop))
+        return super().read(start, stop)
+
+
+def test_what_overlaps_is_read_once_as_long_as_clocks_stay(tmp_path: Path) -> None:
+    with growing(tmp_path / "run.h5") as writer:
+        Bench(writer).send("ABC", 6)
+        with Recording.open(writer.path) as recording:
+            aligned = Spans(recording)
+            newest = NewestSamples(aligned)
+            found = [newest.read(begin, begin + 400) for begin in (0, 200, 400)]
+            aligned.set_clocks()
+            found.append(newest.read(600, 1000))
+            assert aligned.spans == [(0, 400), (400, 600), (600, 800), (600, 1000)]
+            for number, (samples, valid) in enumerate(found):
+                expected = AlignedRecording.read(aligned, 200 * number, 200 * number + 400)
+                np.testing.assert_array_equal(samples, expected[0])
+                np.testing.assert_array_equal(valid, expected[1])
 
 
 def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: Path) -> None:

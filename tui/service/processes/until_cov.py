@@ -43,6 +43,9 @@ class PrecisionObserver:
     def status(self, status: RecordingStatus) -> None:
         """Take no notice."""
 
+    def segments(self, n_segments: int, elapsed: float) -> None:
+        """Take no notice."""
+
     def progress(self, done: int, total: int) -> None:
         """Take no notice."""
 

@@ -1,0 +1,117 @@
+"""Measures the delays between sensors in segments, for the next setting of their clocks.
+
+While a recording is followed, segments come one by one. A few are then measured together, because
+the prediction of one sensor by another costs as much for one segment as for many.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.alignment.delay_estimation import MIN_SEGMENTS, DelayEstimator
+from estimator.spectra.windows import get_window
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.alignment.aligned_recording import AlignedRecording
+    from estimator.spectra.welch import WelchSettings
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+
+_HELD = 6  # segments that are measured together while a recording is followed
+_HELD_VALUES = 1 << 19  # samples times channels that may wait for that: 4 MB
+
+
+class DelayMeasurement:
+    """Delays in the segments of one pass.
+
+    Parameters
+    ----------
+    aligned : AlignedRecording
+        Learns the delays.
+    welch : WelchSettings
+        Of the segments.
+    is_wanted : bool
+        Whether clocks may be refined by what is measured.
+    """
+
+    def __init__(self, aligned: AlignedRecording, welch: WelchSettings, *, is_wanted: bool) -> None:
+        self._aligned, self._welch, self._is_wanted = aligned, welch, is_wanted
+        self._meter: DelayEstimator | None = None
+        self._held: list[tuple[FloatArray, IntArray, IntArray]] = []
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether any segment was to be measured."""
+        return self._meter is not None
+
+    @property
+    def fewest(self) -> int:
+        """Segments to take together so that delays can be measured, some of them with gaps."""
+        wanted = self._is_wanted and bool(self._aligned.measurable)
+        needed = wanted and (self._meter is None or not self._meter.has_frame)
+        return 2 * MIN_SEGMENTS * max(self._aligned.dims) if needed else 0
+
+    @property
+    def awaited(self) -> int:
+        """Segments with which delays could be measured first; 0 where they are, or need not be."""
+        return 0 if self._meter is None or self._meter.has_frame else self._meter.min_segments
+
+    def measure(
+        self, samples: FloatArray, starts: IntArray, begin: IntArray, *, together: bool
+    ) -> None:
+        """Measure what delays are left in segments.
+
+        Parameters
+        ----------
+        samples : float64, shape (n_samples, n_channels)
+            Not changed later.
+        starts, begin : int64, shape (n_segments,)
+            First row of each segment, and its first grid sample.
+        together : bool
+            Whether the segments may wait for others, until the clocks are set.
+        """
+        if not (self._is_wanted and self._aligned.measurable):
+            return
+        if self._meter is None:
+            edges = np.cumsum([0, *self._aligned.dims])
+            sensors = self._aligned.measurable
+            columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
+            window = get_window(self._welch.window, self._welch.segment_length)
+            self._meter = DelayEstimator(self._welch.sampling_rate, window, columns)
+        if not (together and self._meter.has_frame):
+            self._learn(samples, starts, begin)
+            return
+        self._held.append((samples, starts, begin))
+        n_values = sum(each.size for each, _, _ in self._held)
+        if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
+            self._learn_held()
+
+    def _learn_held(self) -> None:
+        if not self._held:
+            return
+        held, self._held = self._held, []
+        before = np.cumsum([0, *(len(samples) for samples, _, _ in held)])
+        self._learn(
+            np.concatenate([samples for samples, _, _ in held]),
+            np.concatenate([rows + n for (_, rows, _), n in zip(held, before, strict=False)]),
+            np.concatenate([begin for _, _, begin in held]),
+        )
+
+    def _learn(self, samples: FloatArray, starts: IntArray, begin: IntArray) -> None:
+        if self._meter is None:
+            return
+        delays, std = self._meter.measure(samples, starts)
+        at = begin + self._welch.segment_length / 2
+        self._aligned.learn(
+            np.asarray(at, dtype=np.float64), delays, std=std, frame_delays=self._frame_delays
+        )
+
+    def _frame_delays(self) -> FloatArray:
+        """Return delays of frames; the clocks, about to be set, know all segments before."""
+        self._learn_held()
+        return np.empty(0) if self._meter is None else self._meter.frame_delays()
