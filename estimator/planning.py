@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import CanonicalCoherence, own_channels
+from estimator.diagnostics.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood.fisher import covariance, cramer_rao_cov, efficiency
 from estimator.methods import METHODS, self_noise
-from estimator.self_noise.coherency import check_dims
+from estimator.self_noise.coherency import check_dims, own_channels
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:

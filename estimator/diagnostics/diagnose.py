@@ -14,15 +14,15 @@ import numpy as np
 
 from estimator.diagnostics.band import BandDiagnosis
 from estimator.diagnostics.kinds import Untested
-from estimator.diagnostics.relative_response import (
-    CanonicalCoherence,
-    RelativeResponse,
-    matched_coherence,
-    own_channels,
-    relative_response,
-)
+from estimator.diagnostics.relative_response import RelativeResponse, relative_response
 from estimator.diagnostics.rules import advise
-from estimator.diagnostics.shared_motion import may_have_moved, moved, shared_motion
+from estimator.diagnostics.shared_motion import (
+    CanonicalCoherence,
+    matched_coherence,
+    may_have_moved,
+    moved,
+    shared_motion,
+)
 from estimator.diagnostics.shared_noise import shared_noise
 from estimator.diagnostics.stability import Stability, stability
 from estimator.diagnostics.time_rules import changes
@@ -46,6 +46,7 @@ from estimator.self_noise.coherency import (
     check_dims,
     check_frequency,
     coherency,
+    own_channels,
     testable,
 )
 from estimator.self_noise.live_channels import Presence, presence

@@ -27,6 +27,9 @@ SKEWED_DEG = 2.0
 VERY_SKEWED_DEG = 20.0
 GAIN = 0.02
 DELAY_SAMPLES = 0.1
+CERTAIN = 5.0
+"""Standard errors that a deviation must exceed as well. The errors come from the scatter of eight
+parts of the band, and every pair of sensors is examined."""
 
 
 def _swapped(response: RelativeResponse) -> dict[int, int]:
@@ -62,23 +65,23 @@ def orientation(
             channels=tuple((own + c, counterpart + other) for c, other in swapped.items()),
         )
         return
-    error = response.angle_error_deg
-    if response.rotation_deg > max(ROTATED_DEG, 3 * error if np.isfinite(error) else 0.0):
+    if _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
         yield Rotated(
             level=Level.NOTE,
             sensors=pair,
             band=band,
             angle_deg=response.rotation_deg,
             horizontal_deg=response.horizontal_deg,
-            error_deg=error,
+            error_deg=response.angle_error_deg,
         )
-    if response.nonorthogonality_deg > SKEWED_DEG:
-        very = response.nonorthogonality_deg > VERY_SKEWED_DEG
+    skew = response.nonorthogonality_deg
+    if _exceeds(skew, SKEWED_DEG, response.nonorthogonality_error_deg):
+        very = skew > VERY_SKEWED_DEG
         yield NotOrthogonal(
             level=Level.WARNING if very else Level.NOTE,
             sensors=pair,
             band=band,
-            deviation_deg=response.nonorthogonality_deg,
+            deviation_deg=skew,
         )
     for channel in response.reversed_channels:
         yield ReversedPolarity(
@@ -89,7 +92,7 @@ def orientation(
             counterpart=counterpart + channel,
         )
     off = int(np.argmax(np.abs(response.gains - 1)))
-    if abs(response.gains[off] - 1) > GAIN:
+    if _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
         yield Gain(
             level=Level.NOTE,
             sensors=pair,
@@ -99,7 +102,7 @@ def orientation(
             ratio=float(response.gains[off]),
         )
     samples = response.delay * 2 * nyquist
-    if abs(samples) > DELAY_SAMPLES:
+    if _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
         yield Delay(
             level=Level.WARNING,
             sensors=pair,
@@ -107,3 +110,8 @@ def orientation(
             delay=response.delay,
             delay_samples=samples,
         )
+
+
+def _exceeds(deviation: float, tolerance: float, error: float) -> bool:
+    """Return whether a deviation is too large, and certain; not if its error is unknown."""
+    return bool(deviation > tolerance and deviation > CERTAIN * error)

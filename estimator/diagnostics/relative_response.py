@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.diagnostics.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.self_noise.coherency import check_dims, check_frequency, coherency
+from estimator.self_noise.coherency import check_dims, check_frequency, coherency, own_channels
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
-    from estimator.types import ComplexArray, FloatArray, IntArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray
 
 MIN_COHERENCE = 0.5
 """Frequencies with a lower coherence are not used: their phase could bias the delay."""
@@ -49,17 +50,25 @@ class RelativeResponse:
         counterclockwise from above for north and east. NaN without two horizontal channels.
     angle_error_deg : float
         Standard error of both angles, from their scatter over parts of the band.
-    gains : float64, shape (d,)
-        Gains of the channels of `second` over those of `first`.
+    rotation_error_deg : float
+        Standard error of the rotation, of its three components together.
+    gains, gain_errors : float64, shape (d,)
+        Gains of the channels of `second` over those of `first`, and their standard errors.
     nonorthogonality_deg : float
         Largest deviation from a right angle between channels of `second`, if those of `first`
-        are orthogonal.
+        are orthogonal and have equal gains.
+    nonorthogonality_error_deg : float
+        Standard error of all these deviations together.
     reversed_channels : tuple of int
         Channels of `second` with opposite polarity.
-    delay : float
-        Lag of `second` behind `first`, s.
+    delay, delay_error : float
+        Lag of `second` behind `first`, and its standard error, s.
     coherence : float
         Coherence in the direction of its minimum, mean over the band.
+
+    Notes
+    -----
+    Standard errors are NaN with few frequencies.
     """
 
     first: int
@@ -71,88 +80,15 @@ class RelativeResponse:
     rotation_deg: float
     horizontal_deg: float
     angle_error_deg: float
+    rotation_error_deg: float
     gains: FloatArray
+    gain_errors: FloatArray
     nonorthogonality_deg: float
+    nonorthogonality_error_deg: float
     reversed_channels: tuple[int, ...]
     delay: float
+    delay_error: float
     coherence: float
-
-
-def matched_coherence(
-    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
-) -> FloatArray:
-    """Return the magnitude squared coherence of like channels of two sensors.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        Cross-spectral or coherency matrix, channels grouped by sensor.
-    dims : tuple of int
-    first, second : int
-
-    Returns
-    -------
-    float64, shape (n_freqs, min(dims[first], dims[second]))
-        NaN if a channel has no power.
-    """
-    common = np.arange(min(dims[first], dims[second]))
-    a, b = (sum(dims[:sensor]) + common for sensor in (first, second))
-    power = csm[:, a, a].real * csm[:, b, b].real
-    cross = np.abs(csm[:, a, b]) ** 2
-    return np.where(power > 0, cross / np.where(power > 0, power, 1.0), np.nan)
-
-
-class CanonicalCoherence:
-    """Magnitude squared canonical coherence of groups of channels.
-
-    Matrix roots and pairs are cached.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        Coherency or cross-spectral matrix.
-    """
-
-    def __init__(self, csm: ComplexArray) -> None:
-        self._n_freqs = len(csm)
-        self._usable = np.isfinite(csm).all(axis=(1, 2))
-        self._csm = csm[self._usable]
-        self._roots: dict[tuple[int, ...], ComplexArray] = {}
-        self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
-
-    def between(self, first: range | IntArray, second: range | IntArray) -> FloatArray:
-        """Return the coherence of two groups of channels.
-
-        Returns
-        -------
-        float64, shape (n_freqs, min(len(first), len(second)))
-            Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``, independent
-            of the sensors' orientations. Zero if the matrix is not finite.
-        """
-        one, two = sorted((tuple(first), tuple(second)), key=len)
-        pair = frozenset((one, two))
-        if pair not in self._found:
-            # Eigenvalues of the product are the squares, at half the cost of singular values.
-            whitened = self._root(one) @ self._csm[:, np.array(one)[:, None], two] @ self._root(two)
-            squares = np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))
-            found = np.zeros((self._n_freqs, len(one)))
-            found[self._usable] = squares[:, ::-1]
-            self._found[pair] = np.clip(found, 0.0, 1.0)
-        return self._found[pair]
-
-    def _root(self, channels: tuple[int, ...]) -> ComplexArray:
-        """Return the inverse root of a group's matrix, zero in directions without power."""
-        if channels not in self._roots:
-            w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
-            alive = w > 1e-12 * w[:, -1:]
-            root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
-            self._roots[channels] = (u * root[:, None, :]) @ u.conj().swapaxes(1, 2)
-        return self._roots[channels]
-
-
-def own_channels(dims: tuple[int, ...], sensor: int) -> range:
-    """Return the indices of a sensor's channels."""
-    return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))
 
 
 def relative_response(
@@ -252,15 +188,17 @@ def relative_response(
     f, weight = frequency[inside], weight[inside]
     csm = csm[inside] / _power(csm[inside], dims, first)[:, None, None]
     S_ik, S_jk = (csm[:, channels[:, None], rest] for channels in own)
-    delay = _delay(f, weight, S_ik, S_jk)
+    delay, delay_error = _delay(f, weight, S_ik, S_jk)
     S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
     matrix = _transfer(weight, S_ik, S_jk)
     horizontal = _horizontal_channels(d, vertical)
     rotation, reversed_channels = _rotation(matrix)
-    gains = np.linalg.norm(matrix, axis=1)
-    directions = matrix / gains[:, None]
-    between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
+    gains, between = _gains_and_skew(matrix)
     rotation_deg, horizontal_deg = _angles(matrix, horizontal)
+    without = [_transfer(weight[~part], S_ik[~part], S_jk[~part]) for part in _parts(weight)]
+    gain_errors = _jackknife([_gains_and_skew(each)[0] for each in without], gains)
+    skew_errors = _jackknife([_gains_and_skew(each)[1] for each in without], between)
+    turned = _jackknife([np.rad2deg(_rotation(each)[0] - rotation) for each in without], rotation)
     return RelativeResponse(
         first=first,
         second=second,
@@ -271,10 +209,14 @@ def relative_response(
         rotation_deg=rotation_deg,
         horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
         angle_error_deg=_angle_error(weight, S_ik, S_jk, horizontal),
+        rotation_error_deg=float(np.linalg.norm(turned) / math.sqrt(2)),
         gains=gains,
+        gain_errors=gain_errors,
         nonorthogonality_deg=float(np.abs(between).max()),
+        nonorthogonality_error_deg=float(np.linalg.norm(skew_errors)),
         reversed_channels=reversed_channels,
         delay=delay,
+        delay_error=delay_error,
         coherence=float(g[inside].mean()),
     )
 
@@ -292,8 +234,18 @@ def _transfer(weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> Flo
     return np.asarray((left @ np.linalg.pinv(right)).real)
 
 
-def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray) -> float:
-    """Return the lag of the second sensor in s: from a grid, refined by the phase."""
+def _gains_and_skew(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lengths of the rows, and their deviations from right angles in degrees."""
+    gains = np.linalg.norm(matrix, axis=1)
+    directions = matrix / gains[:, None]
+    between = np.rad2deg(np.arcsin(np.clip(np.triu(directions @ directions.T, 1), -1, 1)))
+    return gains, np.asarray(between)
+
+
+def _delay(
+    f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray
+) -> tuple[float, float]:
+    """Return the lag of the second sensor and its error in s: from a grid, refined by the phase."""
     transfer = S_jk @ np.linalg.pinv(S_ik)
     known = np.isfinite(transfer).all(axis=(1, 2))
     f, weight, transfer = f[known], weight[known], transfer[known]
@@ -303,7 +255,26 @@ def _delay(f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexA
         mean = np.einsum("f,fab->ab", weight, aligned).real
         phase = np.angle(np.einsum("ab,fab->f", mean, aligned))
         delay -= float((weight * f) @ phase / ((weight * f) @ f) / (2 * np.pi))
-    return delay
+    without = [
+        np.atleast_1d((weight * f)[~part] @ phase[~part] / ((weight * f)[~part] @ f[~part]))
+        for part in _parts(weight)
+    ]
+    return delay, float(_jackknife(without, np.zeros(1))[0]) / (2 * np.pi)
+
+
+def _parts(weight: FloatArray) -> list[BoolArray]:
+    """Return parts of the band of about equal weight, as masks; none with few frequencies."""
+    share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
+    parts = [share == number for number in np.unique(share)]
+    return parts if len(parts) >= _MIN_PARTS and len(weight) >= 2 * _PARTS else []
+
+
+def _jackknife(without: list[FloatArray], like: FloatArray) -> FloatArray:
+    """Return standard errors from estimates that leave out one part each; NaN without any."""
+    n = len(without)
+    if not n:
+        return np.full(like.shape, np.nan)
+    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1))
 
 
 def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
@@ -374,10 +345,9 @@ def _angle_error(
     By the scatter between parts of the band of equal weight. Where single frequencies weigh too
     much for that, as in microseism, by a jackknife that leaves out one part at a time.
     """
-    share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
-    parts = [share == number for number in np.unique(share)]
+    parts = _parts(weight)
     n = len(parts)
-    if len(weight) < 4 * _PARTS or n < _MIN_PARTS:
+    if len(weight) < 4 * _PARTS or not n:
         return math.nan
     whole = n == _PARTS
     angles = np.array(

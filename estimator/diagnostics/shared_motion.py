@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import CanonicalCoherence, own_channels
+from estimator.self_noise.coherency import own_channels
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 AGREE = 0.3
 """Share of common motion from which two sensors agree."""
@@ -40,6 +40,78 @@ LESS = 0.9
 """Share of common motion, relative to that of others, above which a sensor left for no part."""
 GROWN = 4.0
 """Factor from which on a sensor records more besides the motion of the others."""
+
+
+class CanonicalCoherence:
+    """Magnitude squared canonical coherence of groups of channels.
+
+    Matrix roots and pairs are cached.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Coherency or cross-spectral matrix.
+    """
+
+    def __init__(self, csm: ComplexArray) -> None:
+        self._n_freqs = len(csm)
+        self._usable = np.isfinite(csm).all(axis=(1, 2))
+        self._csm = csm[self._usable]
+        self._roots: dict[tuple[int, ...], ComplexArray] = {}
+        self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
+
+    def between(self, first: range | IntArray, second: range | IntArray) -> FloatArray:
+        """Return the coherence of two groups of channels.
+
+        Returns
+        -------
+        float64, shape (n_freqs, min(len(first), len(second)))
+            Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``, independent
+            of the sensors' orientations. Zero if the matrix is not finite.
+        """
+        one, two = sorted((tuple(first), tuple(second)), key=len)
+        pair = frozenset((one, two))
+        if pair not in self._found:
+            # Eigenvalues of the product are the squares, at half the cost of singular values.
+            whitened = self._root(one) @ self._csm[:, np.array(one)[:, None], two] @ self._root(two)
+            squares = np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))
+            found = np.zeros((self._n_freqs, len(one)))
+            found[self._usable] = squares[:, ::-1]
+            self._found[pair] = np.clip(found, 0.0, 1.0)
+        return self._found[pair]
+
+    def _root(self, channels: tuple[int, ...]) -> ComplexArray:
+        """Return the inverse root of a group's matrix, zero in directions without power."""
+        if channels not in self._roots:
+            w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
+            alive = w > 1e-12 * w[:, -1:]
+            root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+            self._roots[channels] = (u * root[:, None, :]) @ u.conj().swapaxes(1, 2)
+        return self._roots[channels]
+
+
+def matched_coherence(
+    csm: ComplexArray, dims: tuple[int, ...], first: int, second: int
+) -> FloatArray:
+    """Return the magnitude squared coherence of like channels of two sensors.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        Cross-spectral or coherency matrix, channels grouped by sensor.
+    dims : tuple of int
+    first, second : int
+
+    Returns
+    -------
+    float64, shape (n_freqs, min(dims[first], dims[second]))
+        NaN if a channel has no power.
+    """
+    common = np.arange(min(dims[first], dims[second]))
+    a, b = (sum(dims[:sensor]) + common for sensor in (first, second))
+    power = csm[:, a, a].real * csm[:, b, b].real
+    cross = np.abs(csm[:, a, b]) ** 2
+    return np.where(power > 0, cross / np.where(power > 0, power, 1.0), np.nan)
 
 
 def shared_motion(

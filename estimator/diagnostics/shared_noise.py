@@ -152,7 +152,7 @@ def shared_noise(
         return None
     there = reduce(add, (scores[n] for n in of_bands))
     amount, error = there.amounts(chosen)
-    if np.any(np.abs(amount) > 1 + SEEN * error):  # no coherency: the misfit has another cause
+    if np.any(np.abs(amount) > 1 + error):  # no coherency: the misfit has another cause
         return None
     others = [
         (step, int(other))

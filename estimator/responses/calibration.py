@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import own_channels, relative_response
+from estimator.diagnostics.relative_response import relative_response
 from estimator.errors import InsufficientDataError
 from estimator.responses.derived_quantities import Value, with_errors
+from estimator.self_noise.coherency import own_channels
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray

@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.relative_response import own_channels
 from estimator.likelihood.dimension import bands
-from estimator.self_noise.coherency import check_dims
+from estimator.self_noise.coherency import check_dims, own_channels
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray

@@ -13,8 +13,8 @@ import numpy as np
 
 from estimator.diagnostics.advice import UnequalResponses
 from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.relative_response import own_channels
 from estimator.responses.edge_leakage import band_shares
+from estimator.self_noise.coherency import own_channels
 from estimator.spectra.equaliser import (
     USABLE,
     bounded,

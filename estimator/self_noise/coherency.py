@@ -82,6 +82,11 @@ def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
         raise InsufficientDataError(f"{len(dims)} sensors; expected at least {n_sensors}")
 
 
+def own_channels(dims: tuple[int, ...], sensor: int) -> range:
+    """Return the indices of a sensor's channels."""
+    return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))
+
+
 def check_averages(n_effective: float, d: int = 0) -> None:
     """Raise an error unless the averages are finite and exceed the dimension of the motion."""
     if not (np.isfinite(n_effective) and n_effective > 0):

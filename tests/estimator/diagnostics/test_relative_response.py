@@ -10,11 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.diagnostics.advice import ModelMisfit, Rotated
 from estimator.diagnostics.diagnose import diagnose
-from estimator.diagnostics.relative_response import (
-    CanonicalCoherence,
-    matched_coherence,
-    relative_response,
-)
+from estimator.diagnostics.orientation import orientation
+from estimator.diagnostics.relative_response import relative_response
+from estimator.diagnostics.shared_motion import CanonicalCoherence, matched_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from tests.estimator.csm_models import wishart
@@ -154,6 +152,19 @@ def test_noise_causes_no_bias_and_the_error_covers(peak: float) -> None:
     assert abs(np.mean(miss)) < 4 * np.std(miss) / np.sqrt(len(miss))
     assert np.std(miss) < 1.3 * np.sqrt(np.mean(np.square(errors)))
     assert np.sqrt(np.mean(np.square(errors))) < 3 * np.std(miss)
+
+
+@pytest.mark.parametrize("dims", [(1, 1, 1), (3, 3, 3)])
+def test_equal_sensors_in_weak_motion_are_not_said_to_differ(dims: tuple[int, ...]) -> None:
+    csm = bench([np.eye(dims[0])] * 3, snr=1.5 if dims[0] == 1 else 15)
+    names = [
+        found.kind
+        for draw in wishart(csm, 40, np.random.default_rng(5), n_draws=60)
+        for found in orientation(
+            relative_response(draw, FREQUENCY, dims=dims, first=0, second=1), dims, 20.0
+        )
+    ]
+    assert len(names) <= 1
 
 
 def test_more_sensors_and_one_channel() -> None:

@@ -10,8 +10,12 @@ import pytest
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import AdviceKind
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges
-from estimator.diagnostics.relative_response import CanonicalCoherence
-from estimator.diagnostics.shared_motion import may_have_moved, moved, shared_motion
+from estimator.diagnostics.shared_motion import (
+    CanonicalCoherence,
+    may_have_moved,
+    moved,
+    shared_motion,
+)
 from estimator.diagnostics.stability import PARTS, SegmentCourse
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.segment_spectra import (

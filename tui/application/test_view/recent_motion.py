@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level
-from estimator.diagnostics.relative_response import CanonicalCoherence
-from estimator.diagnostics.shared_motion import outsiders, shared_motion
+from estimator.diagnostics.shared_motion import CanonicalCoherence, outsiders, shared_motion
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot

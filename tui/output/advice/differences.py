@@ -61,7 +61,7 @@ def _not_orthogonal(advice: NotOrthogonal, names: Names) -> Explanation:
     one, other = (names.sensors[sensor] for sensor in advice.sensors)
     return Explanation(
         f"Channels of sensor {one} or {other} deviate by {advice.deviation_deg:.1f}° from a right "
-        f"angle: {EFFECT_OF_SKEW}.",
+        f"angle, or have unequal gains: {EFFECT_OF_SKEW}.",
         "Channels at right angles are best.",
     )
 

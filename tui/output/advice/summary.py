@@ -158,7 +158,9 @@ def _delays(*found: Delay, names: Names) -> str:
 @_together.register(NotOrthogonal)
 def _skewed(*found: NotOrthogonal, names: Names) -> str:
     pairs = _listed(found, names, lambda each: each.deviation_deg, lambda angle: f"{angle:.1f}°")
-    return f"Channels deviate from a right angle ({pairs}): {EFFECT_OF_SKEW}."
+    return (
+        f"Channels deviate from a right angle ({pairs}), or have unequal gains: {EFFECT_OF_SKEW}."
+    )
 
 
 @_together.register(ReversedPolarity)

@@ -409,7 +409,9 @@ def test_pairs_of_one_kind_are_one_line() -> None:
     (line,) = summarise(all_pairs(LEADS), who)
     assert line.startswith("Sensors lag each other (a–b −20 ms, a–c −20 ms, b–c −20 ms): their")
     (line,) = summarise(all_pairs(SKEWED), who)
-    assert line.startswith("Channels deviate from a right angle (a–b 5.7°, a–c 5.7°, b–c 5.7°): no")
+    assert line.startswith(
+        "Channels deviate from a right angle (a–b 5.7°, a–c 5.7°, b–c 5.7°), or have unequal gains"
+    )
     (line,) = summarise(all_pairs(GAIN), who)
     assert line.startswith("Gains differ (a–b 1.050, a–c 1.050, b–c 1.050): no bias")
     assert "in common" not in line  # no sensor is part of all three pairs
