@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.estimation.noise_estimates import ALL_METHODS
+from estimator.likelihood.dimension import bands
 from estimator.likelihood.gradients import misfit
 from estimator.self_noise.band_means import (
     NORMAL_95,
@@ -32,6 +33,11 @@ AT_BOUND = 0.05
 SECOND_ORDER = 2.5
 """Bias by further dimensions over the squared c.o.v. of one frequency, one standard deviation
 (docs/validation/gradients.md)."""
+FEW_AVERAGES = 0.25
+"""Bias of maximum likelihood over the squared c.o.v. of one frequency, one standard deviation."""
+OFTEN_AND_NOT = 3.0
+"""The same for weak dimensions, times the share of frequencies with them and that without
+(docs/validation/small-samples.md)."""
 _SHAPE_LENGTH = 512  # only the window's shape and overlap matter to the correlation of bins
 
 
@@ -66,10 +72,10 @@ def channel_means(
     """Return the mean noise of every channel in a band, each with its interval.
 
     It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
-    given, its lower end lowered by what the clocks may have added, and widened by what further
-    dimensions of the motion may have added (`dimension_error`). Where maximum likelihood stands at
-    its bound of zero at many frequencies, the mean is that of a noise constant over the band
-    (`estimator.self_noise.quiet_sensor`).
+    given, its lower end lowered by what the clocks may have added, and widened by errors that all
+    frequencies have in common (`dimension_error`, `second_order_error`). Where maximum likelihood
+    stands at its bound of zero at many frequencies, the mean is that of a noise constant over each
+    octave, or over the band (`estimator.self_noise.quiet_sensor`).
     """
     frequency = snapshot.frequency
     edges = band_edges(frequency, band)
@@ -96,14 +102,7 @@ def channel_means(
         own = range(int(first[sensor]), int(first[sensor + 1]))
         if d < max(snapshot.dims) or not any(often[column] for column in own):
             continue
-        found = quiet_sensor_noise(
-            snapshot.csm[inside],
-            dims=snapshot.dims,
-            sensor=sensor,
-            n_effective=averages_at(snapshot, frequency[inside]),
-            correlation=correlation,
-            quantile=quantile,
-        )
+        found, is_pooled = _of_quiet_sensor(snapshot, sensor, inside, correlation, quantile)
         for column, (mean, low, high) in zip(own, zip(*found, strict=True), strict=True):
             if often[column] and np.isfinite((mean, low, high)).all():
                 extra = (
@@ -111,14 +110,52 @@ def channel_means(
                     if added is None
                     else float(np.average(added[inside, column], weights=width[inside]))
                 )
-                parts = (mean, (high - low) / (2 * quantile), low - extra, high)
+                # a noise that varies over the band may be larger, but not than the biased mean
+                most = max(high, float(means[column].mean[0])) if is_pooled else high
+                parts = (mean, (most - low) / (2 * quantile), low - extra, most)
                 means[column] = BandMeans(*(np.array([float(part)]) for part in parts))
-    share = dimension_error(snapshot, noise.method)
+    share = np.hypot(
+        dimension_error(snapshot, noise.method)[:, None], second_order_error(noise, frequency)
+    )
     if not share.any():
         return tuple(means)
-    common = share[:, None] * np.nan_to_num(np.abs(noise.noise_psd))
+    common = share * np.nan_to_num(np.abs(noise.noise_psd))
     errors = quantile * np.average(common[inside], axis=0, weights=width[inside])
     return tuple(_widened(mean, error) for mean, error in zip(means, errors, strict=True))
+
+
+def _of_quiet_sensor(
+    snapshot: Snapshot, sensor: int, inside: slice, correlation: FloatArray, quantile: float
+) -> tuple[FloatArray, bool]:
+    """Return mean noise, low and high ends of a quiet sensor's channels, shape (3, n_channels).
+
+    Of each octave, where all of them are known; else of a noise constant over all octaves, and
+    True.
+    """
+    frequency = snapshot.frequency[inside]
+    octave = bands(frequency, per_octave=1)
+    whole = np.zeros_like(octave)
+    for part_of in (octave, whole) if octave[-1] else (whole,):
+        parts = np.array(
+            [
+                quiet_sensor_noise(
+                    snapshot.csm[inside][part_of == part],
+                    dims=snapshot.dims,
+                    sensor=sensor,
+                    n_effective=averages_at(snapshot, frequency[part_of == part]),
+                    correlation=correlation,
+                    quantile=quantile,
+                )
+                for part in range(part_of[-1] + 1)
+            ]
+        )
+        if np.isfinite(parts).all():
+            break
+    weight = np.bincount(part_of, np.gradient(snapshot.frequency)[inside])
+    share = weight / weight.sum()
+    mean = share @ parts[:, 0]
+    below, above = (np.sqrt(share**2 @ (parts[:, 0] - parts[:, end]) ** 2) for end in (1, 2))
+    return np.array([mean, mean - below, mean + above]), len(parts) == 1 and bool(octave[-1])
 
 
 def dimension_error(snapshot: Snapshot, method: str) -> FloatArray:
@@ -142,6 +179,24 @@ def dimension_error(snapshot: Snapshot, method: str) -> FloatArray:
             else SECOND_ORDER * choice.cov**2
         )
     return share
+
+
+def second_order_error(noise: SelfNoise, frequency: FloatArray) -> FloatArray:
+    """Return the bias of maximum likelihood as a share of the noise, shape (n_freqs, n_channels).
+
+    One standard deviation, common to the frequencies of a band: of second order in the c.o.v. of
+    one frequency. It is largest where the averages resolve a dimension of the motion at some
+    frequencies of an octave and not at others: scatter is then taken for it, and removes noise.
+    Zero with the other methods.
+    """
+    if noise.method != "maximum-likelihood":
+        return np.zeros(noise.noise_psd.shape)
+    unresolved = ((noise.flags & Flag.UNRESOLVED) != 0).any(axis=1)
+    octave = bands(frequency, per_octave=1)
+    found = (np.bincount(octave, unresolved) / np.bincount(octave))[octave]
+    of_second_order = FEW_AVERAGES + OFTEN_AND_NOT * found * (1 - found)
+    cov = np.where(np.isfinite(noise.cov), noise.cov, 0.0)
+    return np.asarray(of_second_order[:, None] * cov**2)
 
 
 def _widened(mean: BandMeans, error: float) -> BandMeans:

@@ -38,6 +38,9 @@ QUIETER = 0.2
 """Maximum noise of the target, as a fraction of the second-best partner's residuals."""
 MIN_EIGENVALUE = 1e-12
 """Smallest usable eigenvalue of the normal matrix, as a fraction of the largest."""
+RESOLVED = 4.0
+"""Standard deviations by which that eigenvalue must exceed zero. The interval does not include the
+scatter of the normal matrix, which is large where partners are hardly coherent with the target."""
 
 
 def quiet_sensor_noise(
@@ -71,8 +74,8 @@ def quiet_sensor_noise(
     Returns
     -------
     noise, low, high : float64, shape (dims[sensor],)
-        Estimate and ends of its interval in unit**2/Hz; NaN if unknown, or if the target is not far
-        quieter than its partners.
+        Estimate and ends of its interval in unit**2/Hz; NaN if unknown, if the partners hardly show
+        the motion, or if the target is not far quieter than they are.
 
     Raises
     ------
@@ -105,23 +108,24 @@ def quiet_sensor_noise(
         power.append(1 / np.sqrt(rest))
         seen.append(B.conj().swapaxes(1, 2) @ B)
         free.append(seen[-1] - len(other) * inverse / n[:, None, None])
-    normal, score = np.zeros((d, d)), np.zeros(d)
-    spread = np.zeros((len(S), d, d))
+    normal, spread, score = np.zeros((len(S), d, d)), np.zeros((len(S), d, d)), np.zeros(d)
     for j, k in itertools.combinations(range(len(others)), 2):
         cross = S[:, others[j][:, None], others[k]] * power[j][:, :, None] * power[k][:, None, :]
         rest_jk = cross - transfer[j] @ motion @ transfer[k].conj().swapaxes(1, 2)
         rest_jk *= left[:, None, None]
         found = np.einsum("fai,fab,fbi->fi", transfer[j].conj(), rest_jk, transfer[k]).real
         score += found.sum(axis=0)
-        normal += (free[j] * free[k].swapaxes(1, 2)).real.sum(axis=0)
+        normal += (free[j] * free[k].swapaxes(1, 2)).real
         spread += (seen[j] * seen[k].swapaxes(1, 2)).real / (2 * (n - d))[:, None, None]
-    w = np.linalg.eigvalsh(normal)
-    if not w[0] > MIN_EIGENVALUE * abs(w[-1]):
-        return unknown, unknown, unknown
-    regression = np.linalg.inv(normal)
     inflation = 1 + 2 * float(
         sum(r * max(0.0, 1 - lag / len(S)) for lag, r in enumerate(correlation[1:], start=1))
     )
+    w, u = np.linalg.eigh(normal.sum(axis=0))
+    weakest = np.einsum("fab,a,b->f", normal, u[:, 0], u[:, 0])
+    scatter = float(weakest.std()) * np.sqrt(inflation * len(S))
+    if not w[0] > max(MIN_EIGENVALUE * abs(w[-1]), RESOLVED * scatter):
+        return unknown, unknown, unknown
+    regression = np.linalg.inv(normal.sum(axis=0))
     covariance = regression @ spread.sum(axis=0) @ regression.T * inflation
     noise, error = regression @ score, np.sqrt(np.diag(covariance))
     largest = np.maximum(noise + quantile * error, 0.0)

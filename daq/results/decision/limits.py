@@ -26,6 +26,7 @@ from daq.results.band_summary import (
     dimension_error,
     highest_known,
     judged_method,
+    second_order_error,
 )
 from daq.results.clock_effect import added_in_bands
 from daq.results.decision.decision_time import Margins, predict
@@ -249,7 +250,7 @@ def _compare(
         low=low,
         high=high,
         added=added,
-        error=_errors(snapshot, edges, judged_method(snapshot, settings)),
+        error=_errors(snapshot, edges, judged_method(snapshot, settings), column),
         averages=averages,
         is_alone=np.array(
             [column in without_partners(snapshot, (f, f)) for f in centre.tolist()], dtype=bool
@@ -258,13 +259,17 @@ def _compare(
     )
 
 
-def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str) -> FloatArray:
+def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: int) -> FloatArray:
     """Return what the estimate may be off by in each band, as a share of the noise."""
     if edges.size < 2:
         return np.empty(0)
     low, high = snapshot.frequency[edges[:-1]], snapshot.frequency[edges[1:] - 1]
     centre = np.sqrt(low * high)
     share = dimension_error(snapshot, method)[: edges[-1]]
+    noise = snapshot.results.get(method)
+    if noise is not None:
+        weak = second_order_error(noise, snapshot.frequency)[: edges[-1], column]
+        share = np.hypot(share, weak)
     error = NORMAL_95 * np.maximum.reduceat(share, edges[:-1])
     explained = np.zeros(centre.shape, np.bool_)
     for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
-from daq.results.band_summary import channel_means, dimension_error
+from daq.results.band_summary import channel_means, dimension_error, second_order_error
 from daq.results.decision.limits import MIN_AVERAGES, judge
 from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
@@ -19,6 +19,7 @@ from estimator.diagnostics.kinds import Level
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
+from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tui.output.verdict_text import not_judged
 
@@ -331,6 +332,18 @@ def test_the_error_of_further_dimensions_is_not_averaged_away() -> None:
         wanted = math.hypot(old.high[0] - old.mean[0], 1.96 * share * old.mean[0])
         assert new.high[0] - new.mean[0] == pytest.approx(wanted, rel=1e-3)
     assert not dimension_error(wide, "three-sensor").any()
+
+
+def test_the_bias_of_dimensions_resolved_here_and_there_is_common_to_a_band() -> None:
+    noise = with_further_dimensions(0.0, accepted=True).results["maximum-likelihood"]
+    frequency = np.arange(len(noise.noise_psd)) / 10.0
+    flags = np.zeros_like(noise.flags)
+    flags[1::2] = Flag.UNRESOLVED
+    known = replace(noise, cov=np.full(noise.cov.shape, 0.2), flags=flags)
+    everywhere = replace(known, flags=np.full_like(flags, Flag.UNRESOLVED))
+    for each, share in ((known, 0.25 + 3 / 4), (everywhere, 0.25)):
+        np.testing.assert_allclose(second_order_error(each, frequency), share * 0.2**2, rtol=0.05)
+    assert not second_order_error(replace(known, method="three-sensor"), frequency).any()
 
 
 @pytest.mark.parametrize(("accepted", "verdict"), [(True, Verdict.PASS), (False, None)])
