@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 ASK_AFTER = 1.0
 """Silence in s after which the driver tests whether the device was restarted."""
-GATHER = 0.2
+GATHER = 0.25
 """Duration in s of the frames decoded together: a row of ``blocks``."""
 WAITING = 0.05
 """Time limit in s for reading bytes already received."""

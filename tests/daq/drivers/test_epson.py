@@ -90,12 +90,12 @@ async def test_window_and_command_are_separate_writes_with_the_required_interval
 
 
 class Restarted:
-    """A device that sends 47 frames, is restarted, and then answers questions only."""
+    """A device that sends 57 frames, is restarted, and then answers questions only."""
 
     label = "restarted"
 
     def __init__(self, frames: bytes, size: int) -> None:
-        self._pieces = [frames[: 40 * size], frames[40 * size :]]
+        self._pieces = [frames[: 50 * size], frames[50 * size :]]
         self._wanted = 0
         self._answer = asyncio.Event()
 
@@ -123,10 +123,10 @@ class Restarted:
 
 
 async def test_frames_before_a_restart_have_their_arrival_time() -> None:
-    """Seven of forty wait in the kernel until the device is found to be silent."""
+    """Seven of fifty wait in the kernel until the device is found to be silent."""
     configuration = Configuration.of(SENSOR)
-    zeros = np.zeros(47, np.int32)
-    frames = commands.encode_bursts(configuration.burst, x=zeros, count=np.arange(47))
+    zeros = np.zeros(57, np.int32)
+    frames = commands.encode_bursts(configuration.burst, x=zeros, count=np.arange(57))
     stream = cast("ByteStream", Restarted(frames, configuration.burst.size))
     decoder = configuration.decoder("A")
     device = Device(SENSOR, stream)
@@ -140,6 +140,6 @@ async def test_frames_before_a_restart_have_their_arrival_time() -> None:
 
     with pytest.raises(NoAnswerError, match="was restarted"):
         await read()
-    assert [block.n_samples for block in blocks] == [40, 7]
+    assert [block.n_samples for block in blocks] == [50, 7]
     passed = blocks[1].received.monotonic_ns - blocks[0].received.monotonic_ns
     assert passed == pytest.approx(7 / 200 * 1e9)
