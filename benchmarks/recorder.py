@@ -28,7 +28,7 @@ from daq.acquisition.recorder import run as record
 from daq.bench.loading import parse
 from daq.bench.model import Bench, Channel, Sensor
 from daq.estimation.estimation import Estimation
-from daq.estimation.follow import COMMIT_DELAY, SHORTEST_INTERVAL
+from daq.estimation.follow import COMMIT_INTERVAL, SHORTEST_INTERVAL
 from daq.estimation.settings import Settings
 from daq.protocols.epson import commands
 from daq.python_process import python_command
@@ -200,7 +200,7 @@ def _longest_delay(path: Path, *, until: float) -> float:
     with Estimation([path], Settings()) as estimation:
         estimation.update()
         while time.monotonic() < until:
-            time.sleep(max(SHORTEST_INTERVAL, estimation.lacking - COMMIT_DELAY))
+            time.sleep(max(SHORTEST_INTERVAL, estimation.lacking - COMMIT_INTERVAL))
             if estimation.update():
                 estimated = estimation.snapshot()
                 end = estimated.start_utc_ns * 1e-9 + estimated.elapsed

@@ -38,8 +38,8 @@ STATUS_INTERVAL = 1.0
 """Seconds between looks at the sensors, where they are watched."""
 SHORTEST_INTERVAL, LONGEST_INTERVAL = 0.25, 5.0
 """Seconds between looks for a new segment."""
-COMMIT_DELAY = 2.0
-"""Seconds by which the file lies behind the sensors, at most."""
+COMMIT_INTERVAL = 1.0
+"""Seconds of samples that a commit usually adds to the file: no look can find more."""
 LOOK_SHARE, ESTIMATE_SHARE = 0.03, 0.1
 """Share of the time that looks, and that estimates on a screen, may take."""
 SILENCE = 10.0
@@ -204,7 +204,7 @@ def _until_segment(estimation: Estimation) -> float:
     """Return the seconds until there may be a new segment: before, there is nothing to see."""
     bench = estimation.recordings[0].bench
     speed = 1.0 if bench is None else bench.speed
-    return max(SHORTEST_INTERVAL, (estimation.lacking - COMMIT_DELAY) / speed)
+    return max(SHORTEST_INTERVAL, (estimation.lacking - COMMIT_INTERVAL) / speed)
 
 
 def _result(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -111,7 +112,7 @@ class Recording:
                 f"{error}; its journal has what was acknowledged: huddle repair {path}"
             ) from error
 
-    @property
+    @cached_property
     def bench(self) -> Bench | None:
         """The recorded bench; None for imported recordings."""
         if not self.bench_text:

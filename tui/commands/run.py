@@ -303,5 +303,6 @@ def _progress(duration: float | None) -> Iterator[_Bar]:
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[state]}"),
+        per_second=1,
     ) as bar:
         yield _Bar(bar, duration)

@@ -82,13 +82,16 @@ def _width(stream: TextIO) -> int | None:
     return None if stream.isatty() else WIDTH_OF_FILES
 
 
-def progress(*columns: str | ProgressColumn) -> Progress:
-    """Return a display of how far something is, on terminals; files and pipes get none."""
+def progress(*columns: str | ProgressColumn, per_second: float = 2) -> Progress:
+    """Return a display of how far something is, on terminals; files and pipes get none.
+
+    It is drawn so many times `per_second`.
+    """
     screen = notices()
     return Progress(
         *columns,
         console=screen,
-        refresh_per_second=2,
+        refresh_per_second=per_second,
         transient=True,
         disable=screen.quiet or not screen.is_terminal,
     )

@@ -15,7 +15,7 @@ import pytest
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import (
-    COMMIT_DELAY,
+    COMMIT_INTERVAL,
     LONGEST_INTERVAL,
     SHORTEST_INTERVAL,
     RecordingLeftOpenError,
@@ -458,9 +458,9 @@ def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
         settings = replace(SETTINGS, segment=6.0)
         with pytest.raises(InsufficientDataError):
             follow(path, settings, noted, recorder=process, watch_sensors=False)
-    # The demo's bench runs at four times real time; the file may lie behind by two seconds.
+    # The demo's bench runs at four times real time; each commit adds about a second.
     # Looks, a few milliseconds each, may take 3 % of the time, which can make a wait longer.
     speed = 4.0
     for waited, lacking in zip(process.waits, (6.0, 5.0, 3.0), strict=True):
-        assert waited >= max(SHORTEST_INTERVAL, (lacking - COMMIT_DELAY) / speed) - 1e-9
+        assert waited >= max(SHORTEST_INTERVAL, (lacking - COMMIT_INTERVAL) / speed) - 1e-9
         assert waited <= LONGEST_INTERVAL
