@@ -20,6 +20,7 @@ from tui.studies.estimates import ESTIMATES
 from tui.studies.gradients import gradients
 from tui.studies.laboratory import LABORATORY, Laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
+from tui.studies.random_tests import RANDOM, random_tests
 from tui.studies.responses import calibration, edges
 from tui.studies.shared_noise import SHARED_NOISE, shared
 from tui.studies.study import TOLERANCE
@@ -38,6 +39,7 @@ RESPONSES = {
     "edges": edges,
     "gradients": gradients,
     "clock-coverage": clock_coverage,
+    RANDOM: random_tests,
 }
 STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, SHARED_NOISE, *RESPONSES)
 ALL = "all"

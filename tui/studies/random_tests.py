@@ -1,0 +1,223 @@
+"""Tests drawn at random, with known noise: whether intervals cover, and advice is true.
+
+The other studies vary one thing at a time. Here sensors, channels, orientation, SNR, colour and
+spread of the noise, gains, length and segment are drawn together. Some tests have a sensor of
+another response, or one that lags. So combinations are seen that nobody thought of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import channel_means
+from estimator.diagnostics.advice import (
+    Advice,
+    Delay,
+    Gain,
+    ModelMisfit,
+    NoSharedMotion,
+    Rotated,
+    UnequalResponses,
+)
+from estimator.diagnostics.misfit import SharedNoise
+from estimator.self_noise.band_means import band_edges
+from tui.studies.study import Panel, Point, Series, Study
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daq.estimation.snapshot import Snapshot
+    from estimator.types import FloatArray
+    from tui.studies.study import ProgressCallback
+
+RANDOM = "random-tests"
+N_TESTS = 400
+SEED = 27
+RATE = 100.0
+BANDS = ((1.0, 10.0), (10.0, 40.0))
+METHODS = ("three-sensor", "maximum-likelihood")
+DECADES = (-2, -1, 0, 1, 2, 4, 6)
+"""Limits of the groups of SNR, log10."""
+LOW_PASS, LAGS = 0.2, 0.15
+"""Shares of tests in which sensor B has a low-pass, and in which sensor C lags by one sample."""
+SETTLING = 2000
+"""Samples before a filter has forgotten its start."""
+_NOMINAL, _ALLOWED, _FALSE, _FALSE_ALLOWED = 0.95, 0.045, 0.01, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a test consists of; colours are coefficients of first-order autoregression.
+
+    `corner` is that of the low-pass of sensor B in Hz, `lag` that of sensor C in samples.
+    """
+
+    n_sensors: int
+    n_channels: int
+    seconds: float
+    segment: float
+    turned: str
+    snr: float
+    spread: float
+    colours: tuple[float, float]
+    gains: float
+    n_directions: int
+    corner: float | None
+    lag: int
+
+
+def draw_scene(rng: np.random.Generator) -> Scene:
+    """Draw a scene."""
+    d = int(rng.choice([1, 3, 3]))
+    return Scene(
+        n_sensors=int(rng.choice([3, 3, 4, 5])),
+        n_channels=d,
+        seconds=float(rng.choice([120, 300, 600, 1200])),
+        segment=float(rng.choice([2, 5, 10])),
+        turned=str(rng.choice(["parallel", "tilted", "anyhow"])) if d > 1 else "parallel",
+        snr=10 ** rng.uniform(-1.5, 6),
+        spread=float(rng.choice([1, 1, 3, 10, 30])),
+        colours=(float(rng.choice([0, 0.9, 0.98])), float(rng.choice([0, 0.5, 0.9]))),
+        gains=float(rng.choice([0, 0.01, 0.1])),
+        n_directions=int(rng.choice([d, d, d, 1])),
+        corner=float(rng.uniform(10, 40)) if rng.random() < 0.2 else None,
+        lag=int(rng.random() < 0.15),
+    )
+
+
+def simulate(scene: Scene, rng: np.random.Generator) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Return the samples of each sensor, and the standard deviations of the channels' noise."""
+    n, d = round(scene.seconds * RATE), scene.n_channels
+    of_motion, of_noise = scene.colours
+
+    def coloured(colour: float) -> FloatArray:
+        white = rng.standard_normal((n + SETTLING, d)) * np.sqrt(1 - colour**2)
+        return np.asarray(lfilter([1], [1, -colour], white, axis=0)[SETTLING:])
+
+    motion = coloured(of_motion) * np.where(np.arange(d) >= scene.n_directions, 0.1, 1.0)[::-1]
+    samples, deviations = {}, []
+    for name in "ABCDE"[: scene.n_sensors]:
+        seen = motion @ _turn(scene, rng) * (1 + scene.gains * rng.standard_normal(d))
+        if name == "B" and scene.corner is not None:
+            pole = np.exp(-2 * np.pi * scene.corner / RATE)
+            seen = lfilter([1 - pole], [1, -pole], seen, axis=0)
+        if name == "C" and scene.lag:
+            seen = np.roll(seen, scene.lag, axis=0)
+        deviation = scene.spread ** rng.uniform(-0.5, 0.5, d) / np.sqrt(scene.snr)
+        samples[name] = seen + deviation * coloured(of_noise)
+        deviations.append(deviation)
+    return samples, np.concatenate(deviations)
+
+
+def _turn(scene: Scene, rng: np.random.Generator) -> FloatArray:
+    if scene.turned == "parallel":
+        return np.eye(scene.n_channels)
+    if scene.turned == "tilted":
+        return np.asarray(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix())
+    return np.asarray(Rotation.random(random_state=rng).as_matrix())
+
+
+def noise_psd(scene: Scene, deviations: FloatArray, frequency: FloatArray) -> FloatArray:
+    """Return the PSD of the noise of each channel, shape (n_freqs, n_channels)."""
+    colour = scene.colours[1]
+    shape = (1 - colour**2) / np.abs(1 - colour * np.exp(-2j * np.pi * frequency / RATE)) ** 2
+    return np.asarray(shape[:, None] * deviations**2 * 2 / RATE)
+
+
+FALSE: dict[type[Advice], Callable[[Scene], bool]] = {
+    Delay: lambda scene: not scene.lag and scene.corner is None,
+    Gain: lambda scene: not scene.gains and scene.corner is None,
+    Rotated: lambda scene: scene.turned == "parallel",
+    UnequalResponses: lambda scene: not scene.lag and scene.corner is None,
+    NoSharedMotion: lambda _: True,
+    ModelMisfit: lambda scene: not scene.lag and scene.corner is None,
+    SharedNoise: lambda scene: not scene.lag and scene.corner is None,
+}
+"""Kinds of advice, and in which scenes they are wrong."""
+
+
+def random_tests(told: ProgressCallback, *, length: float = 1.0) -> Study:
+    """Judge intervals and advice on tests drawn at random.
+
+    Parameters
+    ----------
+    told
+        Takes progress.
+    length
+        Share of `N_TESTS` to simulate.
+    """
+    n_tests = max(12, round(N_TESTS * length))
+    covered: dict[tuple[str, int], list[float]] = {}
+    said: dict[type[Advice], list[bool]] = {kind: [] for kind in FALSE}
+    for number in range(n_tests):
+        told("random tests", number / n_tests)
+        rng = np.random.default_rng([SEED, number])
+        scene = draw_scene(rng)
+        samples, deviations = simulate(scene, rng)
+        settings = Settings(segment=scene.segment, methods=METHODS)
+        snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
+        group = int(np.searchsorted(DECADES, np.log10(scene.snr), side="right")) - 1
+        for method in METHODS:
+            share = _coverage(snapshot, settings, method, scene, deviations)
+            covered.setdefault((method, group), []).append(share)
+        kinds = {type(each) for each in snapshot.diagnostics.advice}
+        for kind, would_be_wrong in FALSE.items():
+            if would_be_wrong(scene):
+                said[kind].append(kind in kinds)
+    coverage = []
+    for method in METHODS:
+        groups = sorted(group for each, group in covered if each == method)
+        points = [_covering(group, covered[method, group]) for group in groups]
+        coverage.append(Series("95 % intervals of band means", method, "share", tuple(points)))
+    wrong = tuple(
+        Series(
+            f"{kind.__name__} ({sum(found)} of {len(found)})",
+            "advice",
+            "share",
+            (_accused(number, found),),
+        )
+        for number, (kind, found) in enumerate(said.items())
+        if found
+    )
+    return Study(
+        RANDOM,
+        f"{n_tests} tests drawn at random",
+        (
+            Panel("(a) coverage", "SNR, at least", "share (1)", tuple(coverage), log="x"),
+            Panel("(b) advice that is wrong", "kind", "share of tests (1)", wrong),
+        ),
+    )
+
+
+def _covering(group: int, shares: list[float]) -> Point:
+    """Return a mean share of covered means; the channels of one test depend on each other."""
+    error = max(float(np.std(shares)), 0.05) / np.sqrt(len(shares))
+    return Point(10.0 ** DECADES[group], float(np.mean(shares)), _NOMINAL, error, _ALLOWED)
+
+
+def _accused(number: int, found: list[bool]) -> Point:
+    error = float(np.sqrt(_FALSE * (1 - _FALSE) / len(found)))
+    return Point(number, float(np.mean(found)), _FALSE, error, _FALSE_ALLOWED)
+
+
+def _coverage(
+    snapshot: Snapshot, settings: Settings, method: str, scene: Scene, deviations: FloatArray
+) -> float:
+    """Return the share of channels and bands whose interval holds the true mean."""
+    true = noise_psd(scene, deviations, snapshot.frequency)
+    inside = []
+    for band in BANDS:
+        means = channel_means(snapshot.results[method], snapshot, settings, band)
+        truth = true[slice(*band_edges(snapshot.frequency, band))].mean(axis=0)
+        inside += [
+            mean.low[0] <= each <= mean.high[0] for mean, each in zip(means, truth, strict=True)
+        ]
+    return float(np.mean(inside))
