@@ -18,8 +18,8 @@ from tui.output.extras import require
 from tui.studies.clocks import clock_coverage, clocks
 from tui.studies.estimates import ESTIMATES
 from tui.studies.gradients import gradients
-from tui.studies.laboratory import LABORATORY, Laboratory
-from tui.studies.numerical import NUMERICAL, Ingredients
+from tui.studies.paper.laboratory import LABORATORY, Laboratory
+from tui.studies.paper.numerical import NUMERICAL, Ingredients
 from tui.studies.random_tests import RANDOM, random_tests
 from tui.studies.responses import calibration, edges
 from tui.studies.shared_noise import SHARED_NOISE, shared

@@ -17,8 +17,8 @@ from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.studies.laboratory import HANN, SHOWN, measure, smoothed
-from tui.studies.numerical import (
+from tui.studies.paper.laboratory import HANN, SHOWN, measure, smoothed
+from tui.studies.paper.numerical import (
     BAND,
     NUMERICAL,
     PAPER,
