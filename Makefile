@@ -6,7 +6,7 @@ PEER := tests/peers/async_labjack_peer
 PEER_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/huddle-tests/async_labjack
 SOURCES := huddle.py daq estimator sim_devices tui tests benchmarks docs examples
 
-.PHONY: demo test peers check bench docs session torture clean
+.PHONY: demo test test-long peers check bench docs session torture clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -24,8 +24,11 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 demo: $(VENV)/.installed  ## the whole huddle test on a simulated bench, over its real protocols
 	$(BIN)/huddle demo
 
-test: $(VENV)/.installed-dev  ## the tests; three at a time on two cores, for many wait for their devices
+test: $(VENV)/.installed-dev  ## the tests but the long ones; three at a time on two cores, for many wait for their devices
 	$(BIN)/pytest -n 3
+
+test-long: $(VENV)/.installed-dev  ## the tests that are studies, endurance or whole sessions
+	$(BIN)/pytest -n 3 -m long
 
 peers:  ## compile the program in Rust that the tests talk to; kept in the user's cache
 	cargo build --quiet --manifest-path $(PEER)/Cargo.toml --target-dir $(PEER_CACHE)

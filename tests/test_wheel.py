@@ -64,6 +64,7 @@ def run(site: Path, folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_it_works_in_a_folder_of_the_users_own_modules(site: Path, crowded: Path) -> None:
     call = (
         "import huddle; sensors = huddle.simulate('fig9', 60);"
@@ -86,6 +87,7 @@ def test_everything_that_is_not_code_is_in_it(site: Path) -> None:
     assert (site / "huddle-stubs" / "__init__.pyi").read_text() == (ROOT / stub).read_text()
 
 
+@pytest.mark.long
 def test_a_users_type_checker_sees_its_types(site: Path, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT, encoding="utf-8")
     interpreter = next(site.parents[i] for i in (1, 2) if (site.parents[i] / "pyvenv.cfg").exists())

@@ -35,6 +35,7 @@ ATTEMPTS = 3
 """To start the recorder, should a fault strike just then."""
 
 
+@pytest.mark.long
 def test_every_sample_sent_is_recorded_and_every_gap_has_its_length(tmp_path: Path) -> None:
     faults = fault_script.script(begin=BEGIN, spacing=SPACING, every=ROUND)
     out, log = tmp_path / "r.h5", tmp_path / "log.jsonl"

@@ -101,7 +101,13 @@ def test_the_example_passes_its_suite(tmp_path: Path) -> None:
     assert "6 passed, 1 skipped" in done.stdout
 
 
-@pytest.mark.parametrize("name", BREAKS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if number == 0 else pytest.param(name, marks=pytest.mark.long)
+        for number, name in enumerate(BREAKS)
+    ],
+)
 def test_a_broken_driver_fails(name: str, tmp_path: Path) -> None:
     read, failing = BREAKS[name]
     sound = (EXAMPLE / "tests" / "test_conformance.py").read_text(encoding="utf-8")

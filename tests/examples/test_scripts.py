@@ -52,6 +52,7 @@ def command(arguments: list[str], *, check: bool) -> None:
     print(done.stdout, end="")
 
 
+@pytest.mark.long
 def test_from_a_bench_to_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

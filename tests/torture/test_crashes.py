@@ -16,10 +16,12 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and a preloaded library")
 
 
+@pytest.mark.long
 def test_nothing_acknowledged_is_lost_in_a_kill(tmp_path: Path) -> None:
     assert kill_faults(tmp_path, 3, seed=5) == []
 
 
+@pytest.mark.long
 def test_nothing_acknowledged_is_lost_in_an_error_of_the_disk(tmp_path: Path) -> None:
     library = shim(tmp_path)
     if library is None:

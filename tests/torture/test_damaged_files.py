@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.torture.damaged_files import LIMIT, contents, flips, make_recording, tally
 from tests.waiting import limit
 
@@ -11,6 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+@pytest.mark.long
 def test_no_flipped_bit_is_taken_for_data_or_stops_the_reader(tmp_path: Path) -> None:
     whole = tmp_path / "whole.h5"
     make_recording(whole)

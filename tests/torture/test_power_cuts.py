@@ -26,13 +26,17 @@ def operations(tmp_path_factory: pytest.TempPathFactory) -> list[Operation]:
     return recorded(library, folder, 12)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model",
+    [m if m == "sectors" else pytest.param(m, marks=pytest.mark.long) for m in MODELS],
+)
 def test_nothing_acknowledged_is_lost(
     operations: list[Operation], model: str, tmp_path: Path
 ) -> None:
     assert faults(operations, model, 6, tmp_path, seed=7) == []
 
 
+@pytest.mark.long
 def test_without_its_journal_a_torn_recording_is_lost(
     operations: list[Operation], tmp_path: Path
 ) -> None:

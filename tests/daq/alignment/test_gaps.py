@@ -67,6 +67,7 @@ def work_of(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Work, int]:
     return work, snapshot.n_segments
 
 
+@pytest.mark.long
 def test_many_gaps_of_polled_sensors_do_not_increase_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

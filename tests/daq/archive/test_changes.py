@@ -19,6 +19,7 @@ def series(
     return 100 + scatter * spread * rng.standard_normal((n_days, 8)), spread
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scatter", [1.0, 4.0])
 def test_the_rate_of_false_alarms_is_as_stated(scatter: float) -> None:
     rng = np.random.default_rng(5)

@@ -163,6 +163,7 @@ def test_every_mode_is_tested() -> None:
     assert set(FAULTS) == set(CASES)
 
 
+@pytest.mark.long
 def test_each_sample_has_its_index(
     tmp_path: Path, subtests: pytest.Subtests, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ async def _recorded(served: Served, path: Path) -> float:
     return begun
 
 
+@pytest.mark.long
 def test_samples_kept_by_a_pausing_device_are_recorded(
     tmp_path: Path, subtests: pytest.Subtests
 ) -> None:

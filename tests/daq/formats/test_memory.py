@@ -66,8 +66,8 @@ def same(a: Snapshot, b: Snapshot) -> None:
 @pytest.mark.parametrize(
     ("dtype", "holes", "options"),
     [
-        ("float64", 0, {"methods": ("all",)}),
-        ("int32", 0, {"segment": 1.0, "window": "blackman"}),
+        pytest.param("float64", 0, {"methods": ("all",)}, marks=pytest.mark.long),
+        pytest.param("int32", 0, {"segment": 1.0, "window": "blackman"}, marks=pytest.mark.long),
         ("float32", 40, {"segment": 0.5, "reject": True}),
         ("float64", 5, {"segment": 2.0, "octaves": True, "detrend": "linear"}),
     ],

@@ -280,6 +280,7 @@ def test_a_small_significant_misfit_is_graded_by_its_effect() -> None:
     assert not misfit.is_wrong
 
 
+@pytest.mark.long
 def test_a_sound_test_seldom_fails_in_any_band() -> None:
     """One in a hundred, however many bands are tested: with one in a hundred each, 8 of these."""
     rng = np.random.default_rng(11)
@@ -315,6 +316,7 @@ def test_a_model_of_too_few_dimensions_has_its_own_advice() -> None:
     assert np.isfinite(found.model.p_value).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rank", [0, 1])
 def test_the_dimension_is_overrated_as_seldom_as_its_level_says(rank: int) -> None:
     """Bartlett's degrees of freedom: with fewer it would be too often, with more hardly ever."""

@@ -129,6 +129,7 @@ def test_sensors_of_unequal_channels_get_advice_on_the_compared_channels(
     assert all(100 < advice.snr < 300 for advice in space)  # of channels whose noise is known
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dims", [(3, 2, 1), (3, 3, 1), (2, 2, 1)])
 def test_a_sound_bench_of_unequal_sensors_seldom_fails(dims: tuple[int, ...]) -> None:
     """Two channels alone feel a dimension: their noise is divided anyhow, and fits no better."""

@@ -102,7 +102,9 @@ def test_eigenvalues_are_corrected_for_scatter() -> None:
     assert fisher.spiked_eigenvalues(np.ones((1, 1)), 39, 200)[0, 0] > 1
 
 
-@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize(
+    "d", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("snr", [1.0, 1e6])
 def test_the_bias_is_of_first_order(d: int, snr: float) -> None:
     """With n = 100, terms of second order are below (2 q / n)**2."""

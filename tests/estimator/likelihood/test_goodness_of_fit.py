@@ -32,7 +32,7 @@ def bench(dims: tuple[int, ...], *, snr: float = 1e3) -> ComplexArray:
 @pytest.mark.parametrize(
     ("dims", "degrees"), [((1,) * 3, 1), ((2,) * 3, 10), ((3,) * 3, 27), ((3,) * 5, 129)]
 )
-@pytest.mark.parametrize("n_averages", [20, 100, 1080])
+@pytest.mark.parametrize("n_averages", [20, 100, pytest.param(1080, marks=pytest.mark.long)])
 def test_false_alarms_occur_at_the_one_percent_level(
     dims: tuple[int, ...], degrees: int, n_averages: int
 ) -> None:
@@ -48,6 +48,7 @@ def test_false_alarms_occur_at_the_one_percent_level(
     assert test.statistic.mean() / degrees == pytest.approx(1, abs=tolerance + 4 * error)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_averages", [4, 6])
 def test_estimated_noise_lowers_the_statistic_as_predicted(n_averages: int) -> None:
     """Without motion psi is the diagonal, and Bartlett's factor exact to order 1/n**3.
@@ -69,6 +70,7 @@ def test_correlation_of_neighbouring_bins_by_closed_form() -> None:
     assert len(neighbour_correlation(np.ones(256), 256, 100)) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("overlap", [0.5, 0.75])
 def test_pooled_false_alarms_under_a_taper(overlap: float) -> None:
     """White motion and noise through real Hann segments; bands of 20 bins."""

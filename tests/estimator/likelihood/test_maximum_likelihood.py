@@ -203,7 +203,7 @@ GEOMETRIES = {
 
 
 @pytest.mark.parametrize("geometry", GEOMETRIES)
-@pytest.mark.parametrize("n_averages", [100, 1080])
+@pytest.mark.parametrize("n_averages", [100, pytest.param(1080, marks=pytest.mark.long)])
 def test_the_estimate_is_unbiased_with_the_scatter_of_the_bound(
     geometry: str, n_averages: int
 ) -> None:
@@ -243,6 +243,7 @@ def test_five_triaxial_sensors_reach_four_percent() -> None:
     assert np.median(found.cov) < 0.040
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("snr", [10.0, 1e6])
 def test_the_estimate_is_unbiased_from_twenty_averages_on(d: int, snr: float) -> None:

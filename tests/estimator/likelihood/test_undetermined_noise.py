@@ -85,7 +85,7 @@ def test_a_channel_without_counterpart_has_no_estimate(d: int) -> None:
         ((3, 2, 1), 2.0, [2]),
     ],
 )
-@pytest.mark.parametrize("n_averages", [100, 1080])
+@pytest.mark.parametrize("n_averages", [100, pytest.param(1080, marks=pytest.mark.long)])
 def test_motion_measured_by_one_channel_is_not_reported_as_its_noise(
     dims: tuple[int, ...], tilt: float, alone: list[int], n_averages: int
 ) -> None:

@@ -32,6 +32,7 @@ def drawn(rng: np.random.Generator, terms: FloatArray, n: float) -> tuple[FloatA
     return psd * rng.gamma(n, 1 / n, len(psd)), np.full(len(psd), 1 / np.sqrt(n))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [20, 400])
 def test_terms_are_unbiased_and_their_errors_cover_the_truth(n: int) -> None:
     rng = np.random.default_rng(1)
@@ -47,6 +48,7 @@ def test_terms_are_unbiased_and_their_errors_cover_the_truth(n: int) -> None:
     assert chi_square == pytest.approx(1.0, abs=0.04 if n == 20 else 0.015)
 
 
+@pytest.mark.long
 def test_an_absent_term_is_zero_within_its_error() -> None:
     rng = np.random.default_rng(2)
     white = np.array([0, 0, 1e-12, 0])

@@ -21,7 +21,7 @@ def two_poor_sensors(ratio: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("ratio", "snr"), [(10.0, 1e3), (100.0, 1e3), (1000.0, 1e4)])
-@pytest.mark.parametrize("n", [30, 200])
+@pytest.mark.parametrize("n", [30, pytest.param(200, marks=pytest.mark.long)])
 def test_two_poor_sensors_hardly_affect_the_others(ratio: float, snr: float, n: int) -> None:
     """Scatter within 10 % of maximum likelihood; no bias; the interval is that of these weights."""
     noise_psd = two_poor_sensors(ratio)

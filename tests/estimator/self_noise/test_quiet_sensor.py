@@ -18,11 +18,11 @@ RATIO = 1000.0
     ("dims", "n", "snr", "n_freqs"),
     [
         ((3, 3, 3), 226, 0.03, 64),
-        ((3, 3, 3), 226, 0.3, 490),
-        ((3, 3, 3), 226, 3.0, 64),
-        ((3, 3, 3), 40, 1.0, 64),
+        pytest.param((3, 3, 3), 226, 0.3, 490, marks=pytest.mark.long),
+        pytest.param((3, 3, 3), 226, 3.0, 64, marks=pytest.mark.long),
+        pytest.param((3, 3, 3), 40, 1.0, 64, marks=pytest.mark.long),
         ((1, 1, 1), 226, 0.3, 64),
-        ((3,) * 5, 226, 0.1, 64),
+        pytest.param((3,) * 5, 226, 0.1, 64, marks=pytest.mark.long),
     ],
 )
 def test_the_interval_covers_the_truth_and_the_estimate_is_unbiased(

@@ -128,7 +128,7 @@ def test_five_sensors_reach_what_all_triads_can() -> None:
 
 
 @pytest.mark.parametrize("dims", BENCHES)
-@pytest.mark.parametrize("snr", [10, 1e6])
+@pytest.mark.parametrize("snr", [10, pytest.param(1e6, marks=pytest.mark.long)])
 def test_bias_scatter_and_coverage_from_twenty_averages_on(
     dims: tuple[int, ...], snr: float
 ) -> None:
@@ -186,6 +186,7 @@ def test_motion_left_in_by_few_averages_is_that_of_decision_10(snr: float) -> No
     assert abs(found.mean() - 1 - left) < 4.5 * error
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("overlap", [0.5, 0.75])
 def test_overlapping_segments_are_worth_n_effective_for_the_bias_too(overlap: float) -> None:
     # method.md: d = 3, 20 segments, Hann, 75 %: -0.273 uncorrected, -0.281 predicted

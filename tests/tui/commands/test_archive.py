@@ -153,6 +153,7 @@ def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> No
     assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     store, address = tmp_path / "store", tmp_path / "scheduler.json"

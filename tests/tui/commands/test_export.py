@@ -143,7 +143,7 @@ def test_miniseed_of_any_type_of_sample_is_read_as_it_was(tmp_path: Path, dtype:
     np.testing.assert_array_equal(np.column_stack([trace.data for trace in stream]), samples)
 
 
-@pytest.mark.parametrize("states_utc", [True, False])
+@pytest.mark.parametrize("states_utc", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_utc: bool) -> None:
     obspy = load_obspy()
     rate, n = 100 * (1 + 80e-6), 8 * 4100

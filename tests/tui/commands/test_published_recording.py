@@ -78,6 +78,7 @@ def published(tst: Path) -> tuple[dict[str, Any], Snapshot]:
     return document, snapshot
 
 
+@pytest.mark.long
 def test_published_table_through_the_command(published: tuple[dict[str, Any], Snapshot]) -> None:
     document, _ = published
     assert document["method"] == "three-channel"
@@ -102,6 +103,7 @@ def test_published_table_of_complex_magnitudes(published: tuple[dict[str, Any], 
             assert np.mean(10 * np.log10(np.abs(noise))) == pytest.approx(level, abs=1e-3)
 
 
+@pytest.mark.long
 def test_three_sensor_removes_the_microseism_that_leaks_through_misalignment(tst: Path) -> None:
     settings = Settings(
         segment=409.6, detrend="none", methods=("three-channel", "three-sensor"), unit="m/s²"
@@ -136,6 +138,7 @@ def test_all_methods_a_part_of_the_time_and_csv(tst: Path, tmp_path: Path) -> No
     assert len(header.split(",")) == len(first.split(",")) == 1 + 9 * (1 + 4 * len(methods))
 
 
+@pytest.mark.long
 def test_the_report_shows_the_angles_and_where_the_model_test_fails(
     tst: Path, tmp_path: Path
 ) -> None:
@@ -166,6 +169,7 @@ def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -
         huddle("estimate", str(tst), *options, code=2)
 
 
+@pytest.mark.long
 def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
     document = result_of(
         tst, "--end", "2h", "--octaves", "--dimension", "auto", "--unit", "m/s²", "--reject"

@@ -243,6 +243,7 @@ def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> No
     assert len(json.loads(said)["channels"]) == 18
 
 
+@pytest.mark.long
 def test_demo_shows_which_estimate_is_right() -> None:
     document = huddle("demo", "--duration", "40s", "--speed", "8", "--json", "-").stdout
     channels = json.loads(document)["channels"]

@@ -496,6 +496,7 @@ def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> N
     assert f"{2 * reported.snapshot.n_segments} segments used" in text
 
 
+@pytest.mark.long
 def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     motion = 4000 * rng.standard_normal((2000, 1))

@@ -65,6 +65,7 @@ def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None
     assert record.exists()
 
 
+@pytest.mark.long
 def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None:
     with simulated(parse(demo_bench()), speed=8.0) as reachable:
         limits = (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),)
@@ -107,6 +108,7 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
     assert not record.exists()
 
 
+@pytest.mark.long
 def test_processes_of_an_archive_execute_none(record: Path, tmp_path: Path) -> None:
     begin = months.START_NS
     paths = [

@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
+@pytest.mark.parametrize(
+    "latency",
+    [Latency(), pytest.param(Latency("batching", 16e-3), marks=pytest.mark.long)],
+    ids=lambda x: x.kind,
+)
 def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Latency) -> None:
     rows = {
         row.clocks: row for row in study(tmp_path, snr=1e4, duration=120.0, latency=latency, seed=3)
@@ -81,6 +85,7 @@ def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> 
     assert stated.noise_bias[at - 20 : at + 20, 4].mean() == pytest.approx(expected, rel=0.4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
 def test_half_a_minute_is_stated_by_its_samples_not_by_its_arrivals(
     tmp_path: Path, latency: Latency
@@ -116,6 +121,7 @@ def test_a_clock_that_samples_could_not_refine_is_as_far_off_as_the_arrivals_lea
     assert told.residual == pytest.approx({"A": 0.0, "B": 1e-6, "C": 13e-6})
 
 
+@pytest.mark.long
 def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None:
     latency = Latency("batching", 16e-3)
     left, told = [], []
@@ -134,7 +140,7 @@ def test_what_is_stated_holds_though_arrivals_are_polled(tmp_path: Path) -> None
     assert np.sqrt(np.mean(np.square(left))) < 2 * np.sqrt(np.mean(np.square(told)))
 
 
-@pytest.mark.parametrize("behind", [0.0004, -0.7])
+@pytest.mark.parametrize("behind", [0.0004, pytest.param(-0.7, marks=pytest.mark.long)])
 def test_device_utc_and_host_times_meet_though_the_hosts_utc_is_off(
     tmp_path: Path, behind: float
 ) -> None:
@@ -165,6 +171,7 @@ def test_a_rate_that_is_off_by_one_per_cent_is_followed(tmp_path: Path) -> None:
     assert noise[band].mean(axis=0) == pytest.approx(1e-13, rel=0.03)
 
 
+@pytest.mark.long
 def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> None:
     rows = {row.clocks: row for row in study(tmp_path, snr=0.3, duration=100.0, seed=4)}
     alone, refined = rows["arrival times"], rows["refined"]

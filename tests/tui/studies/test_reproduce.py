@@ -93,6 +93,7 @@ def test_theory_is_the_published_one(ingredients: Ingredients, studies: dict[str
     assert cov.theory == pytest.approx(np.sqrt(2.5 / (3600 * QUICK)), rel=0.02)
 
 
+@pytest.mark.long
 def test_the_window_smooths_what_a_laboratory_expects() -> None:
     """Three triaxial sensors, a resonance and pink noise: measured against expected."""
     table: dict[str, Any] = {
@@ -121,6 +122,7 @@ def test_the_window_smooths_what_a_laboratory_expects() -> None:
     assert power[peak, 0] == pytest.approx(1.0, abs=4 / np.sqrt(measured.n_effective))
 
 
+@pytest.mark.long
 def test_a_laboratory_case_in_four_minutes() -> None:
     """Above 5 Hz, where so few averages still find the motion."""
     (study,) = reproduce(["setup2"], told=quiet, length=0.02)

@@ -16,6 +16,7 @@ def found() -> list[Outcome]:
     return outcomes(N_TESTS, seed=7)
 
 
+@pytest.mark.long
 def test_verdicts_are_seldom_wrong(found: list[Outcome]) -> None:
     """Four standard deviations: a rule that passes what does not fail is wrong in twenty of 60."""
     for verdict in (Verdict.PASS, Verdict.FAIL):

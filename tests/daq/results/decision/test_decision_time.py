@@ -56,6 +56,7 @@ def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
     assert 20 <= found.seconds < 28
 
 
+@pytest.mark.long
 def test_it_decides_as_often_as_it_says() -> None:
     """Channels of different noise, each estimated with scatter, now and after the time stated."""
     rng, cov, n = np.random.default_rng(3), 0.12, 40

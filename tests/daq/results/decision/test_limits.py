@@ -86,6 +86,7 @@ def test_too_few_averages_decide_nothing() -> None:
     assert verdict_on(made_snapshot(n_effective=100), 1e-9).verdict is Verdict.PASS
 
 
+@pytest.mark.long
 def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     rng = np.random.default_rng(11)
     snapshot, settings = made_snapshot(), replace(SETTINGS, window="rectangular", overlap=0.0)
