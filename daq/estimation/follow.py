@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 STATUS_INTERVAL = 1.0
 """Seconds between looks at the sensors, where they are watched."""
-SHORTEST_INTERVAL, LONGEST_INTERVAL = 0.25, 5.0
+SHORTEST_INTERVAL, MAX_INTERVAL = 0.25, 5.0
 """Seconds between looks for a new segment."""
 COMMIT_INTERVAL = 1.0
 """Seconds of samples that a commit usually adds to the file: no look can find more."""
@@ -192,7 +192,7 @@ def follow(
                     sensors.look()
             memory.give_back()
             interval = STATUS_INTERVAL if sensors is not None else _until_segment(estimation)
-            known.ends_within(min(max(interval, looks.remaining), LONGEST_INTERVAL))
+            known.ends_within(min(max(interval, looks.remaining), MAX_INTERVAL))
             if cancelled.is_set():
                 return None
         if sensors is not None:

@@ -34,7 +34,7 @@ LEVEL = 0.05
 (in one band in twenty), a missing one causes a bias."""
 MISFIT_LEVEL = 0.01
 """p value below which the misfit of a band is not explained by chance."""
-ENOUGH_SENSORS = 5
+MIN_DETERMINED_SENSORS = 5
 """Number of sensors from which further dimensions still determine the noise of each sensor."""
 EQUATIONS = 1.5
 """Minimum number of equations, ``(p - q)**2``, per channel, with more factors than usual.
@@ -85,7 +85,7 @@ class BandDimension:
     tried: tuple[BandTest, ...]
     cov: float
     usual_cov: float
-    n_sensors: int = ENOUGH_SENSORS
+    n_sensors: int = MIN_DETERMINED_SENSORS
     gradients: bool = False
 
     @property
@@ -95,7 +95,7 @@ class BandDimension:
         With further dimensions, four sensors have too few directions without motion to determine
         the noise of each: the model then also fits wrong noise.
         """
-        return self.n_factors > self.usual and self.n_sensors < ENOUGH_SENSORS
+        return self.n_factors > self.usual and self.n_sensors < MIN_DETERMINED_SENSORS
 
     @property
     def is_biased(self) -> bool:
@@ -242,7 +242,7 @@ def choose_dimension(
             n_factors=len(tests) - 1,
             usual=usual,
             accepted=b not in open_bands
-            and not (len(tests) - 1 > usual and len(there.sensors) < ENOUGH_SENSORS),
+            and not (len(tests) - 1 > usual and len(there.sensors) < MIN_DETERMINED_SENSORS),
             n_sensors=len(there.sensors),
             test=tests[-1],
             tried=tuple(tests),

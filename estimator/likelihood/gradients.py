@@ -17,7 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.likelihood import fisher
-from estimator.likelihood.dimension import ENOUGH_SENSORS, MAX_BINS, MIN_BINS, MISFIT_LEVEL
+from estimator.likelihood.dimension import (
+    MAX_BINS,
+    MIN_BINS,
+    MIN_DETERMINED_SENSORS,
+    MISFIT_LEVEL,
+)
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.known_loadings import known_loadings_test, maximise_known
@@ -238,7 +243,7 @@ def _chosen(
     n_factors = 3 * choice.usual
     test = known_loadings_test(fit, n_factors=n_factors, n_effective=n_effective)
     pooled = pool(test, np.ones(len(csm), np.bool_), neighbours=neighbours)
-    enough = choice.n_sensors >= ENOUGH_SENSORS
+    enough = choice.n_sensors >= MIN_DETERMINED_SENSORS
     harmless = misfit(pooled, csm.shape[1], n_effective) < _HARMLESS * choice.cov
     if not (pooled.p_value > MISFIT_LEVEL or (enough and harmless)):
         return choice

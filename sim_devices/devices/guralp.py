@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 FULL_SCALE = (1 << 23) - 1
 MAX_SAMPLES = 248
 """Maximum number of samples per block: fits every compression, in complete records."""
-LONGEST_BLOCK = 10
+MAX_BLOCK = 10
 """Maximum duration of a block, in s, at low sampling rates."""
 REPLY_TIME = 0.15
 STATUS_INTERVAL = 60.0
@@ -82,8 +82,8 @@ class Digitizer:
     def _length_of_block(self) -> int:
         unit = self._rate / self._parts  # samples per permitted interval between block starts
         if unit.denominator > 1:
-            return max(1, round(LONGEST_BLOCK * float(self._rate)))
-        most = min(MAX_SAMPLES, int(LONGEST_BLOCK * self._rate))
+            return max(1, round(MAX_BLOCK * float(self._rate)))
+        most = min(MAX_SAMPLES, int(MAX_BLOCK * self._rate))
         return max(1, most // int(unit)) * int(unit)
 
     def start(self, now: float) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-LONGEST_FRAME = 300
+MAX_FRAME = 300
 
 
 class Slave(Protocol):
@@ -92,7 +92,7 @@ class ModbusEndpoint:
             answer = self._answer(request)
             if answer is not None:
                 answers.append(self._framer.buildFrame(answer))
-        if len(self._waiting) > LONGEST_FRAME:
+        if len(self._waiting) > MAX_FRAME:
             self._waiting = b""
         return answers
 

@@ -41,7 +41,7 @@ SHORTEST, LONGEST = 2_000_000, 40_000_000
 """Limits of the clock's lead over a participant, ns: shorter than any timeout of a driver."""
 LOOKS = 2
 """Minimum number of times that an idle participant reads the clock in this lead."""
-LONGEST_PAUSE = 0.01
+MAX_PAUSE = 0.01
 """Maximum interval between two reads of a stopped clock, s of the system's clock."""
 MAX_PARTICIPANTS = 1024
 _FREE = 2**63 - 1
@@ -253,7 +253,7 @@ class _Selector(selectors.SelectSelector):
             if ready or now >= until:
                 return ready
             # While the clock waits for a participant, frequent reads would only load the computer.
-            pause = min(max(2 * pause, seconds), LONGEST_PAUSE) if now == before else 0.0
+            pause = min(max(2 * pause, seconds), MAX_PAUSE) if now == before else 0.0
 
 
 class PacedLoop(asyncio.SelectorEventLoop):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy import fft
 
-from sim_devices.world.tables import LONGEST_BLOCK
+from sim_devices.world.tables import MAX_BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +40,7 @@ class WhiteSources:
     """
 
     def __init__(
-        self, key: tuple[int, int], n_sources: int, longest_block: int = LONGEST_BLOCK
+        self, key: tuple[int, int], n_sources: int, longest_block: int = MAX_BLOCK
     ) -> None:
         self.n_sources = n_sources
         self.block = min(longest_block, 2 ** ((LARGEST_SPECTRUM // n_sources).bit_length() - 1))

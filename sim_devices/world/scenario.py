@@ -52,7 +52,7 @@ import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError, model_validator
 
 from sim_devices.errors import ScenarioError
-from sim_devices.world.tables import LONGEST_BLOCK, USABLE, MotionModel, SensorModel, Table
+from sim_devices.world.tables import MAX_BLOCK, USABLE, MotionModel, SensorModel, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -71,7 +71,7 @@ class Scenario(Table):
     seed: NonNegativeInt = 0
     motion: MotionModel
     sensors: dict[str, SensorModel] = Field(min_length=1)
-    longest_block: Literal[4096, 65536] = LONGEST_BLOCK
+    longest_block: Literal[4096, 65536] = MAX_BLOCK
     """Grid samples computed at once; 4096, for smooth spectra, is quicker to begin."""
 
     @classmethod

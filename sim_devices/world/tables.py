@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 USABLE = 0.9
 """The motion ends at this fraction of the lowest Nyquist frequency."""
-LONGEST_BLOCK: Final = 65536
+MAX_BLOCK: Final = 65536
 """Grid samples computed at once by default: spectra are as wanted at the resolution of half."""
 
 

@@ -37,7 +37,7 @@ ENTRY = ScheduledRun(
     name="disk", cron="*/10 * * * *", time_zone="UTC", duration=240.0, when_busy="queue"
 )
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EMFILE)
-LONGEST_WAIT = 600.0
+MAX_WAIT = 600.0
 
 
 def main() -> int:
@@ -76,7 +76,7 @@ def main() -> int:
 
                 def wait_for(*states: RunState) -> None:
                     """Let runs come to these states, also those due from now on."""
-                    since, end = clock.now(), time.monotonic() + LONGEST_WAIT
+                    since, end = clock.now(), time.monotonic() + MAX_WAIT
                     while time.monotonic() < end and service.poll() is None:
                         if any(r.due >= since and r.state in states for r in store.runs()):
                             return
@@ -96,7 +96,7 @@ def main() -> int:
                 last = store.runs(None, RunState.DONE)[-1]
                 if last.due < until:
                     wrong.append("no run was done after the last failure")
-                end = time.monotonic() + LONGEST_WAIT
+                end = time.monotonic() + MAX_WAIT
                 while time.monotonic() < end and any(
                     run.due < last.due and not run.is_over for run in store.runs()
                 ):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator import planning
-from estimator.likelihood.dimension import ENOUGH_SENSORS
+from estimator.likelihood.dimension import MIN_DETERMINED_SENSORS
 from estimator.likelihood.gradients import MIN_SENSORS
 from estimator.methods import self_noise
 
@@ -66,7 +66,7 @@ class Waves:
                 f" {self.n_sensors} sensors cannot tell gradients of the motion from noise; the"
                 " model test can only warn. Put them closer together, or use six sensors:"
             )
-        elif not math.isfinite(self.cost) or self.n_sensors < ENOUGH_SENSORS:
+        elif not math.isfinite(self.cost) or self.n_sensors < MIN_DETERMINED_SENSORS:
             text += (
                 f" {self.n_sensors} sensors tell gradients of the motion from noise only if like"
                 " channels have like noise, and no band is called accepted. Put them closer"
@@ -122,7 +122,7 @@ def waves_across(
         radius=radius,
         is_known=positions is not None,
         one_percent=low * math.sqrt(0.01 / bias),
-        cost=cost(directions, where) if n_sensors >= ENOUGH_SENSORS else math.inf,
+        cost=cost(directions, where) if n_sensors >= MIN_DETERMINED_SENSORS else math.inf,
         cost_of_six=cost(six, around),
     )
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
-LONGEST_SLEEP = 30.0
+MAX_SLEEP = 30.0
 """Seconds between two readings of the clock, which may be set."""
 MAX_ATTEMPTS = 5
 """Estimates of a run that may end without an outcome: one that kills its process is given up."""
@@ -200,9 +200,9 @@ class Service:
                 self._load_again()
             self._write_unsaved()
             run, now = self.next_run, self._clock.now()
-            left = LONGEST_SLEEP if run is None else (run.due - now).total_seconds()
+            left = MAX_SLEEP if run is None else (run.due - now).total_seconds()
             if run is None or left > 0:
-                await self._clock.sleep(min(left, LONGEST_SLEEP), self._wake)
+                await self._clock.sleep(min(left, MAX_SLEEP), self._wake)
                 continue
             del self._planned[run.key]
             if now - run.due > GRACE:

@@ -31,7 +31,7 @@ LOOK = 2.0
 """Seconds between looks at a recorder and the disk."""
 STALL = timedelta(minutes=2)
 """Time without progress after which a recorder is killed: devices that are lost do not matter."""
-RETRY, LONGEST_RETRY = 5.0, 300.0
+RETRY, MAX_RETRY = 5.0, 300.0
 """Seconds until the rest of a window is tried to be recorded: at first, and at most."""
 START = timedelta(minutes=5)
 """Time for which a recorder that cannot begin is started again: a cable may just be plugged in."""
@@ -119,7 +119,7 @@ class Window:
                 if not self._existing(run) and self._clock.now() - begun > START:
                     break  # the devices, the bench file or the disk let no recording begin
             run = await self._pause(run, wait)
-            wait = min(2 * wait, LONGEST_RETRY)
+            wait = min(2 * wait, MAX_RETRY)
         return self._recorded(run)
 
     def _left_over(self, run: Run) -> Recorder | None:

@@ -39,7 +39,7 @@ N_TESTS = 200
 SHORTEST, LONGEST = 20.0, 600.0
 FARTHEST_DB = 3.0
 """Of the noise from the limit."""
-LONGEST_AGAIN = 4 * 3600.0
+MAX_AGAIN = 4 * 3600.0
 """Seconds to which a test is prolonged at most."""
 SNRS = (1.0, 1e6)
 WRONG = 0.025
@@ -197,7 +197,7 @@ def outcomes(
         verdict = test.verdict(limit)
         predicted = None if verdict.prediction is None else verdict.prediction.seconds
         second = None
-        if predicted is not None and predicted <= LONGEST_AGAIN:
+        if predicted is not None and predicted <= MAX_AGAIN:
             test.record_until(predicted)
             second = test.verdict(limit).verdict
         found.append(Outcome(above_db, seconds, verdict.verdict, predicted, second))

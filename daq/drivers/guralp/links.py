@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SEND_INTERVAL = 10.0
 """Interval of requests to continue sending, s."""
 RECOVERY_TIMEOUT = 2.0
-FIRST_RETRY, LONGEST_RETRY = 5.0, 300.0
+FIRST_RETRY, MAX_RETRY = 5.0, 300.0
 """Delay of the next recovery after a failed one, s; doubled after each failure."""
 
 
@@ -131,7 +131,7 @@ class _UdpLink:
             why = str(error) or "no answer"
             text = f"no recovery of lost packets over TCP, next in {self._delay:g} s: {why}"
             self._retry_ns = at.monotonic_ns + round(self._delay * 1e9)
-            self._delay = min(2 * self._delay, LONGEST_RETRY)
+            self._delay = min(2 * self._delay, MAX_RETRY)
             return [*found, Event(self._name, EventKind.STATUS, text[:200], at)]
         if self._retry_ns is not None:
             text = "lost packets are recovered over TCP again"

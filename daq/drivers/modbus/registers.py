@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 FAILURES = 3
 """Polls without a reply after which a device is lost."""
-FIRST_RETRY, LONGEST_RETRY = 1.0, 30.0
+FIRST_RETRY, MAX_RETRY = 1.0, 30.0
 """Delay in s of the next request to a lost device while others on its bus reply; doubled after each
 request, because the others wait meanwhile."""
 GATEWAY_CODES = {10, 11}
@@ -248,7 +248,7 @@ class _Poller:
     def _give_up(self) -> None:
         self.is_gone = True
         self.due_ns = self._clock.now().monotonic_ns + self._delay * 1e9
-        self._delay = min(2 * self._delay, LONGEST_RETRY)
+        self._delay = min(2 * self._delay, MAX_RETRY)
 
     def _unanswered(self, text: str) -> list[Block | Event]:
         self._failures += 1

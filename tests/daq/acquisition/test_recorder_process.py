@@ -36,7 +36,7 @@ pytestmark = pytest.mark.devices
 SPEED = 8.0
 NAMES = ("A", "B", "C")
 TABLES = [device(name) for name in NAMES]
-LONGEST_SEARCH = 20 * 3600 * 200
+MAX_SEARCH = 20 * 3600 * 200
 """Samples of a world that goes on between tests."""
 
 # Records the bench in argv[1] and prints what is acknowledged.
@@ -90,7 +90,7 @@ def check_against_truth(path: Path) -> None:
         for sensor in recording.sensors[:1]:
             counts = sensor.counts()[:400, :3]
             # When the device began to sample shows by the motion itself.
-            for begin in range(0, LONGEST_SEARCH, 60_000):
+            for begin in range(0, MAX_SEARCH, 60_000):
                 truth = world.samples(sensor.name, begin, 60_400) * commands.COUNTS_PER_UNIT
                 off = np.abs(truth[:60_000, :3] - counts[0]).max(axis=1)
                 start = int(np.argmin(off))

@@ -16,7 +16,7 @@ from daq.alignment.aligned_recording import AlignedRecording
 from daq.estimation.estimation import estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
-    LONGEST_INTERVAL,
+    MAX_INTERVAL,
     SHORTEST_INTERVAL,
     RecordingLeftOpenError,
     follow,
@@ -463,4 +463,4 @@ def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(
     speed = 4.0
     for waited, lacking in zip(process.waits, (6.0, 5.0, 3.0), strict=True):
         assert waited >= max(SHORTEST_INTERVAL, (lacking - COMMIT_INTERVAL) / speed) - 1e-9
-        assert waited <= LONGEST_INTERVAL
+        assert waited <= MAX_INTERVAL
