@@ -213,10 +213,12 @@ def _coverage(
 ) -> float:
     """Return the share of channels and bands whose interval holds the true mean."""
     true = noise_psd(scene, deviations, snapshot.frequency)
+    width = np.gradient(snapshot.frequency)
     inside = []
     for band in BANDS:
         means = channel_means(snapshot.results[method], snapshot, settings, band)
-        truth = true[slice(*band_edges(snapshot.frequency, band))].mean(axis=0)
+        here = slice(*band_edges(snapshot.frequency, band))
+        truth = np.average(true[here], axis=0, weights=width[here])
         inside += [
             mean.low[0] <= each <= mean.high[0] for mean, each in zip(means, truth, strict=True)
         ]
