@@ -24,6 +24,7 @@ def test_without_motion_the_samples_have_the_stated_noise() -> None:
     np.testing.assert_allclose(ratio.mean(axis=0), 1, atol=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("length", [0.03])
 def test_intervals_cover_and_advice_is_true(length: float) -> None:
     study = random_tests(lambda *_: None, length=length)
