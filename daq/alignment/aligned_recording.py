@@ -26,7 +26,7 @@ from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
     from numpy.typing import NDArray
 
@@ -56,6 +56,8 @@ class AlignedRecording:
         Limits of the grid, UTC in ns since 1970.
     nominal_clocks : bool
         Whether to assume that every clock has its nominal rate, from the first sample to arrive.
+    sensors : collection of str, optional
+        Default: all.
 
     Raises
     ------
@@ -71,10 +73,12 @@ class AlignedRecording:
         start_utc_ns: int | None = None,
         end_utc_ns: int | None = None,
         nominal_clocks: bool = False,
+        sensors: Collection[str] | None = None,
     ) -> None:
         self._recording = recording
         self._wanted = (start_utc_ns, end_utc_ns)
-        records = [record for record in recording.sensors if main_columns(record)]
+        every = [record for record in recording.sensors if main_columns(record)]
+        records = [one for one in every if sensors is None or one.name in sensors]
         if not records:
             raise CannotAlignError(
                 f"{recording.path}: no sensor with a channel that is not auxiliary"
@@ -162,11 +166,9 @@ class AlignedRecording:
             In s; only differences are meaningful.
         """
         seconds = self._start + at / self.sampling_rate
-        columns = [
-            seconds - source.known_clock.position(seconds) / source.record.sampling_rate
-            for source in self._sources
-        ]
-        return np.stack(columns, axis=1)
+        rates = [source.record.sampling_rate for source in self._sources]
+        positions = [source.known_clock.position(seconds) for source in self._sources]
+        return np.asarray(seconds[:, None] - np.column_stack(positions) / rates)
 
     @property
     def measurable(self) -> tuple[int, ...]:
@@ -214,9 +216,8 @@ class AlignedRecording:
         for column, number in enumerate(self.measurable):
             source = self._sources[number]
             index = source.known_clock.position(seconds)
-            source.learnt.add(
-                np.column_stack([index, at_reference, delays[:, column], std[:, column]])
-            )
+            found = index, at_reference, delays[:, column], std[:, column]
+            source.learnt.add(np.column_stack(found))
 
     def reset_delays(self) -> None:
         """Drop all measured delays; the clocks do not change until they are set again."""
@@ -358,8 +359,7 @@ class AlignedRecording:
     @property
     def _untouched(self) -> bool:
         """Return whether all samples are on the grid."""
-        grid = self._grid
-        return grid is None or all(map(grid.has, self._sources))
+        return self._grid is None or all(map(self._grid.has, self._sources))
 
     @property
     def _start(self) -> float:

@@ -34,6 +34,7 @@ from daq.estimation.recording_set import (
     open_another,
 )
 from daq.estimation.segment_course import keep_few
+from daq.estimation.segments.memory import announce, live_sensors
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
@@ -66,6 +67,9 @@ class Estimation:
         Default: those of the bench in the first recording.
     diagnosis_share : float
         Of the time, at most, that diagnoses of growing recordings may cost.
+    live : bool
+        Whether memory is limited: an estimate of very many channels then has the first sensors
+        only, and is never finished.
 
     Raises
     ------
@@ -83,6 +87,7 @@ class Estimation:
         settings: Settings | None = None,
         *,
         diagnosis_share: float = DIAGNOSIS_SHARE,
+        live: bool = False,
     ) -> None:
         if not paths:
             raise CannotAlignError("no recording given; expected at least one")
@@ -92,7 +97,9 @@ class Estimation:
                 self._recordings.append(open_another(path, self._recordings))
             self._open_continuations()
             self.settings = Settings.of(self._recordings[0].bench) if settings is None else settings
-            self._passes = [Pass(recording, self.settings) for recording in self._recordings]
+            first = self._recordings[0]
+            self._sensors = live_sensors(first, self.settings) if live else None
+            self._passes = [self._pass(recording) for recording in self._recordings]
             check_same(self._passes)
             aligned = self._passes[0].aligned
             unit = canonical(self.settings.unit or aligned.channels[0][1].unit)
@@ -122,6 +129,14 @@ class Estimation:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _pass(self, recording: ReadableRecording) -> Pass:
+        return Pass(recording, self.settings, self._sensors)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all sensors are estimated."""
+        return self._sensors is None
 
     @property
     def recordings(self) -> tuple[ReadableRecording, ...]:
@@ -213,12 +228,14 @@ class Estimation:
         self._continue()
         for each in self._passes:
             each.aligned.refresh()
+        first = self._passes[0]
+        announce(first.n_channels, first.welch.sampling_rate, self.settings.segment)
         is_exact = all(each.aligned.is_exact for each in self._passes)
         if not is_exact:
             self._equalisation.reset()
         for number, each in enumerate(self._passes):
             if each.n_seen and not each.aligned.is_exact:
-                self._passes[number] = Pass(each.recording, self.settings)
+                self._passes[number] = self._pass(each.recording)
         self._filter()
         check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
@@ -262,7 +279,7 @@ class Estimation:
             return
         self._open_continuations()
         for recording in self._recordings[len(self._passes) :]:
-            self._passes.append(Pass(recording, self.settings))
+            self._passes.append(self._pass(recording))
             check_same(self._passes)
         self._filter()
 

@@ -142,7 +142,7 @@ def follow(
     """
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = Recording.open(path)
-    with Estimation([recording], settings, diagnosis_share=share / 10) as estimation:
+    with Estimation([recording], settings, diagnosis_share=share / 10, live=True) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
             remote = _RemoteRecorder(recording, cancelled, silence)
@@ -176,11 +176,7 @@ def follow(
                     known, sensors = seen(recording)
                 if recording.closed:
                     break
-                if left_open:
-                    raise RecordingLeftOpenError(
-                        f"{path}: the recorder ended without closing it; what it had acknowledged"
-                        f" is safe: huddle repair {path}, then huddle estimate {path}"
-                    )
+                _check_left(path, is_open=left_open)
                 if estimation.n_seen >= wanted and estimates.is_due:
                     wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + growth))
                     if sensors is not None:
@@ -197,7 +193,18 @@ def follow(
                 return None
         if sensors is not None:
             sensors.look_closely()
-        return _result(estimation, observer, cancelled)
+        if estimation.is_whole:
+            return _result(estimation, observer, cancelled)
+    with Estimation([path], estimation.settings) as whole:
+        return _result(whole, observer, cancelled)
+
+
+def _check_left(path: Path, *, is_open: bool) -> None:
+    if is_open:
+        raise RecordingLeftOpenError(
+            f"{path}: the recorder ended without closing it; what it had acknowledged"
+            f" is safe: huddle repair {path}, then huddle estimate {path}"
+        )
 
 
 def _until_segment(estimation: Estimation) -> float:

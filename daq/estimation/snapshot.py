@@ -191,6 +191,8 @@ class Snapshot:
         finished estimate.
     bridged : Bridged or None
         None where no segment with gaps counts.
+    not_estimated : tuple of str
+        Sensors that a live estimate leaves out, because all would take too much memory.
     """
 
     frequency: FloatArray
@@ -215,6 +217,7 @@ class Snapshot:
     no_segment: NoSegment | None = None
     quantisation_psd: FloatArray | None = None
     bridged: Bridged | None = None
+    not_estimated: tuple[str, ...] = ()
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.alignment.sensor_reader import main_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
 from daq.estimation.noise_estimates import (
     Dimensions,
@@ -181,6 +182,7 @@ class SnapshotBuilder:
             diagnostics=diagnostics,
             no_segment=_no_segment(passes, self._settings.segment),
             bridged=gaps,
+            not_estimated=_not_estimated(latest, channels),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
                 if final
@@ -288,6 +290,13 @@ def _widened(
         low = low - np.clip(np.nan_to_num(gaps.leakage), 0.0, 1.0) * np.abs(psd)
         high = high + np.clip(np.nan_to_num(-gaps.leakage), 0.0, 1.0) * np.abs(psd)
     return replace(result, cov=factor * result.cov, low=low, high=high)
+
+
+def _not_estimated(recording: ReadableRecording, channels: Channels) -> tuple[str, ...]:
+    """Return the sensors that could be estimated and are not."""
+    estimated = {sensor for sensor, _ in channels}
+    left = (record for record in recording.sensors if record.name not in estimated)
+    return tuple(record.name for record in left if main_columns(record))
 
 
 def _counting_rates(recording: ReadableRecording) -> dict[str, float]:

@@ -16,7 +16,7 @@ from tui.output.console import console, finite, write_text
 from tui.output.formatting import clock_time, time_left
 from tui.output.json_document import verdict_document
 from tui.output.json_values import plain
-from tui.output.results import why_no_segment
+from tui.output.results import live_remarks
 from tui.runs.estimate_settings import settings_for
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class _Lines:
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         before, self.last = self.last, snapshot
-        reason = " ".join(why_no_segment(snapshot))
+        reason = " ".join(live_remarks(snapshot))
         if reason and not self._says_why:
             self._says_why = True
             if self._json is None:

@@ -170,8 +170,22 @@ def faulty_channels(snapshot: Snapshot) -> list[str]:
     return lines
 
 
-def why_no_segment(snapshot: Snapshot) -> tuple[str, ...]:
-    """Return why no segment counts, and what to do; empty where one does, or may soon."""
+def live_remarks(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return what a live estimate lacks, and what to do; empty where nothing."""
+    return *_not_estimated(snapshot), *_why_no_segment(snapshot)
+
+
+def _not_estimated(snapshot: Snapshot) -> tuple[str, ...]:
+    if not snapshot.not_estimated:
+        return ()
+    n, n_left = len(snapshot.sensor_names), len(snapshot.not_estimated)
+    return (
+        f"Live estimate of the first {n} of {n + n_left} sensors, to limit its memory.",
+        "The result has all; so has huddle estimate.",
+    )
+
+
+def _why_no_segment(snapshot: Snapshot) -> tuple[str, ...]:
     found = snapshot.no_segment
     if found is None:
         return ()

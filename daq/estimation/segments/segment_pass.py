@@ -25,7 +25,7 @@ from estimator.spectra.segment_spectra import SegmentSpectra, kept_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from datetime import datetime
 
     from numpy.typing import NDArray
@@ -46,9 +46,22 @@ _MATERIAL_CONSTANT = 0.02  # samples of constant delay, of which a window forgiv
 
 
 class Pass:
-    """Segments of one recording, taken in order; other processors read ahead."""
+    """Segments of one recording, taken in order; other processors read ahead.
 
-    def __init__(self, recording: ReadableRecording, settings: Settings) -> None:
+    Parameters
+    ----------
+    recording : ReadableRecording
+    settings : Settings
+    sensors : collection of str, optional
+        Names of the sensors to estimate; default: all.
+    """
+
+    def __init__(
+        self,
+        recording: ReadableRecording,
+        settings: Settings,
+        sensors: Collection[str] | None = None,
+    ) -> None:
         self.recording = recording
         self.aligned = AlignedRecording(
             recording,
@@ -56,6 +69,7 @@ class Pass:
             start_utc_ns=_utc_ns(settings.start),
             end_utc_ns=_utc_ns(settings.end),
             nominal_clocks=settings.clocks == "nominal",
+            sensors=sensors,
         )
         names = {sensor for sensor, _ in self.aligned.channels}
         self._sensors = [record for record in recording.sensors if record.name in names]

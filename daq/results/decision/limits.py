@@ -83,7 +83,8 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     elif Verdict.FAIL in verdicts:
         verdict, obstacles = Verdict.FAIL, tuple(o for o in obstacles if o not in SHRINKS)
     else:
-        verdict = Verdict.NOT_DECIDED if Verdict.NOT_DECIDED in verdicts else Verdict.PASS
+        undecided = Verdict.NOT_DECIDED in verdicts or bool(snapshot.not_estimated)
+        verdict = Verdict.NOT_DECIDED if undecided else Verdict.PASS
     prediction = None
     if verdict is Verdict.NOT_DECIDED and obstacles and set(obstacles) <= SHRINKS:
         prediction = _prediction(found, snapshot, quantile)

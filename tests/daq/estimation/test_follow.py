@@ -21,6 +21,7 @@ from daq.estimation.follow import (
     RecordingLeftOpenError,
     follow,
 )
+from daq.estimation.segments import memory
 from daq.estimation.segments.newest_samples import NewestSamples
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
@@ -29,6 +30,7 @@ from daq.recording.reader import Recording
 from daq.results.sources import sources
 from estimator.errors import InsufficientDataError
 from tests.tui.example_snapshot import SETTINGS, growing
+from tui.output.results import live_remarks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -440,6 +442,25 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
     both = estimate([path, tmp_path / "run-3.h5"], SETTINGS)
     assert both.n_segments == result.n_segments
     np.testing.assert_array_equal(both.csm, result.csm)
+
+
+def test_more_sensors_than_memory_allows_wait_for_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "LIVE_BYTES", 0.0)
+    monkeypatch.setattr(memory, "MIN_SENSORS", 2)
+    with growing(tmp_path / "run.h5") as writer:
+        noted = Noted()
+        Bench(writer).send("ABC", 30)
+        process = Process(writer.close)
+        result = follow(writer.path, SETTINGS, noted, recorder=process)
+    live, last = noted.snapshots
+    assert live.sensor_names == ("A", "B")
+    assert live.not_estimated == ("C",)
+    assert live_remarks(live)[0].startswith("Live estimate of the first 2 of 3 sensors")
+    assert result is last
+    assert last.not_estimated == ()
+    np.testing.assert_array_equal(last.csm, estimate([writer.path], SETTINGS).csm)
 
 
 def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(

@@ -18,7 +18,7 @@ from estimator.diagnostics.kinds import Level
 from tui.output.advice.alerts import alert
 from tui.output.advice.sentences import Names
 from tui.output.formatting import clock_time, percent, roughly, several, signed, time_left
-from tui.output.results import faulty_channels, why_no_segment
+from tui.output.results import faulty_channels, live_remarks
 from tui.output.verdict_text import STYLES as STYLES_OF_VERDICTS
 from tui.output.verdict_text import headline, record_for
 from tui.output.vocabulary import FLAG_WORDS, PARTNER_WORDS, STATE_ALERTS, WITHOUT_ESTIMATE
@@ -312,7 +312,7 @@ def findings(snapshot: Snapshot, *, width: int) -> list[Text]:
         if each.level in styles
     ]
     faulty = [(line, styles[Level.PROBLEM]) for line in faulty_channels(snapshot)]
-    unusable = [(line, styles[Level.PROBLEM]) for line in why_no_segment(snapshot)]
+    unusable = [(line, styles[Level.PROBLEM]) for line in live_remarks(snapshot)]
     whole = [*unusable, *found[:1], *faulty, *found[1:]]
     lines = [Text(f"▲ {words}", style) for words, style in whole]
     for line in lines:

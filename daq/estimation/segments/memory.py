@@ -1,0 +1,65 @@
+"""How much memory an estimate takes, and how many sensors a live one may have.
+
+Most of it are matrices of all channels at all frequencies, and what methods and diagnosis make of
+them. The number of such matrices was measured: docs/validation/torture.md.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from daq.alignment.sensor_reader import main_columns
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+    from daq.recording.interface import ReadableRecording
+
+_LOGGER = logging.getLogger(__name__)
+MATRICES = 10
+"""Matrices that exist at the same time, at most."""
+LIVE_BYTES = 100e6
+"""That a live estimate may take."""
+MIN_SENSORS = 3
+"""That it has in any case."""
+_LARGE = 1e9
+
+
+def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
+    """Return the memory that an estimate takes, beside the program.
+
+    Parameters
+    ----------
+    n_channels : int
+    sampling_rate : float
+        Of the grid, in Hz.
+    segment : float
+        In seconds.
+    """
+    return MATRICES * 16.0 * (segment * sampling_rate / 2 + 1) * n_channels**2
+
+
+def live_sensors(recording: ReadableRecording, settings: Settings) -> tuple[str, ...] | None:
+    """Return the first sensors, as many as `LIVE_BYTES` allow; None where that is all of them."""
+    rate = settings.sampling_rate or min(each.sampling_rate for each in recording.sensors)
+    chosen: list[str] = []
+    n_channels = 0
+    for record in recording.sensors:
+        n_channels += len(main_columns(record))
+        too_much = bytes_of(n_channels, rate, settings.segment) > LIVE_BYTES
+        if too_much and len(chosen) >= MIN_SENSORS:
+            return tuple(chosen)
+        chosen.append(record.name)
+    return None
+
+
+def announce(n_channels: int, sampling_rate: float, segment: float) -> None:
+    """Log how much memory a large estimate is about to take."""
+    needed = bytes_of(n_channels, sampling_rate, segment)
+    if needed > _LARGE:
+        _LOGGER.warning(
+            "the result of %d channels takes about %.0f GB of memory; longer --segment takes more,"
+            " a lower --rate less",
+            n_channels,
+            needed / 1e9,
+        )
