@@ -17,6 +17,7 @@ from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
 from tui.application.state import State
+from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.plotted import Choice, curves, moved, panned, whole_span, zoomed
 from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
 
@@ -69,6 +70,12 @@ def test_zoom_pan_and_cursor_stay_within_the_spectrum() -> None:
     assert near.span is not None
     assert near.span[1] - near.span[0] >= 0.02  # ends somewhere
     assert zoomed(near, snapshot, 1e6).span is None  # all of it
+
+
+def test_lines_are_dots_in_the_cells_that_they_cross() -> None:
+    x, y = joined(np.array([0.0, 7.0, 7.0]), np.array([0.0, 7.0, -3.0]))
+    found = {(column, row): character for column, row, character in cells(x, y, 3, 2)}
+    assert found == {(0, 0): "⠑", (1, 0): "⢄", (2, 1): "⠑"}  # what is outside is left out
 
 
 async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) -> None:

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tui.application.test_view.braille import DOTS, FIRST
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-DOTS = np.array([[0x01, 0x02, 0x04, 0x40], [0x08, 0x10, 0x20, 0x80]])
-"""Bits of the dots of a Braille character, by column and row from the top."""
 
 
 def trace(values: NDArray[np.float64], *, width: int) -> str:
@@ -37,5 +36,5 @@ def trace(values: NDArray[np.float64], *, width: int) -> str:
     at, row = column * len(high) // n_columns, np.arange(4)
     is_set = (row >= first[at, None]) & (row <= last[at, None])
     cells = (is_set * DOTS[column % 2]).sum(axis=1).reshape(width, 2).sum(axis=1)
-    text: bytes = (0x2800 + cells).astype("<u2").tobytes()
+    text: bytes = (FIRST + cells).astype("<u2").tobytes()
     return text.decode("utf-16-le")

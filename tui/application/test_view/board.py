@@ -16,12 +16,15 @@ from tui.application.view import TALL
 from tui.output.formatting import clock_time
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import RenderableType
     from textual.app import ComposeResult
     from textual.events import Resize
 
     from estimator.self_noise.band_means import BandMeans
     from tui.application.state import State
+    from tui.application.test_view.curves import Curve
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
 
@@ -104,6 +107,8 @@ class Board(Vertical):
                 is_followed=not shown.trouble,
             )
         self._write("#table", table, n_lines=table.row_count + 1)
+        if choice.clocks or choice.cursor is None:  # the answer to a key, before the curves
+            self._write_title(self._frozen or shown)
         self._write("#clocks", clocks.clock_line(snapshot, settings, width=width))
         progress = panels.progress_line(now, snapshot, settings, width=width)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
@@ -144,17 +149,27 @@ class Board(Vertical):
             return
         self._drawn = drawn
         if choice.clocks:
-            self._write("#title", clocks.drift_title(snapshot))
             lines = clocks.drift_lines(snapshot, chosen=self._sensor(), n_points=drift.n_points)
             drift.show(lines)
         else:
             psd.visible = snapshot.n_segments > 0
             shown_curves = curves(shown, choice, n_points=psd.n_points)
-            title = read_out(snapshot, choice, shown_curves) or plot_title(snapshot, choice)
-            frozen = f"frozen at {clock_time(snapshot.elapsed)}  " if self._frozen else ""
-            self._write("#title", Text.assemble((frozen, "reverse"), title))
+            if choice.cursor is not None:
+                self._write_title(shown, shown_curves)
             unit = unit_of(snapshot, choice)
             psd.show(shown_curves, unit=unit, span=choice.span, cursor=choice.cursor)
+
+    def _write_title(self, shown: State, shown_curves: Sequence[Curve] = ()) -> None:
+        """Say what the curves are, or read values off them where the cursor is."""
+        snapshot, choice = shown.snapshot, self._choice
+        if snapshot is None:
+            return
+        if choice.clocks:
+            self._write("#title", clocks.drift_title(snapshot))
+            return
+        title = read_out(snapshot, choice, shown_curves) or plot_title(snapshot, choice)
+        frozen = f"frozen at {clock_time(snapshot.elapsed)}  " if self._frozen else ""
+        self._write("#title", Text.assemble((frozen, "reverse"), title))
 
     def _write(self, selector: str, text: RenderableType, *, n_lines: int = 1) -> None:
         """Write a part of the screen; its layout changes only with its height."""

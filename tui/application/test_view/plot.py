@@ -11,6 +11,7 @@ from textual_hires_canvas import Canvas
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
+from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.curves import level_limits
 from tui.application.test_view.units import SpectrumUnit
 
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from textual.app import RenderResult
+    from textual_plot.plot_widget import LinePlot, ScatterPlot
 
+    from estimator.types import FloatArray
     from tui.application.test_view.curves import Curve, Line
 
 DOTS_PER_ROW = 4  # of a Braille character
@@ -113,6 +116,29 @@ class FullPlot(PlotWidget, can_focus=False):
             for canvas in self.query(Canvas):
                 batches.enter_context(canvas.batch_refresh())
             return super().render()
+
+    def _render_scatter_plot(self, dataset: ScatterPlot) -> None:
+        """Draw dots as arrays: one by one, those of a band take tens of milliseconds."""
+        if dataset.hires_mode is None:
+            super()._render_scatter_plot(dataset)
+        else:
+            self._set_dots(*self._dots(dataset), dataset.marker_style)
+
+    def _render_line_plot(self, dataset: LinePlot) -> None:
+        """Draw a line as an array of dots."""
+        self._set_dots(*joined(*self._dots(dataset)), dataset.line_style)
+
+    def _dots(self, dataset: LinePlot | ScatterPlot) -> tuple[FloatArray, FloatArray]:
+        """Return columns and rows of dots."""
+        box = self._scale_rectangle
+        x = box.x + (dataset.x - self._x_min) * box.width / (self._x_max - self._x_min)
+        y = box.bottom - (dataset.y - self._y_min) * box.height / (self._y_max - self._y_min)
+        return np.floor(2 * x), np.floor(4 * y)
+
+    def _set_dots(self, x: FloatArray, y: FloatArray, style: str) -> None:
+        canvas = self.query_one("#plot", Canvas)
+        for column, row, character in cells(x, y, canvas.size.width, canvas.size.height):
+            canvas.set_pixel(column, row, character, style)
 
     def _update_legend(self) -> None:
         """Leave the legend as it is: `write_legend` is called once all curves are there."""
