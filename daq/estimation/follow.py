@@ -141,12 +141,12 @@ def follow(
         If the whole recording is too little for any of the methods.
     """
     cancelled = threading.Event() if cancelled is None else cancelled
-    recording = Recording.open(path)
+    recording = first = Recording.open(path)
     with Estimation([recording], settings, diagnosis_share=share / 10, live=True) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
             remote = _RemoteRecorder(recording, cancelled, silence)
-            sensors = _Sensors(recording, observer) if watch_sensors else None
+            sensors = _Sensors(recording, observer, first) if watch_sensors else None
             return remote if recorder is None else recorder, sensors
 
         known, sensors = seen(recording)
@@ -236,8 +236,8 @@ def _result(
 class _Sensors:
     """States of the sensors: from the file, and from the recorder where the file is silent."""
 
-    def __init__(self, recording: Recording, observer: Observer) -> None:
-        self._monitor, self._observer = RecordingMonitor(recording), observer
+    def __init__(self, recording: Recording, observer: Observer, first: Recording) -> None:
+        self._monitor, self._observer = RecordingMonitor(recording, first=first), observer
         self._path = recording.path
         self._address: tuple[int, str] | None = None
 

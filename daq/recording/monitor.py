@@ -97,12 +97,20 @@ class RecordingMonitor:
     Parameters
     ----------
     recording : Recording
+    first : Recording, optional
+        The one that it continues, from whose start the time counts.
     now : callable
         Time in s of a monotonic clock.
     """
 
-    def __init__(self, recording: Recording, *, now: Callable[[], float] = time.monotonic) -> None:
-        self._recording, self._now = recording, now
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        first: Recording | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._recording, self._first, self._now = recording, first or recording, now
         self._latest_ns, self._since = -1, now()
         self._blocks = {sensor.name: _BlockSummary(sensor) for sensor in recording.sensors}
         self._events: tuple[Event, ...] = ()
@@ -115,7 +123,7 @@ class RecordingMonitor:
         self._read_events()
         for blocks in self._blocks.values():
             blocks.update()
-        start_ns = recording.created_at.monotonic_ns
+        start_ns = self._first.created_at.monotonic_ns
         latest_ns = max(
             start_ns,
             *(blocks.last_ns for blocks in self._blocks.values()),
@@ -127,10 +135,10 @@ class RecordingMonitor:
         )
         since_latest = self._since_latest(latest_ns, sensors)
         elapsed = (latest_ns - start_ns) * _NS + since_latest
-        duration = None if recording.closed else recording.duration
+        duration = None if recording.closed else self._first.duration
         return RecordingStatus(
             elapsed=elapsed,
-            started_utc_ns=recording.created_at.utc_ns,
+            started_utc_ns=self._first.created_at.utc_ns,
             closed=recording.closed,
             sensors=tuple(replace(s, overdue_for=s.overdue_for + since_latest) for s in sensors)
             if since_latest
@@ -176,7 +184,7 @@ class RecordingMonitor:
         states : mapping
             State of each sensor by name, from the recorder's reply.
         """
-        latest_ns = round(status.elapsed / _NS) + self._recording.created_at.monotonic_ns
+        latest_ns = round(status.elapsed / _NS) + self._first.created_at.monotonic_ns
         sensors = [
             replace(
                 sensor,

@@ -412,7 +412,7 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
     with growing(unrelated) as writer:
         Bench(writer).send("ABC", 30)
         writer.close()
-    with growing(path) as first:
+    with growing(path, duration=600.0) as first:
         Bench(first).send("ABC", 30)
         with growing(tmp_path / "run-3.h5", continues=first.run_id) as second:
             noted, bench = Noted(), Bench(second)
@@ -432,6 +432,9 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
     assert result is not None
     assert result.closed
     assert noted.seen[-1].closed
+    assert len({status.started_utc_ns for status in noted.seen}) == 1  # its time goes on
+    for status in noted.seen[:-1]:
+        assert status.ends_in == pytest.approx(600.0 - status.elapsed)
     if started_here:  # the same files again
         return
     alone = [estimate([tmp_path / name], SETTINGS) for name in ("run.h5", "run-3.h5")]
