@@ -18,12 +18,19 @@ LATEST = 3
 
 
 def running_recording(bench: Bench) -> Path | None:
-    """Return the newest recording of this bench whose recorder answers."""
+    """Return the newest recording of this bench whose recorder answers: the first of its parts."""
     folder = bench.recording_directory
     if not folder.is_dir():
         return None
     files = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
-    return next((path for path in files[:LATEST] if _runs(path, bench.name)), None)
+    return next((first_part(path) for path in files[:LATEST] if _runs(path, bench.name)), None)
+
+
+def first_part(path: Path) -> Path:
+    """Return the recording that this one continues after a disk error; itself, if it does not."""
+    with Recording.open(path) as recording:
+        first = path.with_stem(path.stem.rpartition("-")[0])  # as in `continuation_names`
+        return first if recording.continues and first.exists() else path
 
 
 def _runs(path: Path, name: str) -> bool:
