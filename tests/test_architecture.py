@@ -52,7 +52,8 @@ ARRAYS_IN = {"notebook", "report", "simulation", "studies"}
 """Packages of the front ends that take or draw arrays."""
 ARRAYS_OF = {
     "application/bench_view/sensors.py", "application/bench_view/traces.py",
-    "application/test_view/clocks.py", "application/test_view/curves.py",
+    "application/test_view/braille.py", "application/test_view/clocks.py",
+    "application/test_view/curves.py",
     "application/test_view/panels.py", "application/test_view/plot.py",
     "application/test_view/plotted.py", "application/test_view/units.py",
     "output/json_values.py", "output/noise_parameters.py", "output/results.py",
