@@ -57,14 +57,19 @@ def imported(folder: Path, sensors: dict[str, FloatArray]) -> Path:
     ("options", "arguments"),
     [
         ({}, ()),
-        ({"method": "all", "segment": 2.0}, ("--method", "all", "--segment", "2")),
+        pytest.param(
+            {"method": "all", "segment": 2.0},
+            ("--method", "all", "--segment", "2"),
+            marks=pytest.mark.long,
+        ),
         (
             {"segment": "4s", "window": "kaiser,8", "overlap": 0.6, "reject": True},
             ("--segment", "4s", "--window", "kaiser,8", "--overlap", "0.6", "--reject"),
         ),
-        (
+        pytest.param(
             {"octaves": True, "segment": "1s", "detrend": "linear", "correct": False},
             ("--octaves", "--segment", "1s", "--detrend", "linear", "--no-correction"),
+            marks=pytest.mark.long,
         ),
         (
             {"gains": {"B": 1.02}, "segment": 2},

@@ -59,6 +59,7 @@ def test_estimates_have_the_planned_precision(method: str) -> None:
         assert relative.std() == pytest.approx(0.2, rel=0.08)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["three-channel", "three-sensor", "maximum-likelihood"])
 @pytest.mark.parametrize(("snr", "cov"), [(0.1, 0.05), (1, 0.2)])
 def test_estimates_of_weak_motion_have_the_planned_precision(

@@ -69,6 +69,7 @@ def command(installed: Path, *arguments: str, folder: Path) -> subprocess.Comple
     )
 
 
+@pytest.mark.long
 @pytest.mark.devices
 async def test_huddle_checks_and_runs_the_example(
     installed: Path, example: Callable[[str], Any], tmp_path: Path

@@ -34,6 +34,7 @@ def run(script: str, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_noise_from_arrays(tmp_path: Path) -> None:
     printed = run("noise_from_arrays.py", tmp_path)
     rows = [line.split() for line in printed.splitlines() if re.match("[ABC] +[XYZ]", line)][:9]

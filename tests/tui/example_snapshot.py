@@ -57,15 +57,19 @@ def rotation(degrees: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]
 
 
 def made_snapshot(
-    *, n_effective: float = 100.0, closed: bool = False, clock_share: float = 0.0004
+    *,
+    n_effective: float = 100.0,
+    closed: bool = False,
+    clock_share: float = 0.0004,
+    n_channels: int = len(CHANNELS),
 ) -> Snapshot:
     """Three sensors at 0, 5 and 9° in a motion of 1/f, each channel's noise at −120 dB and up."""
     frequency: np.ndarray[tuple[int], np.dtype[np.float64]] = np.arange(201) * np.float64(0.5)
     motion = 1e-9 / np.maximum(frequency, 0.5)
-    turned = np.vstack([rotation(angle) for angle in (0.0, 5.0, 9.0)])
+    turned = np.vstack([rotation(angle)[:n_channels] for angle in (0.0, 5.0, 9.0)])
     csm = motion[:, None, None] * (turned @ np.diag([1.0, 1.5, 1.0]) @ turned.T)
-    csm = csm + np.diag(np.arange(1, 10) * 1e-12)
-    dims = (3, 3, 3)
+    csm = csm + np.diag(np.arange(1, 3 * n_channels + 1) * 1e-12)
+    dims = (n_channels,) * 3
     n_samples = round(n_effective * 200)
     return Snapshot(
         frequency=frequency,
@@ -75,7 +79,7 @@ def made_snapshot(
             for method in SETTINGS.methods
         },
         refused={},
-        channels=tuple(ChannelLabel(s, c, "m/s²") for s in SENSORS for c in CHANNELS),
+        channels=tuple(ChannelLabel(s, c, "m/s²") for s in SENSORS for c in CHANNELS[:n_channels]),
         dims=dims,
         unit="m/s²",
         n_segments=round(n_effective * 1.06),
@@ -99,7 +103,7 @@ def made_snapshot(
         diagnostics=SnapshotDiagnostics(
             synchronisation=Synchronisation(
                 residual=dict(zip(SENSORS, RESIDUALS, strict=True)),
-                noise_bias=np.full((len(frequency), 9), clock_share),
+                noise_bias=np.full((len(frequency), sum(dims)), clock_share),
             )
         ),
     )

@@ -349,7 +349,14 @@ def test_clocks_are_aligned_after_an_hour_of_suspension(tmp_path: Path) -> None:
                 assert np.std(error) < 1e-4 * np.std(samples[rows, 0])
 
 
-@pytest.mark.parametrize(("late", "missed"), [(2e-4, 0), (7.3e-3, 0), (7.3e-3, 130)])
+@pytest.mark.parametrize(
+    ("late", "missed"),
+    [
+        pytest.param(2e-4, 0, marks=pytest.mark.long),
+        pytest.param(7.3e-3, 0, marks=pytest.mark.long),
+        (7.3e-3, 130),
+    ],
+)
 def test_a_sensor_connected_twice_is_reported_and_does_not_stop_the_estimate(
     tmp_path: Path, late: float, missed: int
 ) -> None:

@@ -101,6 +101,7 @@ def test_stretches_are_whole_hours_of_utc(store: Store) -> None:
     assert [list(each) for each in starts] == [[0, 1, 2], [9, 10, 11], [24, 25, 26]]
 
 
+@pytest.mark.long
 def test_processes_that_were_interrupted_and_resumed_write_the_same_bytes(
     paths: list[Path], store: Store, tmp_path: Path
 ) -> None:

@@ -114,9 +114,11 @@ def test_what_is_wrong_is_said_within_a_minute_while_recording(tmp_path: Path) -
     "options",
     [
         {"reject": True},
-        {"octaves": True},
+        pytest.param({"octaves": True}, marks=pytest.mark.long),
         {"octaves": True, "reject": True},
-        {"dimension": "auto", "methods": ("maximum-likelihood",)},
+        pytest.param(
+            {"dimension": "auto", "methods": ("maximum-likelihood",)}, marks=pytest.mark.long
+        ),
     ],
     ids=["reject", "octaves", "undisturbed octaves", "dimension"],
 )
@@ -177,7 +179,14 @@ def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -
     assert not estimate([write(tmp_path / "2.h5", bench())], SETTINGS).diagnostics.clipped
 
 
-@pytest.mark.parametrize(("reject", "duration"), [(None, 5), (True, 5), (True, 30)])
+@pytest.mark.parametrize(
+    ("reject", "duration"),
+    [
+        (None, 5),
+        pytest.param(True, 5, marks=pytest.mark.long),
+        pytest.param(True, 30, marks=pytest.mark.long),
+    ],
+)
 def test_a_channel_that_was_dead_for_a_while_is_named_and_its_sensitivity_is_not_blamed(
     tmp_path: Path, reject: bool | None, duration: int
 ) -> None:
@@ -303,7 +312,10 @@ def test_samples_that_are_no_numbers_are_gaps(tmp_path: Path) -> None:
     assert np.isfinite(found.results["three-sensor"].noise_psd).all()
 
 
-@pytest.mark.parametrize("value", [0, 7, 8_388_607])
+@pytest.mark.parametrize(
+    "value",
+    [pytest.param(0, marks=pytest.mark.long), 7, pytest.param(8_388_607, marks=pytest.mark.long)],
+)
 def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
     tmp_path: Path, value: int
 ) -> None:

@@ -403,7 +403,7 @@ def test_a_process_that_closes_its_recording_as_it_ends_has_a_result(tmp_path: P
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks are seen there")
-@pytest.mark.parametrize("started_here", [True, False])
+@pytest.mark.parametrize("started_here", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_what_the_disk_refused_is_followed_into_the_next_file(
     tmp_path: Path, started_here: bool
 ) -> None:

@@ -85,7 +85,7 @@ def elsewhere(sensor: int, *, n_sensors: int = 3, snr: float = 100.0) -> Complex
 
 
 @pytest.mark.parametrize("n", [10, 1080])
-@pytest.mark.parametrize("n_sensors", [3, 5])
+@pytest.mark.parametrize("n_sensors", [3, pytest.param(5, marks=pytest.mark.long)])
 def test_a_sensor_on_another_floor_is_named(n_sensors: int, n: int) -> None:
     """Without advice that contradicts it, such as to record longer."""
     for sensor in range(3):

@@ -134,7 +134,7 @@ def test_reversed_polarity_is_named() -> None:
     assert found.delay == pytest.approx(2e-3, rel=1e-3)
 
 
-@pytest.mark.parametrize("peak", [1.0, 100.0])
+@pytest.mark.parametrize("peak", [1.0, pytest.param(100.0, marks=pytest.mark.long)])
 def test_noise_causes_no_bias_and_the_error_covers(peak: float) -> None:
     """SNR 10: a plain regression would shorten the gains by a tenth.
 

@@ -31,6 +31,7 @@ def mean_over_triads(csm: np.ndarray) -> np.ndarray:
     return total / 6  # a sensor belongs to six of the ten triads
 
 
+@pytest.mark.long
 def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     """Item 9 of method.md: bias of the mean over each band and all channels."""
     centres = np.array([1.0, 3.5, 7, 10, 20, 50])

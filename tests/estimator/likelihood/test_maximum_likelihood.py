@@ -262,7 +262,10 @@ def test_the_estimate_is_unbiased_from_twenty_averages_on(d: int, snr: float) ->
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
-@pytest.mark.parametrize("snr", [1e-1, 1.0, 1e6])
+@pytest.mark.parametrize(
+    "snr",
+    [1e-1, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1e6, marks=pytest.mark.long)],
+)
 def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
     n_draws = 1000
     csm = equal_noise(18, dims=(d,) * 3, snr=snr)
@@ -274,7 +277,10 @@ def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
 
 
 @pytest.mark.parametrize("dims", [(1,) * 3, (3,) * 3, (2,) * 4])
-@pytest.mark.parametrize("snr", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "snr",
+    [pytest.param(0.1, marks=pytest.mark.long), 0.3, pytest.param(1.0, marks=pytest.mark.long)],
+)
 def test_unresolved_motion_causes_a_bias_of_a_few_percent(
     dims: tuple[int, ...], snr: float
 ) -> None:

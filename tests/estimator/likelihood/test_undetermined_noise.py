@@ -105,6 +105,7 @@ def test_motion_measured_by_one_channel_is_not_reported_as_its_noise(
     assert np.all(covered[:, others].mean(axis=0) > 0.9)
 
 
+@pytest.mark.long
 def test_no_single_frequency_of_an_unchecked_channel_has_an_estimate() -> None:
     """By chance one in a thousand would look known."""
     csm = common_motion(np.concatenate([np.eye(3)[:k] for k in (3, 2, 2)]), np.ones(7), snr=1e3)

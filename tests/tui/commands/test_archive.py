@@ -188,6 +188,7 @@ def test_figures_show_the_density_and_the_days(folder: Path, tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir() if path.stat().st_size > 5000} == written
 
 
+@pytest.mark.long
 def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> None:
     paths = [
         record(

@@ -103,6 +103,7 @@ def test_a_result_that_cannot_be_written_elsewhere_is_in_the_recording(
         assert recording.results()
 
 
+@pytest.mark.long
 def test_kill_in_the_middle_loses_nothing_that_was_acknowledged(
     bench: Path, tmp_path: Path
 ) -> None:
@@ -142,6 +143,7 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
         assert recording.results()
 
 
+@pytest.mark.long
 def test_ctrl_c_stops_the_recorder_and_still_prints_the_result(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped.h5"
     process = start("run", str(bench), "--out", str(out), "--duration", "10min")
@@ -160,12 +162,12 @@ def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     with_report = tmp_path / "bench.toml"
     text = bench.read_text(encoding="utf-8")
     with_report.write_text(text.replace("[recording]", '[recording]\nreport = "html"'), "utf-8")
-    wanted = ("--out", str(out), "--until-cov", "0.4", "--json", "-")
+    wanted = ("--out", str(out), "--until-cov", "0.5", "--json", "-")
     document = json.loads(huddle("run", str(with_report), *wanted).stdout)
     inside = slice(4, 41)  # 2 to 20 Hz
     cov = np.array([channel["cov"] for channel in document["channels"]], dtype=float)[:, inside]
     # The last, complete look differs a little from the live one that ended the run.
-    assert np.median(cov, axis=1).max() <= 0.6
+    assert np.median(cov, axis=1).max() <= 0.75
     with Recording.open(out) as recording:
         assert recording.events[-1].text != "duration reached"
     assert "self-noise" in out.with_suffix(".html").read_text(encoding="utf-8")

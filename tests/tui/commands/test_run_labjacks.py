@@ -96,6 +96,7 @@ def wait_until(path: Path, recorder: subprocess.Popen[str], **wanted: Any) -> di
     raise AssertionError(recorder.communicate())
 
 
+@pytest.mark.long
 def test_two_of_three_digitizers_are_killed_and_return(tmp_path: Path) -> None:
     bench = parse(bench_text())
     told = specification(bench, speed=SPEED) | {"epoch_ns": paced_clock().now_ns()}

@@ -133,8 +133,9 @@ def test_a_model_of_another_quantity_is_refused() -> None:
 
 
 def test_the_key_fits_into_a_narrow_figure() -> None:
+    snapshot = made_snapshot(n_channels=1)
     for width in (3.3, 7.1):
-        plots = noise_plots(SNAPSHOT, SETTINGS, None, masks_named("nlnm,nhnm,alnm"), width=width)
+        plots = noise_plots(snapshot, SETTINGS, None, masks_named("nlnm,nhnm,alnm"), width=width)
         with drawing.look():
             figure = Figure(figsize=(width, drawing.stack_height(plots)))
             drawing.stack(plots, figure)
@@ -148,9 +149,10 @@ def test_the_key_fits_into_a_narrow_figure() -> None:
 
 
 def test_the_same_estimate_gives_the_same_file(tmp_path: Path) -> None:
+    snapshot = made_snapshot(n_channels=1)
     contents = {}
     for name in ("a.svg", "b.svg", "a.pdf", "b.pdf"):
-        write_figure(SNAPSHOT, SETTINGS, None, tmp_path / name, width=7.1)
+        write_figure(snapshot, SETTINGS, None, tmp_path / name, width=7.1)
         contents[name] = (tmp_path / name).read_bytes()
     for kind in ("svg", "pdf"):
         assert contents[f"a.{kind}"] == contents[f"b.{kind}"]
