@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from itertools import chain
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from tui.cli.main import app
+from tui.cli.main import HuddleGroup, app
 
 ROOT = Path(__file__).parents[1]
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
@@ -64,10 +65,17 @@ def test_documents_that_code_names_exist() -> None:
     assert missing == []
 
 
+@functools.cache
+def group() -> HuddleGroup:
+    """Return all commands: making them takes longer than looking one up."""
+    made = typer.main.get_command(app)
+    assert isinstance(made, HuddleGroup)
+    return made
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_and_their_options_exist(page: Path) -> None:
-    group = typer.main.get_command(app)
-    commands = group.commands  # type: ignore[attr-defined]  # a group has them
+    commands = group().commands
     text = page.read_text(encoding="utf-8")
     wrong = []
     for line in re.findall(r"(?:^|[`\s/\\])huddle ([a-z]+[^`\n]*)", text, re.MULTILINE):

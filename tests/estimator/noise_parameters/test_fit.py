@@ -81,7 +81,7 @@ def test_terms_are_recovered_from_samples_with_strong_motion() -> None:
     rng = np.random.default_rng(3)
     terms, errors, scores, inside = [], [], [], []
     truth = np.empty(0)
-    for _ in range(12):
+    for _ in range(6):
         motion = 1e-4 * rng.standard_normal((15_000, 3))
         samples = []
         for _ in range(3):

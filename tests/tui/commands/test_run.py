@@ -97,7 +97,7 @@ def test_a_result_that_cannot_be_written_elsewhere_is_in_the_recording(
     bench: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "r.h5"
-    wanted = ("--duration", "20s", "--out", str(out), "--json", "/dev/full")
+    wanted = ("--duration", "14s", "--out", str(out), "--json", "/dev/full")
     assert "/dev/full" in huddle("run", str(bench), *wanted, code=3).stderr
     with Recording.open(out) as recording:
         assert recording.results()
@@ -136,10 +136,10 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
 
     monkeypatch.setattr("tui.commands.run.follow", fail)
     out = tmp_path / "r.h5"
-    huddle("run", str(bench), "--duration", "20s", "--out", str(out))
+    huddle("run", str(bench), "--duration", "14s", "--out", str(out))
     with Recording.open(out) as recording:
         assert recording.events[-1].text == "duration reached"
-        assert min(sensor.n_samples for sensor in recording.sensors) >= 20 * 190
+        assert min(sensor.n_samples for sensor in recording.sensors) >= 14 * 190
         assert recording.results()
 
 
