@@ -45,9 +45,12 @@ class Precision:
 def precision(snapshot: Snapshot, settings: Settings) -> Precision:
     """Return the c.o.v. of the method that judges, and when it reaches its target.
 
-    The c.o.v. falls with the root of the averages, and averages come at a steady pace.
+    The c.o.v. falls with the root of the averages, and averages come at a steady pace. It is
+    unknown where sensors are left out of a live estimate.
     """
     known = [cov for cov in channel_covs(snapshot, settings) if math.isfinite(cov)]
+    if snapshot.not_estimated:
+        known = []
     cov, target = max(known, default=math.nan), settings.target_cov
     left = total = None
     if target is not None and known:

@@ -31,6 +31,8 @@ def test_a_target_that_is_reached_takes_no_more_time() -> None:
     assert found.is_reached
     assert found.seconds_left == 0.0
     assert found.total == snapshot.elapsed
+    of_some = precision(replace(snapshot, not_estimated=("D",)), replace(SETTINGS, target_cov=cov))
+    assert not of_some.is_reached
 
 
 def test_segments_that_were_left_out_slow_it_down() -> None:
