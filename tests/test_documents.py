@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from itertools import chain
 from pathlib import Path
@@ -43,14 +42,15 @@ def test_a_decision_has_status_date_and_sections(page: Path) -> None:
     assert f"[{page.name[:4]}]({page.name})" in index
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_links_resolve(page: Path) -> None:
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
-    local = [
-        target for target in targets if "://" not in target and not target.startswith("mailto")
-    ]
-    assert [target for target in local if not (page.parent / target).exists()] == []
+def test_links_resolve() -> None:
+    missing = []
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+            local = "://" not in target and not target.startswith("mailto")
+            if local and not (page.parent / target).exists():
+                missing.append(f"{name(page)}: {target}")
+    assert missing == []
 
 
 def test_documents_that_code_names_exist() -> None:
@@ -65,29 +65,27 @@ def test_documents_that_code_names_exist() -> None:
     assert missing == []
 
 
-@functools.cache
-def group() -> HuddleGroup:
-    """Return all commands: making them takes longer than looking one up."""
-    made = typer.main.get_command(app)
-    assert isinstance(made, HuddleGroup)
-    return made
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_commands_and_their_options_exist(page: Path) -> None:
-    commands = group().commands
-    text = page.read_text(encoding="utf-8")
+def test_commands_and_their_options_exist() -> None:
+    group = typer.main.get_command(app)
+    assert isinstance(group, HuddleGroup)
+    commands = group.commands
+    texts = {name(page): page.read_text(encoding="utf-8") for page in PAGES}
+    lines = [
+        (where, line)
+        for where, text in texts.items()
+        for line in re.findall(r"(?:^|[`\s/\\])huddle ([a-z]+[^`\n]*)", text, re.MULTILINE)
+    ]
     wrong = []
-    for line in re.findall(r"(?:^|[`\s/\\])huddle ([a-z]+[^`\n]*)", text, re.MULTILINE):
+    for where, line in lines:
         word = line.split()[0]
         options = re.findall(r"(?<!\S)--[a-z][a-z-]*", line)
         if word not in commands:
-            if options or re.search(rf"`huddle {word}`", text):
-                wrong.append(f"huddle {line}")
+            if options or re.search(rf"`huddle {word}`", texts[where]):
+                wrong.append(f"{where}: huddle {line}")
             continue
         known = {
             "--help",
             *chain.from_iterable(p.opts + p.secondary_opts for p in commands[word].params),
         }
-        wrong += [f"huddle {word} {option}" for option in options if option not in known]
+        wrong += [f"{where}: huddle {word} {option}" for option in options if option not in known]
     assert wrong == []
