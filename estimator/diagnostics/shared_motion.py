@@ -38,6 +38,8 @@ FREQUENCIES = 8
 """Number of frequencies that are averaged in a part."""
 LESS = 0.9
 """Share of common motion, relative to that of others, above which a sensor left for no part."""
+ROOT_BYTES = 1 << 26
+"""Bytes of matrix roots that are kept: 64 MB."""
 GROWN = 4.0
 """Factor from which on a sensor records more besides the motion of the others."""
 
@@ -45,7 +47,8 @@ GROWN = 4.0
 class CanonicalCoherence:
     """Magnitude squared canonical coherence of groups of channels.
 
-    Matrix roots and pairs are cached.
+    Pairs are cached, and matrix roots up to `ROOT_BYTES`: that of all channels but those of two
+    sensors is another one for each pair, as large as the matrix.
 
     Parameters
     ----------
@@ -83,6 +86,8 @@ class CanonicalCoherence:
     def _root(self, channels: tuple[int, ...]) -> ComplexArray:
         """Return the inverse root of a group's matrix, zero in directions without power."""
         if channels not in self._roots:
+            while sum(each.nbytes for each in self._roots.values()) > ROOT_BYTES:
+                del self._roots[max(self._roots, key=len)]
             w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
             alive = w > 1e-12 * w[:, -1:]
             root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)

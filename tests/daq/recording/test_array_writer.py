@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import NO_COUNTER, SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
+from daq.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -135,6 +137,13 @@ def test_a_file_of_that_name_is_never_replaced(tmp_path: Path) -> None:
 def test_files_of_a_killed_process_do_not_block_a_new_recording(tmp_path: Path) -> None:
     leftover = tmp_path / ".r.h5.0123.new"
     leftover.write_bytes(b"half of it")
-    os.utime(leftover, (0, 0))
+    alive = RecordingWriter.create(
+        tmp_path / "r.h5", sensors=[LAYOUT], created=CREATED, hidden=True
+    )
+    (kept,) = set(tmp_path.iterdir()) - {leftover}
+    for path in (leftover, kept):
+        os.utime(path, (time.time() - 2, time.time() - 2))
     written(tmp_path / "r.h5", 1000)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"r.h5", kept.name}
+    alive.abandon()
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
