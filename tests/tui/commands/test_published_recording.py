@@ -92,6 +92,7 @@ def test_published_table_through_the_command(published: tuple[dict[str, Any], Sn
         assert np.sum(psd <= 0) == n_negative
 
 
+@pytest.mark.long
 def test_published_table_of_complex_magnitudes(published: tuple[dict[str, Any], Snapshot]) -> None:
     _, snapshot = published
     inside = (snapshot.frequency >= 1 / 30) & (snapshot.frequency <= 10)

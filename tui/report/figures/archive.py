@@ -58,6 +58,7 @@ def write_figures(answer: Answer, folder: Path, models: Sequence[Mask] = ()) -> 
             for kind, about in (("png", {"Software": "huddle"}), ("svg", {"Date": None})):
                 content = io.BytesIO()
                 figure.savefig(content, format=kind, dpi=RESOLUTION, metadata=about)
+                figure.set_layout_engine("none")  # found for the first file, it holds for both
                 path = folder / f"{name}.{kind}"
                 write_whole(path, content.getvalue())
                 written.append(path)
