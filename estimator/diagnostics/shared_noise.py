@@ -33,8 +33,9 @@ UNEXPLAINED = 1e-3
 SEEN = 3.0
 """Standard deviations from which a band shows shared noise of pairs already found."""
 OF_BANDS = 0.5
-"""Level of all single bands together, over that of all frequencies. The scores of pairs depend on
-each other, so that both together cause fewer false alarms than their sum."""
+"""Level of all single bands together, over that of all frequencies."""
+LEVEL = REJECT / (1 + OF_BANDS)
+"""Probability that a sound test is accused at all frequencies together."""
 SMALL_PART = 0.1
 """Part of the statistic that may remain unexplained, though significant, if much is shared."""
 A_PARAMETER = 8.0
@@ -137,13 +138,13 @@ def shared_noise(
         return None
     whole = reduce(add, scores.values())
     groups = _groups(whole, dims)
-    chosen, of_bands = stepwise(whole, REJECT, groups), tuple(known)
+    chosen, of_bands = stepwise(whole, LEVEL, groups), tuple(known)
     if chosen is not None and len(chosen):
         of_bands = _showing(scores, chosen)
         if not _is_steady([scores[n] for n in of_bands], chosen):
             return None
     elif chosen is not None and len(known) > 1:
-        each_band = {n: stepwise(scores[n], OF_BANDS * REJECT / len(known), groups) for n in known}
+        each_band = {n: stepwise(scores[n], OF_BANDS * LEVEL / len(known), groups) for n in known}
         named = [n for n, pairs in each_band.items() if pairs is not None and len(pairs)]
         if named:
             clearest = max(named, key=lambda n: float(np.abs(scores[n].z).max()))

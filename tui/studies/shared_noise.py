@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.shared_noise import shared_noise
+from estimator.diagnostics.shared_noise import LEVEL, shared_noise
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.score_test import pair_scores
@@ -30,7 +30,7 @@ CASES = (
 
 
 def _power(true: ComplexArray, pair: tuple[int, int], amount: float, n: int) -> float:
-    """Return the probability that the score of a pair exceeds the limit of 1 % for all pairs.
+    """Return the probability that the score of a pair exceeds the limit for all pairs.
 
     At one frequency, by the information of the true matrix (method.md, item 13).
     """
@@ -41,7 +41,7 @@ def _power(true: ComplexArray, pair: tuple[int, int], amount: float, n: int) -> 
         return 0.0
     own = int(np.flatnonzero((scores.pairs == pair).all(axis=1))[0])
     mean = amount * np.sqrt(scores.averages * scores.information[own, own])
-    limit = NormalDist().inv_cdf(1 - 0.01 / len(scores.pairs) / 2)
+    limit = NormalDist().inv_cdf(1 - LEVEL / len(scores.pairs) / 2)
     return NormalDist().cdf(float(mean) - limit)
 
 
