@@ -2,3 +2,5 @@
 
 No numerics of its own: numbers come from `daq.results` and `estimator`.
 """
+
+__version__ = "0.1.0"

@@ -17,22 +17,21 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
-from typer.core import TyperGroup
 
-from tui.cli import acquisition, archives, recordings, service, setup, studies
-from tui.cli.examples import EXAMPLES
+from tui import __version__
+from tui.cli.help import LazyGroup
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 
-class HuddleGroup(TyperGroup):
+class HuddleGroup(LazyGroup):
     """Runs a subcommand; converts its exceptions into messages and exit codes."""
 
     def main(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401 - the library's own
-        """Run the command. Without a terminal, usage errors are plain lines."""
-        if sys.stderr.isatty() or not options.get("standalone_mode", True):
+        """Run the command. Usage errors are plain lines."""
+        if not options.get("standalone_mode", True):
             return super().main(*args, **options)
         try:
             code = super().main(*args, **options | {"standalone_mode": False})
@@ -109,57 +108,20 @@ app = typer.Typer(
     cls=HuddleGroup,
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     help=(
         "Measure the self-noise of accelerometers placed side by side (huddle test): read them, "
         "record, estimate. The sensors may point in any direction.\n\n"
-        "Without hardware, [b]huddle demo[/b] runs a complete test on simulated sensors."
+        "Without hardware, huddle demo runs a complete test on simulated sensors."
     ),
 )
-
-_PANELS = {
-    "Bench": (
-        setup.init,
-        setup.check,
-        setup.plan,
-        acquisition.tui,
-        acquisition.run,
-        acquisition.record,
-        acquisition.watch,
-    ),
-    "Unattended": (
-        acquisition.serve,
-        service.status,
-        service.runs,
-        service.history,
-        service.pin,
-        service.verify,
-    ),
-    "Recordings": (
-        recordings.estimate,
-        recordings.calibrate,
-        archives.archive,
-        recordings.report,
-        recordings.plot,
-        recordings.import_,
-        recordings.export,
-        recordings.repair,
-    ),
-    "Without hardware": (setup.demo, setup.devices, recordings.simulate, studies.reproduce),
-}
-for _panel, _commands in _PANELS.items():
-    for _command in _commands:
-        _epilog = "\n\n".join(("[b]Examples[/b]", *EXAMPLES[_command.__name__]))
-        app.command(_command.__name__.rstrip("_"), rich_help_panel=_panel, epilog=_epilog)(_command)
 
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version  # noqa: PLC0415
-
-        typer.echo(f"huddle {version('huddle-bench')}")
+        typer.echo(f"huddle {__version__}")
         raise typer.Exit
 
 
@@ -170,9 +132,6 @@ def _options(
     ),
 ) -> None:
     del version
-    from tui.output.logs.lines import configure  # noqa: PLC0415 - not for --help
-
-    configure()
 
 
 def _spare_the_processor() -> None:

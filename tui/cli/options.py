@@ -23,7 +23,7 @@ def duration(value: str | float) -> float:
 
 
 BenchArgument: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="BENCH", help="Bench file (TOML); [b]huddle init[/b] writes one.")
+    Path, typer.Argument(metavar="BENCH", help="Bench file (TOML); huddle init writes one.")
 ]
 FileArgument: TypeAlias = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.h5).")]
 FilesArgument: TypeAlias = Annotated[

@@ -277,14 +277,14 @@ def import_(
     A sensor may be in several files. Files of any length take little memory. A file or channel that
     cannot be used is listed at the end; the others are imported, and the exit code is 3.
 
-    [b]miniSEED[/b]  a sensor is network.station.location, a channel is its code
+    miniSEED: a sensor is network.station.location, a channel is its code.
 
-    [b].npz .mat[/b] sampling_rate (Hz), start_time (UTC, optional), and for each sensor an array of
-    counts (n_samples, n_channels) under its name
+    .npz, .mat: sampling_rate (Hz), start_time (UTC, optional), and for each sensor an array of
+    counts (n_samples, n_channels) under its name.
 
-    [b].csv[/b]      a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²)
+    .csv: a header such as: time (s), A.X (m/s²), A.Y (m/s²), B.X (m/s²).
 
-    [b].wav[/b]      a file is a sensor, its channels are numbered
+    .wav: a file is a sensor, its channels are numbered.
 
     Also SAC, GSE2, GCF, SEG-2, SEG-Y (extra: formats), UFF 58 and TDMS (extra: vibration).
     """
@@ -339,15 +339,15 @@ def export(
 ) -> None:
     """Write samples or noise curves for other programs.
 
-    [b]mseed[/b]        all samples (times to 0.5 % of a sample), and StationXML
+    mseed: all samples (times to 0.5 % of a sample), and StationXML.
 
-    [b]csv parquet[/b]  a row for each method, channel and frequency
+    csv, parquet: a row for each method, channel and frequency.
 
-    [b]netcdf[/b]       labelled arrays, for xarray
+    netcdf: labelled arrays, for xarray.
 
-    [b]mat npz[/b]      an array (n_frequencies, n_channels) of each curve
+    mat, npz: an array (n_frequencies, n_channels) of each curve.
 
-    [b]uff58[/b]        a function of type 9 (PSD) for each curve
+    uff58: a function of type 9 (PSD) for each curve.
     """
     from tui.commands.export import export_recordings
 
@@ -361,7 +361,7 @@ def simulate(
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="Bench file with a \\[simulation] table, or a scenario of the paper: fig4, fig5, "
+            help="Bench file with a [simulation] table, or a scenario of the paper: fig4, fig5, "
             "fig9, fig12, fig13, setup1, setup2, waves.",
         ),
     ],

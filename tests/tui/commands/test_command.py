@@ -16,33 +16,12 @@ from typer.testing import CliRunner
 
 from daq.python_process import python_command
 from sim_devices.world.paper_scenarios import SCENARIOS
+from tui.cli.help import subcommand
 from tui.cli.main import app, main
+from tui.cli.subcommands import MODULES, PANELS
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]
-COMMANDS = (
-    "init",
-    "check",
-    "devices",
-    "demo",
-    "record",
-    "run",
-    "watch",
-    "simulate",
-    "import",
-    "estimate",
-    "report",
-    "tui",
-    "serve",
-    "status",
-    "runs",
-    "history",
-    "pin",
-    "verify",
-    "repair",
-    "plan",
-    "reproduce",
-)
 
 
 def huddle(*arguments: str, code: int = 0) -> str:
@@ -64,21 +43,26 @@ def modules_after(code: str) -> set[str]:
 
 def test_help_names_every_command() -> None:
     said = huddle("--help")
-    assert all(name in said for name in COMMANDS)
+    for panel, commands in PANELS.items():
+        assert f"\n{panel}:\n" in said
+        for name, (_, summary) in commands.items():
+            assert re.search(rf"\n  {name} +{re.escape(summary)}\n", said)
+            assert " ".join(subcommand(name).help.split("\n\n")[0].split()) == summary
 
 
-def test_help_loads_nothing_that_takes_long() -> None:
+@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["estimate", "--help"]])
+def test_help_loads_nothing_that_takes_long(arguments: list[str]) -> None:
     """How long it takes is measured by ``make bench``."""
-    run = "import sys; from tui.cli.main import main; sys.argv[1:] = ['--help']"
+    run = f"import sys; from tui.cli.main import main; sys.argv[1:] = {arguments}"
     loaded = modules_after(f"{run}\ntry:\n    main()\nexcept SystemExit:\n    print()")
     assert "typer" in loaded
     assert not loaded & {
         "numpy", "scipy", "h5py", "pydantic", "serial", "pymodbus", "textual", "matplotlib",
-        "asyncio",
+        "asyncio", "rich", "logging", "importlib.metadata",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", MODULES)
 def test_every_command_has_help_with_examples(name: str) -> None:
     text = huddle(name, "--help")
     assert "Examples" in text

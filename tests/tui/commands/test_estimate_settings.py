@@ -26,6 +26,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from estimator.likelihood.factor_analysis import max_factors
 from estimator.spectra.welch import WelchSettings
+from tui.cli.help import subcommand
 from tui.cli.main import app
 from tui.cli.options import with_estimate_options
 from tui.runs.estimate_settings import check_fit, chosen
@@ -80,10 +81,9 @@ def test_the_template_names_every_option_and_means_nothing_by_it() -> None:
 
 
 def test_every_command_that_estimates_has_every_option() -> None:
-    commands = typer.main.get_group(app).commands
     for name in COMMANDS:
         flags = {
-            flag for each in commands[name].params for flag in (*each.opts, *each.secondary_opts)
+            flag for each in subcommand(name).params for flag in (*each.opts, *each.secondary_opts)
         }
         for option in OPTIONS.values():
             assert set("/".join(option.flags).split("/")) <= flags, (name, option.flags)

@@ -1,0 +1,112 @@
+"""Commands whose help is plain text: usage, description, and a section for each panel.
+
+The help pages of typer need Rich and its Markdown, which take as long to load as all the rest.
+"""
+
+# ruff: noqa: ANN401, PLC0415 - contexts and formatters are typer's own; logging is for commands
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import typer
+from typer.core import TyperArgument, TyperCommand, TyperGroup
+
+from tui.cli.examples import EXAMPLES
+from tui.cli.subcommands import MODULES, PANELS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    Rows = Iterable[tuple[str, tuple[str, str]]]
+    """Panel, and a form with its help."""
+
+_HYPHEN = "\N{NON-BREAKING HYPHEN}"
+"""In place of a hyphen while lines are broken: --no-reject stays whole."""
+
+
+class HelpfulCommand(TyperCommand):
+    """A subcommand."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the page."""
+        return super().get_help(ctx).replace(_HYPHEN, "-")
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write a section for each panel of options."""
+        _write_sections(formatter, _options(self.get_params(ctx), ctx))
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+        """Write the examples, each on a line of its own."""
+        with formatter.section(_heading("Examples")):
+            formatter.write_text(f"\b\n{self.epilog}")
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. Its own options of log lines are applied later."""
+        from tui.output.logs.lines import configure
+
+        configure()
+        return super().invoke(ctx)
+
+
+class LazyGroup(TyperGroup):
+    """The subcommands of `PANELS`; one is built when it is used."""
+
+    def __init__(self, **declared: Any) -> None:
+        super().__init__(**declared)
+        for panel, entries in PANELS.items():
+            for name, (_, summary) in entries.items():
+                self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return ``--help``. By its default it is off, so no Pydantic is needed to read nothing."""
+        option = super().get_help_option(ctx)
+        if option is not None:
+            option.default = False
+        return option
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """Return a subcommand with its options; None if there is none of this name."""
+        return subcommand(cmd_name) if cmd_name in MODULES else None
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write a section for the options, and one for each panel of commands."""
+        _write_sections(formatter, _options(self.get_params(ctx), ctx))
+        for panel, entries in PANELS.items():
+            rows = ((panel, (name, summary)) for name, (_, summary) in entries.items())
+            _write_sections(formatter, rows)
+
+
+@cache
+def subcommand(name: str) -> Any:
+    """Return a subcommand with its options, as a command of typer."""
+    module = import_module(f"tui.cli.{MODULES[name]}")
+    function = getattr(module, name if hasattr(module, name) else f"{name}_")  # import_
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    epilog = "\n".join(EXAMPLES[function.__name__])
+    alone.command(name, cls=HelpfulCommand, epilog=epilog)(function)
+    return typer.main.get_command(alone)
+
+
+def _options(parameters: Iterable[Any], ctx: Any) -> Rows:
+    for each in parameters:
+        form, text = each.get_help_record(ctx)
+        if isinstance(each, TyperArgument):
+            yield "Arguments", (" ".join(each.get_usage_pieces(ctx)), text)
+        else:
+            yield each.rich_help_panel or "Options", (form, text.replace("-", _HYPHEN))
+
+
+def _write_sections(formatter: Any, rows: Rows) -> None:
+    sections: dict[str, list[tuple[str, str]]] = {}
+    for panel, row in rows:
+        sections.setdefault(panel, []).append(row)
+    for panel, members in sections.items():
+        with formatter.section(_heading(panel)):
+            formatter.write_dl(members)
+
+
+def _heading(text: str) -> str:
+    return typer.style(text, bold=True)  # bold on terminals only: typer.echo removes it elsewhere
