@@ -145,7 +145,8 @@ class SnapshotBuilder:
             ),
             dimensions=() if estimates.dimensions is None else estimates.dimensions.chosen,
         )
-        if final or self._diagnoses.is_due:
+        left = _not_estimated(latest, channels)
+        if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:
                 self._findings = self._diagnose(recordings, passes, raw, bands, estimates)
         if self._findings.fits(frequency):
@@ -182,7 +183,7 @@ class SnapshotBuilder:
             diagnostics=diagnostics,
             no_segment=_no_segment(passes, self._settings.segment),
             bridged=gaps,
-            not_estimated=_not_estimated(latest, channels),
+            not_estimated=left,
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, _counting_rates(latest))
                 if final

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableRecording
 
 _LOGGER = logging.getLogger(__name__)
-MATRICES = 10
-"""Matrices that exist at the same time, at most."""
-LIVE_BYTES = 100e6
-"""That a live estimate may take."""
+MATRICES = 27
+"""Matrices that exist at the same time, at most: in the diagnosis."""
+LIVE_BYTES = 250e6
+"""That an estimate may take to be live with all sensors. One with a part of them is not diagnosed,
+and takes two fifths of this."""
 MIN_SENSORS = 3
 """That it has in any case."""
 _LARGE = 1e9
@@ -58,8 +59,8 @@ def announce(n_channels: int, sampling_rate: float, segment: float) -> None:
     needed = bytes_of(n_channels, sampling_rate, segment)
     if needed > _LARGE:
         _LOGGER.warning(
-            "the result of %d channels takes about %.0f GB of memory; longer --segment takes more,"
-            " a lower --rate less",
+            "the result of %d channels takes about %.0f GB of memory;"
+            " a shorter --segment takes less",
             n_channels,
             needed / 1e9,
         )
