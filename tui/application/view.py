@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from rich.style import Style
 from rich.text import Text
 from textual.screen import Screen
-from textual.widgets import Footer, Static
+from textual.widgets import Static
 
 from tui.application.dialogs import TextScreen, help_text
 from tui.application.state import TITLES, VIEWS
@@ -21,8 +21,36 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
+KEY = Style(color="#ffa62b", bold=True)
 TALL = 34  # rows from which there is room for remarks and air
 ALL_TABS = 60  # columns from which the titles of all views fit
+
+
+class KeyLine(Static):
+    """The keys that do something now, in one line; a click does the same.
+
+    In place of Textual's footer, whose widget for each key made half of the work of a change of
+    view.
+    """
+
+    def on_mount(self) -> None:
+        """Follow what the keys do."""
+        self.screen.bindings_updated_signal.subscribe(self, self._write)
+
+    def _write(self, screen: Screen[object]) -> None:
+        line, actions = Text(), set[str]()
+        for _, binding, is_enabled, _ in screen.active_bindings.values():
+            if not binding.show or binding.action in actions:
+                continue
+            actions.add(binding.action)
+            style = Style(dim=not is_enabled, meta={"@click": f"press('{binding.key}')"})
+            line.append(f" {self.app.get_key_display(binding)} ", style + KEY)
+            line.append(f"{binding.description} ", style)
+        self.update(line, layout=False)
+
+    def action_press(self, key: str) -> None:
+        """Do what a key does."""
+        self.app.simulate_key(key)
 
 
 class View(Screen[None]):
@@ -54,7 +82,7 @@ class View(Screen[None]):
         """Lay out the frame around the parts of a view."""
         yield Static(id="status")
         yield from self.parts()
-        yield Footer(show_command_palette=False)
+        yield KeyLine(id="keys")
 
     def parts(self) -> ComposeResult:
         """Yield what the view consists of."""
