@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
 
+MIN_AVERAGES = 2.0
+"""Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
 
@@ -197,6 +199,8 @@ def diagnosis(
     known = [_n_known(band) for band in bands]
     with np.errstate(invalid="ignore", divide="ignore"):
         for band, count in zip(bands, known, strict=True):
+            if band.n_effective < MIN_AVERAGES:
+                return None, Untested.TOO_FEW_AVERAGES
             try:
                 diagnostics = diagnose(
                     band.csm[:count],

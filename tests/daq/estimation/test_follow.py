@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from daq.alignment.aligned_recording import AlignedRecording
-from daq.estimation.estimation import estimate
+from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.follow import (
     COMMIT_INTERVAL,
     MAX_INTERVAL,
@@ -210,6 +210,16 @@ def test_time_goes_on_when_every_sensor_is_lost(tmp_path: Path) -> None:
         assert [s.overdue_for for s in later.sensors] == pytest.approx(
             [s.overdue_for + 60 * speed for s in lost.sensors]
         )
+
+
+def test_channels_of_one_segment_are_not_called_copies(tmp_path: Path) -> None:
+    with growing(tmp_path / "run.h5") as writer:
+        Bench(writer).send("ABC", 3)
+        with Estimation([writer.path], SETTINGS) as estimation:
+            estimation.update()
+            snapshot = estimation.snapshot()
+    assert snapshot.n_segments == 1
+    assert snapshot.diagnostics.advice == ()
 
 
 @pytest.mark.parametrize("duration", [60.0, None])
