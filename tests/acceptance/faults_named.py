@@ -19,7 +19,7 @@ import numpy as np
 
 from daq.estimation.estimation import Estimation
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, HostTime
+from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
 from sim_devices.world.world import World
@@ -64,9 +64,16 @@ def _clipping(samples: FloatArray, _: FloatArray) -> FloatArray:
     return np.clip(samples, -most, most)
 
 
+def _flag(case: Case, name: str, second: int) -> BlockFlag:
+    """Return what the driver, which knows the full scale, flags a block with."""
+    if case.change is not _clipping or name != case.sensor or second < case.at:
+        return BlockFlag.NONE
+    return BlockFlag.CLIPPED
+
+
 CASES = (
-    *(Case("on another floor", "C", "C records none", lambda _, o: o, at) for at in (0, 600)),
-    Case("two channels swapped", "B", "B", lambda s, _: s[:, [1, 0, 2]]),
+    *(Case("on another floor", "C", "C records none", lambda _, o: o, at) for at in (0, 300)),
+    Case("two channels swapped", "B", "channels are swapped", lambda s, _: s[:, [1, 0, 2]]),
     *(Case("dead channel", "A", "A.Y", _dead, at) for at in (0, 300)),
     *(Case("clipping", "B", "B is clipping", _clipping, at) for at in (0, 300)),
 )
@@ -75,7 +82,10 @@ CASES = (
 def seconds_to_name(case: Case, seed: int) -> tuple[float, str]:
     """Return the seconds from the fault to its line; infinity where it did not come."""
     n = (case.at + LONGEST) * RATE
-    scenario = scenario_of(demo_bench())
+    bench = demo_bench()
+    for sensor in bench.simulation["sensors"].values():
+        del sensor["clock"]  # all blocks arrive at whole seconds
+    scenario = scenario_of(bench)
     here, other = (
         World(scenario.model_copy(update={"seed": each})) for each in (seed, seed + 1000)
     )
@@ -93,7 +103,9 @@ def seconds_to_name(case: Case, seed: int) -> tuple[float, str]:
                 at = HostTime(begun.monotonic_ns + ns, begun.utc_ns + ns)
                 for name, values in samples.items():
                     block = np.rint(values[second * RATE : (second + 1) * RATE] * COUNTS)
-                    writer.append(Block(name, second * RATE, block.astype(np.int32), at))
+                    flags = _flag(case, name, second)
+                    block = block.astype(np.int32)
+                    writer.append(Block(name, second * RATE, block, at, flags=flags))
                 writer.commit()
                 recording.refresh()
                 estimation.update()
