@@ -67,7 +67,10 @@ def copy(store: Store, tmp_path: Path) -> Store:
 
 @pytest.mark.parametrize(
     ("free", "settings", "stretch"),
-    [(False, SETTINGS, "day"), (True, with_reject(SETTINGS), "hour")],
+    [
+        (False, SETTINGS, "day"),
+        pytest.param(True, with_reject(SETTINGS), "hour", marks=pytest.mark.long),
+    ],
 )
 def test_the_pooled_estimate_is_that_of_all_recordings(
     tmp_path: Path, *, free: bool, settings: Settings, stretch: str

@@ -268,6 +268,7 @@ def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
 # ------------------------------------------------------------------------------- files
 
 
+@pytest.mark.long
 def test_the_same_recording_gives_the_same_files(
     reported: Reported, paper: PdfReader, tmp_path: Path
 ) -> None:
@@ -280,6 +281,15 @@ def test_the_same_recording_gives_the_same_files(
     paper.stream.seek(0)
     assert (tmp_path / "a.pdf").read_bytes() == paper.stream.read()
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF-")
+
+
+def test_the_same_report_gives_the_same_paper(reported: Reported) -> None:
+    """With one plot; the long test above writes all of them."""
+    section = next(s for s in reported.report.sections if any(isinstance(p, Plot) for p in s.parts))
+    plot = next(part for part in section.parts if isinstance(part, Plot))
+    report = replace(reported.report, sections=(replace(section, parts=(plot,)),))
+    one, other = paper_of(report), paper_of(report)
+    assert one.getvalue() == other.getvalue()
 
 
 def test_the_page_needs_nothing_else_and_runs_nothing(reported: Reported) -> None:

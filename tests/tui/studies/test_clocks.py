@@ -68,6 +68,7 @@ def test_a_refined_rate_is_known_no_better_than_the_reference(tmp_path: Path) ->
         assert state.ppm_std >= least > 0
 
 
+@pytest.mark.long
 def test_what_is_left_is_stated_with_its_effect_on_the_noise(tmp_path: Path) -> None:
     scenario = free_running(snr=1e4, duration=200.0, seed=5)
     path = synthesise(tmp_path / "r.h5", scenario, duration=200.0)

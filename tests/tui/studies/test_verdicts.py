@@ -29,6 +29,7 @@ def test_verdicts_are_seldom_wrong(found: list[Outcome]) -> None:
         assert n_wrong <= N_TESTS * WRONG + 4 * np.sqrt(N_TESTS * WRONG)
 
 
+@pytest.mark.long
 def test_tests_are_decided_where_they_can_be(found: list[Outcome]) -> None:
     decided = {each.first for each in found if abs(each.above_db) > 1.5 and each.seconds > 300}
     assert {Verdict.PASS, Verdict.FAIL} <= decided
