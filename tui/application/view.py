@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from rich.style import Style
 from rich.text import Text
 from textual.screen import Screen
+from textual.widget import Widget
 from textual.widgets import Static
 
 from tui.application.dialogs import TextScreen, help_text
@@ -16,41 +17,53 @@ from tui.output.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
     from textual.app import ComposeResult
-    from textual.events import Resize
+    from textual.binding import Binding
+    from textual.events import MouseDown, Resize
 
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-KEY = Style(color="#ffa62b", bold=True)
 TALL = 34  # rows from which there is room for remarks and air
 ALL_TABS = 60  # columns from which the titles of all views fit
 
 
-class KeyLine(Static):
+class KeyLine(Widget):
     """The keys that do something now, in one line; a click does the same.
 
     In place of Textual's footer, whose widget for each key made half of the work of a change of
     view.
     """
 
+    COMPONENT_CLASSES: ClassVar[set[str]] = {"keys--key"}
+    ALLOW_SELECT = False
+
+    def __init__(self) -> None:
+        super().__init__(id="keys")
+        self._ends: list[tuple[int, str]] = []
+
     def on_mount(self) -> None:
         """Follow what the keys do."""
-        self.screen.bindings_updated_signal.subscribe(self, self._write)
+        self.screen.bindings_updated_signal.subscribe(self, lambda _: self.refresh())
 
-    def _write(self, screen: Screen[object]) -> None:
-        line, actions = Text(), set[str]()
-        for _, binding, is_enabled, _ in screen.active_bindings.values():
-            if not binding.show or binding.action in actions:
-                continue
-            actions.add(binding.action)
-            style = Style(dim=not is_enabled, meta={"@click": f"press('{binding.key}')"})
-            line.append(f" {self.app.get_key_display(binding)} ", style + KEY)
-            line.append(f"{binding.description} ", style)
-        self.update(line, layout=False)
+    def on_mouse_down(self, event: MouseDown) -> None:
+        """Press the key under the pointer."""
+        key = next((key for end, key in self._ends if event.x < end), None)
+        if key is not None:
+            self.app.simulate_key(key)
 
-    def action_press(self, key: str) -> None:
-        """Do what a key does."""
-        self.app.simulate_key(key)
+    def render(self) -> Text:
+        """Return the keys and what they do, in the colours of the theme and not as links."""
+        line, key_style = Text(), self.get_component_rich_style("keys--key")
+        shown: dict[str, Binding] = {}  # for each action the first of its keys
+        for _, binding, _, _ in self.screen.active_bindings.values():
+            if binding.show:
+                shown.setdefault(binding.action, binding)
+        self._ends.clear()
+        for binding in shown.values():
+            line.append(f" {self.app.get_key_display(binding)} ", key_style)
+            line.append(f"{binding.description} ")
+            self._ends.append((line.cell_len, binding.key))
+        return line
 
 
 class View(Screen[None]):
@@ -82,7 +95,7 @@ class View(Screen[None]):
         """Lay out the frame around the parts of a view."""
         yield Static(id="status")
         yield from self.parts()
-        yield KeyLine(id="keys")
+        yield KeyLine()
 
     def parts(self) -> ComposeResult:
         """Yield what the view consists of."""

@@ -40,6 +40,10 @@ async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: Progre
             helps.add(screen_text(app))
             await pilot.press("escape")
         assert len(footers) == len(helps) == len(VIEWS)
+        styles = [part.style for part in app.screen.query_one("#keys").render_line(0) if part.style]
+        assert not any(style.underline for style in styles)  # they are no links
+        assert len({style.color for style in styles if style.bold}) == 1
+        assert len({style.color for style in styles}) == 2
 
 
 async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
