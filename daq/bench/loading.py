@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,11 @@ if TYPE_CHECKING:
     from daq.bench.driver_rules import DriverRules
 
 _MAX_LENGTH = 1 << 20
-_DOTTED = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
+_MAX_KEYS = 10_000
+"""Counted by equals signs and brackets, before the slow parser: hundreds of sensors have fewer."""
+_MAX_FAULTS = 100
+"""Errors that are reported: a file with more is another kind of file."""
+_DOTTED = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){16}""")
 """A key of so many parts: the time that tomllib takes for one grows with their square."""
 
 
@@ -51,11 +56,13 @@ def load(path: str | Path, drivers: Mapping[str, DriverRules] | None = None) -> 
             found = f"byte {error.start} is not UTF-8 text"
         fault = FileFault("", f"{found}; expected a bench file (.toml)")
         raise BenchFileError(fault, source=source) from None
-    _table(text, source)
-    text, faults = embed_masks(text, source.parent)
+    table = _table(text, source)
+    embedded, faults = embed_masks(text, table, source.parent)
     if faults:
         raise BenchFileError(*faults, source=source)
-    return parse(text, source, drivers)
+    if embedded != text:
+        table = _table(embedded, source)
+    return _check(table, embedded, source, drivers)
 
 
 def parse(
@@ -80,14 +87,29 @@ def parse(
     BenchFileError
         With every error in the file, one per line.
     """
-    table = _table(text, source)
+    return _check(_table(text, source), text, source, drivers)
+
+
+def _check(
+    table: dict[str, Any],
+    text: str,
+    source: str | Path,
+    drivers: Mapping[str, DriverRules] | None,
+) -> Bench:
+    """Return the bench of a table, or raise every error in it."""
     bench: Bench | None = None
     faults: list[FileFault] = []
     context = {"text": text, "source": source if isinstance(source, Path) else None}
     try:
         bench = Bench.model_validate(table, context=context)
     except ValidationError as error:
-        faults += field_faults(error, Bench, table)
+        faults += islice(field_faults(error, Bench, table), _MAX_FAULTS)
+        if error.error_count() > _MAX_FAULTS:
+            raise BenchFileError(
+                *faults,
+                FileFault("", f"{error.error_count()} errors; the first {_MAX_FAULTS} are above"),
+                source=source,
+            ) from None
     if drivers is not None:
         faults += cross_faults(table, drivers)
     if faults or bench is None:
@@ -99,8 +121,10 @@ def _table(text: str, source: str | Path) -> dict[str, Any]:
     """Return the table of a TOML text, in bounded time."""
     if len(text) > _MAX_LENGTH:
         problem = f"{len(text)} characters; expected at most {_MAX_LENGTH}"
+    elif (keys := text.count("=") + text.count("\n[")) > _MAX_KEYS:
+        problem = f"{keys} keys and tables; expected at most {_MAX_KEYS}"
     elif _DOTTED.search(text):
-        problem = "a key of more than 64 parts; expected a bench file"
+        problem = "a key of more than 16 parts; expected a bench file"
     else:
         try:
             return tomllib.loads(text)

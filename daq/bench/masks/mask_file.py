@@ -8,7 +8,6 @@ by commas, semicolons (numbers may then have decimal commas) or tabs.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from daq.bench.units import DensityUnit
 from daq.errors import FileFault, HuddleError, WrongSettingError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 _MOST = 1 << 20
 """Bytes of a file: far more than a mask has."""
@@ -81,7 +80,9 @@ def masks_named(text: str) -> tuple[Mask, ...]:
     return tuple(found)
 
 
-def embed_masks(text: str, folder: Path) -> tuple[str, list[FileFault]]:
+def embed_masks(
+    text: str, table: Mapping[str, object], folder: Path
+) -> tuple[str, list[FileFault]]:
     """Return the text of a bench file with the points of its masks in place of their files.
 
     A recording holds the text: it needs no other file. Comments and order are kept.
@@ -90,6 +91,8 @@ def embed_masks(text: str, folder: Path) -> tuple[str, list[FileFault]]:
     ----------
     text : str
         Of valid TOML.
+    table : mapping
+        What the text holds.
     folder : path
         Of the bench file: names of files are relative to it.
 
@@ -99,7 +102,7 @@ def embed_masks(text: str, folder: Path) -> tuple[str, list[FileFault]]:
     faults : list of FileFault
         Files that are no masks.
     """
-    limits = tomllib.loads(text).get("limits")
+    limits = table.get("limits")
     if not isinstance(limits, list) or not any(
         isinstance(limit, dict) and "file" in limit for limit in limits
     ):
