@@ -114,8 +114,8 @@ def _run(app: HuddleApp, *, again: Path) -> None:
         stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)
     ):
         raise typer.BadParameter(
-            "the application needs a terminal; huddle watch RECORDING and huddle run BENCH need"
-            " none"
+            "the application needs a terminal, for standard input, output and error; huddle watch"
+            " RECORDING and huddle run BENCH need none"
         )
     app.theme = _theme()
     with screen_taken():

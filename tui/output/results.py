@@ -137,9 +137,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
             lines += unresolved(snapshot, method)  # else a longer recording would not help
         negative = int(np.sum(noise.noise_psd[1:-1] <= 0))
         if negative:
-            lines.append(
-                f"{method}: {negative} of {noise.noise_psd[1:-1].size} values are at or below zero"
-            )
+            of = f"{negative} of {noise.noise_psd[1:-1].size} values"
+            lines.append(f"{method}: {of} {'is' if negative == 1 else 'are'} at or below zero")
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines
 
