@@ -42,6 +42,8 @@ def clipped_shares(record: ReadableSensor) -> dict[str, float]:
     begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
     flags = blocks["flags"][np.searchsorted(begins, which, side="right") - 1]
     counts = counts[(flags & int(BlockFlag.CLIPPED)) == 0]
+    if len(counts) == 0:
+        return {}
     shares = {
         channel.name: _share(counts[:, column])
         for column, channel in enumerate(record.channels)

@@ -222,6 +222,17 @@ def test_channels_of_one_segment_are_not_called_copies(tmp_path: Path) -> None:
     assert snapshot.diagnostics.advice == ()
 
 
+def test_a_sensor_whose_every_block_is_clipped_has_a_snapshot(tmp_path: Path) -> None:
+    with growing(tmp_path / "run.h5") as writer:
+        bench = Bench(writer)
+        bench.send("AB", 5)
+        bench.send("C", 5, clipped=True)
+        with Estimation([writer.path], replace(SETTINGS, reject=False)) as estimation:
+            estimation.update()
+            snapshot = estimation.snapshot()
+    assert snapshot.n_segments > 1
+
+
 @pytest.mark.parametrize("duration", [60.0, None])
 def test_what_ends_by_itself_says_when(tmp_path: Path, duration: float | None) -> None:
     path = tmp_path / "run.h5"
