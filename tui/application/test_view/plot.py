@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import numpy as np
+from textual.geometry import Offset
 from textual_hires_canvas import Canvas
 from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
@@ -115,7 +116,9 @@ class FullPlot(PlotWidget, can_focus=False):
         with ExitStack() as batches:
             for canvas in self.query(Canvas):
                 batches.enter_context(canvas.batch_refresh())
-            return super().render()
+            rendered = super().render()
+        self._position_legend()
+        return rendered
 
     def _render_scatter_plot(self, dataset: ScatterPlot) -> None:
         """Draw dots as arrays: one by one, those of a band take tens of milliseconds."""
@@ -148,6 +151,12 @@ class FullPlot(PlotWidget, can_focus=False):
         if curves != self._legend:
             self._legend = curves
             super()._update_legend()
+
+    def _position_legend(self) -> None:
+        """Put the legend into its corner, wherever it came to be before the plot had its size."""
+        self._legend_location = LegendLocation.TOPRIGHT
+        self._legend_relative_offset = Offset()
+        super()._position_legend()
 
     @property
     def n_points(self) -> int:
