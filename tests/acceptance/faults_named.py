@@ -74,8 +74,8 @@ def _flag(case: Case, name: str, second: int) -> BlockFlag:
 CASES = (
     *(Case("on another floor", "C", "C records none", lambda _, o: o, at) for at in (0, 300)),
     Case("two channels swapped", "B", "channels are swapped", lambda s, _: s[:, [1, 0, 2]]),
-    *(Case("dead channel", "A", "A.Y", _dead, at) for at in (0, 300)),
-    *(Case("clipping", "B", "B is clipping", _clipping, at) for at in (0, 300)),
+    *(Case("dead channel", "A", "A.Y is stuck", _dead, at) for at in (0, 60)),
+    *(Case("clipping", "B", "B is clipping", _clipping, at) for at in (0, 60)),
 )
 
 
