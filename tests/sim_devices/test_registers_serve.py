@@ -219,7 +219,7 @@ async def test_a_cancellation_is_not_lost_to_a_reply_that_comes_with_it(
 async def test_a_bus_is_opened_again_without_a_silent_slave(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    both = on_bus(running[0], timeout=0.05)
+    both = on_bus(running[0], timeout=1.0)
     settings = {**both[1].settings, "device_id": 9}
     both[1] = both[1].model_copy(update={"settings": settings})
     async with DRIVER.open(both, host_clock(SPEED)) as session:
