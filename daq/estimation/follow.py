@@ -100,6 +100,7 @@ def follow(
     watch_sensors: bool = True,
     growth: float = 0.0,
     share: float = ESTIMATE_SHARE,
+    of_diagnoses: float = 0.1,
     silence: float = SILENCE,
 ) -> Snapshot | None:
     """Follow a recording until it is closed, and return its result.
@@ -121,8 +122,9 @@ def follow(
     growth : float
         Share by which the number of segments has grown, at least, before the next estimate.
     share : float
-        Of the time, at most, that estimates of the growing recording may cost; the diagnoses in
-        them a tenth of this.
+        Of the time, at most, that estimates of the growing recording may cost.
+    of_diagnoses : float
+        Share of that, at most, for the diagnoses in them.
     silence : float
         In seconds.
 
@@ -142,7 +144,9 @@ def follow(
     """
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = first = Recording.open(path)
-    with Estimation([recording], settings, diagnosis_share=share / 10, live=True) as estimation:
+    with Estimation(
+        [recording], settings, diagnosis_share=share * of_diagnoses, live=True
+    ) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
             remote = _RemoteRecorder(recording, cancelled, silence)

@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 
 Outcome = TypeVar("Outcome")
 GROWTH = 0.01  # of the segments, from which on curves change to the eye
+OF_DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
 
 
 class FollowingApp(App[None]):
@@ -204,7 +205,14 @@ class FollowingApp(App[None]):
             if ended.is_set():  # another one was opened meanwhile
                 return
             try:
-                result = follow(path, settings, messenger, cancelled=ended, growth=GROWTH)
+                result = follow(
+                    path,
+                    settings,
+                    messenger,
+                    cancelled=ended,
+                    growth=GROWTH,
+                    of_diagnoses=OF_DIAGNOSES,
+                )
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)
                 return
