@@ -17,6 +17,7 @@ from daq.estimation.follow import follow
 from daq.results.decision.limits import judge
 from estimator.errors import EstimatorError
 from tui.application.bench_view.view import BenchView
+from tui.application.dialogs import StopScreen
 from tui.application.harmless_lines import HarmlessLines
 from tui.application.messages import (
     BenchEdited,
@@ -67,8 +68,8 @@ if TYPE_CHECKING:
     from tui.application.controls import Controls
 
 Outcome = TypeVar("Outcome")
-GROWTH = 0.01  # of the segments, from which on curves change to the eye
-OF_DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
+GROWN = 0.01  # of the segments, from which on curves change to the eye
+DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
 
 
 class FollowingApp(App[None]):
@@ -206,12 +207,7 @@ class FollowingApp(App[None]):
                 return
             try:
                 result = follow(
-                    path,
-                    settings,
-                    messenger,
-                    cancelled=ended,
-                    growth=GROWTH,
-                    of_diagnoses=OF_DIAGNOSES,
+                    path, settings, messenger, cancelled=ended, growth=GROWN, of_diagnoses=DIAGNOSES
                 )
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)
@@ -281,6 +277,8 @@ class FollowingApp(App[None]):
 
     async def _show_result(self) -> None:
         """Show the result of a test that has just ended, unless somebody is at something else."""
+        if isinstance(self.screen, StopScreen):  # there is nothing to stop any more
+            await self.screen.dismiss(result=False)
         if self.current_mode == TEST and len(self.screen_stack) == 1:
             await self.action_view(RESULT)
         else:

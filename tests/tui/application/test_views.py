@@ -58,8 +58,10 @@ async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
         assert "The test has ended" in screen_text(app)
         await pilot.press("escape")
         await shown(pilot, app, *running())
+        await pilot.press("x")
         await shown(pilot, app, *ended())
         assert app.current_mode == RESULT
+        assert "Stop the recording" not in screen_text(app)
 
 
 async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCallback) -> None:
