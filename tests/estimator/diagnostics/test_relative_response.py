@@ -159,7 +159,7 @@ def test_equal_sensors_in_weak_motion_are_not_said_to_differ(dims: tuple[int, ..
     csm = bench([np.eye(dims[0])] * 3, snr=1.5 if dims[0] == 1 else 15)
     names = [
         found.kind
-        for draw in wishart(csm, 40, np.random.default_rng(5), n_draws=60)
+        for draw in wishart(csm, 40, np.random.default_rng(5), n_draws=25)
         for found in orientation(
             relative_response(draw, FREQUENCY, dims=dims, first=0, second=1), dims, 20.0
         )

@@ -78,6 +78,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.long
 def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -181,6 +182,7 @@ def test_the_workers_of_a_cluster_write_the_same_values(folder: Path, tmp_path: 
     assert_same(Store.open(store), Store.open(folder / "huddle-archive"))  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_figures_show_the_density_and_the_days(folder: Path, tmp_path: Path) -> None:
     result = huddle("--store", folder / "huddle-archive", "-o", tmp_path, "--models", "nlnm")
     assert result.exit_code == 0, result.output

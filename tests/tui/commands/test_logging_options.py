@@ -57,6 +57,7 @@ def test_json_is_all_there_is_on_standard_error(bench: Path, tmp_path: Path) -> 
     assert all(entry["time"].endswith("Z") for entry in entries)
 
 
+@pytest.mark.long
 @pseudo_terminals
 def test_the_level_holds_for_the_recorder_too(bench: Path, tmp_path: Path) -> None:
     done = subprocess.run(
@@ -68,6 +69,7 @@ def test_the_level_holds_for_the_recorder_too(bench: Path, tmp_path: Path) -> No
     assert done.stderr == ""
 
 
+@pytest.mark.long
 @pseudo_terminals
 def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar(
     bench: Path, tmp_path: Path

@@ -125,6 +125,7 @@ def test_three_sensor_removes_the_microseism_that_leaks_through_misalignment(tst
     assert leaking - clean >= 12
 
 
+@pytest.mark.long
 def test_all_methods_a_part_of_the_time_and_csv(tst: Path, tmp_path: Path) -> None:
     csv = tmp_path / "curves.csv"
     document = result_of(

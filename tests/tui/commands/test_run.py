@@ -68,6 +68,7 @@ def estimate(path: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.long
 def test_result_of_a_run_is_that_of_its_file(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.h5"
     page = tmp_path / "page.html"
@@ -157,6 +158,7 @@ def test_ctrl_c_stops_the_recorder_and_still_prints_the_result(bench: Path, tmp_
         assert recording.events[-1].kind == "stopped"
 
 
+@pytest.mark.long
 def test_until_cov_ends_the_run(bench: Path, tmp_path: Path) -> None:
     out = tmp_path / "until.h5"
     with_report = tmp_path / "bench.toml"
@@ -236,6 +238,7 @@ def test_check_finds_what_is_on_a_port(bench: Path) -> None:
     assert device["information"]["model"].startswith("A352")
 
 
+@pytest.mark.long
 def test_a_demo_ended_by_ctrl_c_says_so_and_still_compares(tmp_path: Path) -> None:
     process = start("demo", "--speed", "8", "--json", "-", TMPDIR=str(tmp_path))
     wait_for_samples(process, tmp_path, 2500)

@@ -88,6 +88,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     return Reported(recording, snapshot, settings, out.read_text(encoding="utf-8"), report)
 
 
+@pytest.mark.long
 def test_the_demo_s_reports_outlive_its_folder_and_have_its_noise_models(
     reported: Reported, tmp_path: Path
 ) -> None:
@@ -418,6 +419,7 @@ def places_of(page: PageObject) -> list[tuple[float, float]]:
     return places
 
 
+@pytest.mark.long
 def test_paper_says_all_that_the_page_says(reported: Reported, paper: PdfReader) -> None:
     whole = "".join(page.extract_text() for page in paper.pages)
     letters = "".join(whole.split())

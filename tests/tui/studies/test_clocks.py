@@ -180,6 +180,7 @@ def test_weak_motion_makes_nothing_worse_than_arrival_times(tmp_path: Path) -> N
     assert np.abs(refined.against_oracle).max() < np.abs(alone.against_oracle).max() + 1e-3
 
 
+@pytest.mark.long
 def test_where_the_resampler_damps_nothing_is_said(tmp_path: Path) -> None:
     scenario = free_running(snr=1e4, duration=100.0, seed=1)
     table = scenario.to_dict()

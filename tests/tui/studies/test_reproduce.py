@@ -146,6 +146,7 @@ def test_expected_matrices_of_white_channels_are_the_true_ones() -> None:
     assert np.allclose(expected, true, rtol=1e-9, atol=0)
 
 
+@pytest.mark.long
 def test_the_command_shows_points_figures_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

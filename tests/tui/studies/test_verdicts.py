@@ -36,6 +36,7 @@ def test_tests_are_decided_where_they_can_be(found: list[Outcome]) -> None:
     assert any(each.first is Verdict.NOT_DECIDED for each in found)
 
 
+@pytest.mark.long
 def test_the_predicted_time_decides(found: list[Outcome]) -> None:
     prolonged = [each for each in found if each.second is not None]
     held = sum(each.second is not Verdict.NOT_DECIDED for each in prolonged)
