@@ -142,6 +142,7 @@ def test_without_recordings_and_archive_there_is_nothing_to_do(tmp_path: Path) -
     assert "give recordings to begin one" in result.stderr
 
 
+@pytest.mark.long
 def test_killed_and_started_again_it_goes_on(folder: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     command = [*python_command("tui"), "archive", str(folder), "--store", str(store), *OPTIONS]

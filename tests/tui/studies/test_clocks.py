@@ -39,6 +39,7 @@ def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Late
         assert np.abs(rows["arrival times"].against_oracle).max() > 0.1
 
 
+@pytest.mark.long
 def test_the_command_takes_samples_at_face_value_only_if_told(tmp_path: Path) -> None:
     scenario = free_running(snr=1e4, duration=60.0, seed=6)
     path = synthesise(tmp_path / "r.h5", scenario, duration=60.0)
@@ -160,6 +161,7 @@ def test_device_utc_and_host_times_meet_though_the_hosts_utc_is_off(
     assert snapshot.start_utc_ns > 0
 
 
+@pytest.mark.long
 def test_a_rate_that_is_off_by_one_per_cent_is_followed(tmp_path: Path) -> None:
     table = free_running(snr=1e4, duration=120.0, seed=8).to_dict()
     table["sensors"]["B"]["clock"] |= {"ppm": -1e4}
