@@ -9,7 +9,7 @@ from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
 from tui.output.advice.alerts import alert
 from tui.output.advice.sentences import Explanation, explain, where
-from tui.output.formatting import listed, percent
+from tui.output.formatting import listed, percent, several
 
 if TYPE_CHECKING:
     from tui.output.advice.sentences import Names
@@ -96,7 +96,8 @@ def _changes(advice: NoiseChanges, names: Names) -> Explanation:
 @alert.register(DisturbedSegments)
 def _disturbed_alert(advice: DisturbedSegments, names: Names) -> str:
     return (
-        f"{advice.n_disturbed} disturbed segments, most in {names.channels[advice.channel]}: "
+        f"{several(advice.n_disturbed, 'disturbed segment')}, most in "
+        f"{names.channels[advice.channel]}: "
         f"noise up to {percent(advice.excess)} too high; use --reject"
     )
 
