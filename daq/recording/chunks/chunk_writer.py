@@ -28,11 +28,13 @@ _MERGED_SECONDS = 0.1
 class AppendedRows:
     """Rows at the end of a dataset, written by HDF5's own functions.
 
-    Indexing a `h5py.Dataset` takes five times as long for so few rows.
+    Indexing a `h5py.Dataset` takes five times as long for so few rows. HDF5 takes memory as it is,
+    so rows are converted to the dataset's type first.
     """
 
     def __init__(self, dataset: h5py.Dataset) -> None:
         self._id = dataset.id
+        self._dtype = dataset.dtype
         self._type = h5t.py_create(dataset.dtype)
         self._columns = dataset.shape[1:]
         self._corner = (0,) * len(self._columns)
@@ -42,7 +44,8 @@ class AppendedRows:
         self._id.set_extent((n_rows, *self._columns))
 
     def write(self, first: int, rows: NDArray[Any]) -> None:
-        """Write `rows`, contiguous and of the dataset's type, from row `first` on."""
+        """Write `rows` from row `first` on."""
+        rows = np.ascontiguousarray(rows, self._dtype)
         place = self._id.get_space()
         place.select_hyperslab((first, *self._corner), rows.shape)
         self._id.write(h5s.create_simple(rows.shape), place, rows, self._type)
