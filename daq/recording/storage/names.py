@@ -27,7 +27,7 @@ PRIVATE = 0o600
 """Permissions of a recording: users who can read it can stop its recorder."""
 CONTINUES = "continues"
 """Attribute of a recording that continues another after a disk error: the run_id of the other."""
-_STALE_SECONDS = 1.0
+_STALE_SECONDS = 10.0
 """Age in s from which a temporary file without a writer is a leftover: a new one has no lock yet,
 for less than a millisecond."""
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}

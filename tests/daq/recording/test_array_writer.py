@@ -142,7 +142,7 @@ def test_files_of_a_killed_process_do_not_block_a_new_recording(tmp_path: Path) 
     )
     (kept,) = set(tmp_path.iterdir()) - {leftover}
     for path in (leftover, kept):
-        os.utime(path, (time.time() - 2, time.time() - 2))
+        os.utime(path, (time.time() - 20, time.time() - 20))
     written(tmp_path / "r.h5", 1000)
     assert {entry.name for entry in tmp_path.iterdir()} == {"r.h5", kept.name}
     alive.abandon()
