@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -55,6 +56,11 @@ def canonical(unit: str) -> str:
 def is_motion(unit: str) -> bool:
     """Return whether a unit is one of displacement, velocity or acceleration."""
     return canonical(unit) in _MOTION
+
+
+def decibels(psd: float) -> float:
+    """Return 10 log10 of a PSD; NaN where it is not positive."""
+    return 10 * math.log10(psd) if psd > 0 else math.nan
 
 
 def in_acceleration(unit: str) -> float | None:

@@ -110,7 +110,7 @@ def channel_means(
                     if added is None
                     else float(np.average(added[inside, column], weights=width[inside]))
                 )
-                # a noise that varies over the band may be larger, but not than the biased mean
+                # noise that varies over the band may be larger: at most the mean, which is too high
                 most = max(high, float(means[column].mean[0])) if is_pooled else high
                 parts = (mean, (most - low) / (2 * quantile), low - extra, most)
                 means[column] = BandMeans(*(np.array([float(part)]) for part in parts))
@@ -243,8 +243,3 @@ def highest_known(snapshot: Snapshot) -> float:
     """Return the frequency in Hz above which clocks that ran freely leave nothing to be said."""
     known = np.isfinite(snapshot.data_psd).any(axis=1)
     return float(snapshot.frequency[known].max(initial=0.0))
-
-
-def decibels(psd: float) -> float:
-    """Return 10 log10 of a PSD; NaN where it is not positive."""
-    return 10 * math.log10(psd) if psd > 0 else math.nan

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daq.results.band_summary import band_of, channel_means, decibels
+from daq.bench.units import decibels
+from daq.results.band_summary import band_of, channel_means
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings

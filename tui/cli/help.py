@@ -38,8 +38,9 @@ class HelpfulCommand(TyperCommand):
         """Write a section for each panel of options."""
         _write_sections(formatter, _options(self.get_params(ctx), ctx))
 
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Write the examples, each on a line of its own."""
+        del ctx
         with formatter.section(_heading("Examples")):
             formatter.write_text(f"\b\n{self.epilog}")
 
@@ -67,8 +68,9 @@ class LazyGroup(TyperGroup):
             option.default = False
         return option
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a subcommand with its options; None if there is none of this name."""
+        del ctx
         return subcommand(cmd_name) if cmd_name in MODULES else None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.table import Table
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 from daq.results.uncertainty_budget import student_quantile
 from tui.output.formatting import signed, span
 from tui.output.json_values import plain

@@ -6,6 +6,8 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from daq.bench.units import decibels
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -51,13 +53,6 @@ def level(psd: float) -> str:
     if math.isnan(psd):
         return "?"
     return "below 0" if psd <= 0 else signed(decibels(psd), ".2f")
-
-
-def decibels(psd: float) -> float:
-    """Return 10 log10 of a PSD; NaN where it is not positive."""
-    from daq.results import band_summary  # noqa: PLC0415 - commands without estimates load no methods
-
-    return band_summary.decibels(psd)
 
 
 def level_with_error(psd: float, high: float, low: float = math.nan) -> str:

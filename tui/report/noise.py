@@ -6,7 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 from daq.bench.masks.mask import SOURCES
-from daq.results.band_summary import band_of, channel_means, data_means, decibels
+from daq.bench.units import decibels
+from daq.results.band_summary import band_of, channel_means, data_means
 from daq.results.decision.verdict import Verdict
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench

@@ -6,7 +6,7 @@ import enum
 import math
 from dataclasses import dataclass
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 
 
 class Verdict(enum.StrEnum):

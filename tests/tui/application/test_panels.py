@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 from tests.tui.example_snapshot import RATE, SETTINGS, diagnosed, made_now, made_snapshot
 from tui.application.test_view.details import details
 from tui.application.test_view.panels import (

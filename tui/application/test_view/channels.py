@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from daq.results.band_summary import band_of, data_means, decibels
+from daq.bench.units import decibels
+from daq.results.band_summary import band_of, data_means
 from daq.results.partners import without_partners
 from daq.results.precision import channel_covs
 from tui.application.test_view.panels import MUTED, grouped

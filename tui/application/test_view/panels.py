@@ -10,8 +10,9 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from daq.bench.units import decibels
 from daq.recording.sensor_state import SensorState
-from daq.results.band_summary import band_of, channel_means, decibels
+from daq.results.band_summary import band_of, channel_means
 from daq.results.partners import without_partners
 from daq.results.precision import precision
 from estimator.diagnostics.kinds import Level

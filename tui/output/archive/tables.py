@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.archive.changes import MIN_DAYS
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 from tui.output.formatting import percent, several, signed, span
 
 if TYPE_CHECKING:

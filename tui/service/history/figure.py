@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daq.results.band_summary import decibels
+from daq.bench.units import decibels
 from tui.report.figures.drawing import look
 
 if TYPE_CHECKING:
