@@ -102,6 +102,7 @@ def follow(
     share: float = ESTIMATE_SHARE,
     of_diagnoses: float = 0.1,
     silence: float = SILENCE,
+    whole: bool = False,
 ) -> Snapshot | None:
     """Follow a recording until it is closed, and return its result.
 
@@ -127,6 +128,9 @@ def follow(
         Share of that, at most, for the diagnoses in them.
     silence : float
         In seconds.
+    whole : bool
+        Whether estimates of the growing recording have all sensors, however much memory they take:
+        the observer decides by them.
 
     Returns
     -------
@@ -145,7 +149,7 @@ def follow(
     cancelled = threading.Event() if cancelled is None else cancelled
     recording = first = Recording.open(path)
     with Estimation(
-        [recording], settings, diagnosis_share=share * of_diagnoses, live=True
+        [recording], settings, diagnosis_share=share * of_diagnoses, live=not whole
     ) as estimation:
 
         def seen(recording: Recording) -> tuple[Recorder, _Sensors | None]:
@@ -199,8 +203,8 @@ def follow(
             sensors.look_closely()
         if estimation.is_whole:
             return _result(estimation, observer, cancelled)
-    with Estimation([path], estimation.settings) as whole:
-        return _result(whole, observer, cancelled)
+    with Estimation([path], estimation.settings) as again:
+        return _result(again, observer, cancelled)
 
 
 def _check_left(path: Path, *, is_open: bool) -> None:

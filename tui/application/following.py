@@ -201,20 +201,25 @@ class FollowingApp(App[None]):
     def _follow(
         self, path: Path, settings: Settings | None, ended: threading.Event, *, is_kept: bool
     ) -> None:
-        messenger, bench = Messenger(self, ended), self._bench
+        messenger, bench, plan = Messenger(self, ended), self._bench, self.state.plan
         with self._reading:
             if ended.is_set():  # another one was opened meanwhile
                 return
             try:
                 result = follow(
-                    path, settings, messenger, cancelled=ended, growth=GROWN, of_diagnoses=DIAGNOSES
+                    path,
+                    settings,
+                    messenger,
+                    cancelled=ended,
+                    growth=GROWN,
+                    of_diagnoses=DIAGNOSES,
+                    whole=plan is not None and plan.ends_by_estimate,
                 )
             except (HuddleError, EstimatorError, OSError) as error:
                 messenger.error(error)
                 return
-            if result is None or messenger.settings is None:
-                return
-            if is_kept or messenger.was_open:
+            is_kept = is_kept or messenger.was_open
+            if is_kept and result is not None and messenger.settings is not None:
                 verdict = judge(bench, result, messenger.settings)
                 self._try(partial(self._controls.keep, path, result, verdict))
 
@@ -337,12 +342,11 @@ class FollowingApp(App[None]):
     @on(BenchEdited)
     @work(thread=True, group="control")
     def _on_edited(self, message: BenchEdited) -> None:
-        def save() -> bool:
+        def save() -> None:
             self._controls.save_bench(message.text)
-            return True
-
-        if self._try(save):
             self.call_from_thread(self._show_bench)
+
+        self._try(save)
 
     def _show_bench(self) -> None:
         self.state = replace(self.state, bench=self._controls.bench, failure="")

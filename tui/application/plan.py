@@ -45,6 +45,11 @@ class TestPlan:
 
     __test__ = False  # for pytest
 
+    @property
+    def ends_by_estimate(self) -> bool:
+        """Whether the test ends by what the live estimate says."""
+        return self.until_decided or self.cov is not None
+
     def is_reached(
         self, snapshot: Snapshot, settings: Settings, verdict: TestVerdict | None
     ) -> bool:

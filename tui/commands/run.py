@@ -170,6 +170,7 @@ def result_of(
                 recorder=recorder,
                 watch_sensors=False,
                 share=LINE_SHARE if until_cov is None else ESTIMATE_SHARE,
+                whole=until_cov is not None,
             )
         except RecordingLeftOpenError:
             snapshot = None

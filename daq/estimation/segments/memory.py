@@ -7,6 +7,8 @@ them. The number of such matrices was measured: docs/validation/torture.md.
 from __future__ import annotations
 
 import logging
+from bisect import bisect_right
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from daq.alignment.sensor_reader import main_columns
@@ -18,12 +20,13 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 MATRICES = 27
 """Matrices that exist at the same time, at most: in the diagnosis."""
-LIVE_BYTES = 250e6
-"""That an estimate may take to be live with all sensors. One with a part of them is not diagnosed,
-and takes two fifths of this."""
+LARGE = 1e9
+"""Bytes from which on an estimate is announced, and is not live with all sensors."""
+PART_BYTES = 250e6
+"""That an estimate of a part of the sensors may take. It is not diagnosed, and takes two fifths
+of this."""
 MIN_SENSORS = 3
 """That it has in any case."""
-_LARGE = 1e9
 
 
 def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
@@ -41,23 +44,21 @@ def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
 
 
 def live_sensors(recording: ReadableRecording, settings: Settings) -> tuple[str, ...] | None:
-    """Return the first sensors, as many as `LIVE_BYTES` allow; None where that is all of them."""
+    """Return the sensors of a live estimate: the first ones; None where that is all of them."""
     rate = settings.sampling_rate or min(each.sampling_rate for each in recording.sensors)
-    chosen: list[str] = []
-    n_channels = 0
-    for record in recording.sensors:
-        n_channels += len(main_columns(record))
-        too_much = bytes_of(n_channels, rate, settings.segment) > LIVE_BYTES
-        if too_much and len(chosen) >= MIN_SENSORS:
-            return tuple(chosen)
-        chosen.append(record.name)
-    return None
+    n_channels = accumulate(len(main_columns(record)) for record in recording.sensors)
+    needed = [bytes_of(n, rate, settings.segment) for n in n_channels]
+    if needed[-1] <= LARGE:
+        return None
+    n_sensors = max(MIN_SENSORS, bisect_right(needed, PART_BYTES))
+    names = tuple(record.name for record in recording.sensors)
+    return names[:n_sensors] if n_sensors < len(names) else None
 
 
 def announce(n_channels: int, sampling_rate: float, segment: float) -> None:
     """Log how much memory a large estimate is about to take."""
     needed = bytes_of(n_channels, sampling_rate, segment)
-    if needed > _LARGE:
+    if needed > LARGE:
         _LOGGER.warning(
             "the result of %d channels takes about %.0f GB of memory;"
             " a shorter --segment takes less",

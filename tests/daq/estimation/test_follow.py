@@ -471,7 +471,8 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
 def test_more_sensors_than_memory_allows_wait_for_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "LIVE_BYTES", 0.0)
+    monkeypatch.setattr(memory, "LARGE", 0.0)
+    monkeypatch.setattr(memory, "PART_BYTES", 0.0)
     monkeypatch.setattr(memory, "MIN_SENSORS", 2)
     with growing(tmp_path / "run.h5") as writer:
         noted = Noted()
@@ -485,6 +486,18 @@ def test_more_sensors_than_memory_allows_wait_for_the_result(
     assert result is last
     assert last.not_estimated == ()
     np.testing.assert_array_equal(last.csm, estimate([writer.path], SETTINGS).csm)
+
+
+def test_an_observer_that_decides_by_the_estimate_gets_all_sensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for limit in ("LARGE", "PART_BYTES", "MIN_SENSORS"):
+        monkeypatch.setattr(memory, limit, 0)
+    with growing(tmp_path / "run.h5") as writer:
+        noted = Noted()
+        Bench(writer).send("ABC", 30)
+        follow(writer.path, SETTINGS, noted, recorder=Process(writer.close), whole=True)
+    assert [live.not_estimated for live in noted.snapshots] == [(), ()]
 
 
 def test_without_sensors_to_watch_the_next_look_is_when_a_segment_can_be_there(

@@ -108,7 +108,9 @@ def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -
     assert found is not None
     assert found.verdict is Verdict.FAIL
     assert is_surely_decided(found)
-    assert TestPlan(until_decided=True).is_reached(snapshot, SETTINGS, found)
+    plan = TestPlan(until_decided=True)
+    assert plan.ends_by_estimate
+    assert plan.is_reached(snapshot, SETTINGS, found)
     passed = [each for each in found.limits if each.verdict is Verdict.PASS]
     assert is_surely_decided(replace(found, verdict=Verdict.PASS, limits=tuple(passed[:3])))
     barely = replace(passed[0], limit_psd=passed[0].high * 1.001)

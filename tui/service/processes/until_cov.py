@@ -67,7 +67,7 @@ def stop_when_precise(path: Path, target_cov: float) -> None:
     with Recording.open(path) as recording:
         settings = replace(Settings.of(recording.bench), target_cov=target_cov)
     observer = PrecisionObserver(path)
-    follow(path, settings, observer, cancelled=observer.reached, watch_sensors=False)
+    follow(path, settings, observer, cancelled=observer.reached, watch_sensors=False, whole=True)
 
 
 def main() -> None:
