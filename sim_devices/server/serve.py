@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import signal
 from dataclasses import replace
 from importlib import import_module
@@ -105,7 +106,7 @@ class Served:
         self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._last = 0.0
+        self._last = -math.inf
         self._down = False
         self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme, number=number)
 
@@ -117,7 +118,7 @@ class Served:
 
     def received(self, received: bytes) -> None:
         """Handle received bytes."""
-        self._last = 0.0
+        self._last = -math.inf
         self._send(self._endpoint.receive(received, self._clock.now()))
         self._schedule()
 

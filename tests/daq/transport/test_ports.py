@@ -27,6 +27,7 @@ from daq.protocols.epson import commands
 from daq.transport import address
 from daq.transport.address import host_and_port
 from daq.transport.ports import open_port
+from tests.waiting import limit
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -243,7 +244,7 @@ async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
         assert ((await reading).n_samples, decoder.n_pending) == (4, cut)
         reading = asyncio.create_task(block())
         far.send(sent[cut + 5 * size : 10 * size])
-        async with asyncio.timeout(30):  # the driver loses its own patience sooner
+        async with asyncio.timeout(limit()):  # the driver loses its own patience sooner
             second = await reading
         assert (second.first_sample, second.n_samples, decoder.n_pending) == (4, 5, 0)
 

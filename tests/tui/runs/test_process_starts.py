@@ -18,6 +18,7 @@ from daq.bench.loading import dump
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from tests.daq.archive import months
+from tests.waiting import limit
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.steps import ProcessSteps
 from tui.simulation.devices import simulated
@@ -101,7 +102,7 @@ def test_the_installed_command_and_all_that_it_starts_run_none(record: Path) -> 
         capture_output=True,
         text=True,
         check=False,
-        timeout=100,
+        timeout=limit(),
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["segments"] >= 6

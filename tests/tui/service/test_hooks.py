@@ -12,6 +12,7 @@ import pytest
 
 from daq.bench.tables.unattended import Hooks
 from tests.tui.service.bench_files import HOURLY, START, Place, VirtualClock
+from tests.waiting import limit
 from tui.service.hooks import Teller, events_of, run_hook
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
@@ -56,7 +57,7 @@ async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path
     teller = Teller(lambda: hooks, store, tmp_path, VirtualClock())
     task = asyncio.create_task(teller.work())
     teller.tell(run)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(limit()):
         while True:
             if not store.runs()[0].untold:
                 break
@@ -84,7 +85,7 @@ async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path
     ],
 )
 async def test_what_goes_wrong_is_said(command: tuple[str, ...], problem: str) -> None:
-    said = await run_hook(command, b"{}\n" * 100_000, 0.2 if "sleep" in str(command) else 60)
+    said = await run_hook(command, b"{}\n" * 100_000, 0.2 if "sleep" in str(command) else limit())
     assert said.startswith(problem)
     assert bool(said) == bool(problem)
 
