@@ -154,17 +154,20 @@ def test_noise_causes_no_bias_and_the_error_covers(peak: float) -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 3 * np.std(miss)
 
 
-@pytest.mark.parametrize("dims", [(1, 1, 1), (3, 3, 3)])
-def test_equal_sensors_in_weak_motion_are_not_said_to_differ(dims: tuple[int, ...]) -> None:
-    csm = bench([np.eye(dims[0])] * 3, snr=1.5 if dims[0] == 1 else 15)
-    names = [
+@pytest.mark.parametrize(("dims", "snr", "every"), [((1, 1, 1), 5.0, 8), ((3, 3, 3), 7.0, 1)])
+def test_equal_sensors_in_weak_motion_are_not_said_to_differ(
+    dims: tuple[int, ...], snr: float, every: int
+) -> None:
+    """Their differences exceed what is tolerated in 5 and 12 of 25 draws, but are not certain."""
+    csm, frequency = bench([np.eye(dims[0])] * 3, snr=snr)[::every], FREQUENCY[::every]
+    kinds = [
         found.kind
-        for draw in wishart(csm, 40, np.random.default_rng(5), n_draws=25)
+        for draw in wishart(csm, 20, np.random.default_rng(5), n_draws=25)
         for found in orientation(
-            relative_response(draw, FREQUENCY, dims=dims, first=0, second=1), dims, 20.0
+            relative_response(draw, frequency, dims=dims, first=0, second=1), dims, 20.0
         )
     ]
-    assert len(names) <= 1
+    assert len(kinds) <= 1
 
 
 def test_more_sensors_and_one_channel() -> None:
