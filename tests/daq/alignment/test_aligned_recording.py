@@ -11,13 +11,8 @@ import pytest
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.alignment.resampling import reach
 from daq.errors import CannotAlignError
-from daq.estimation.estimation import estimate
-from daq.estimation.segments import segment_pass
-from daq.estimation.settings import Settings
 from daq.protocols.block import HostTime
 from daq.recording.reader import Recording
-from daq.timing.clock_model import ClockSource, OffsetSource
-from estimator.diagnostics.advice import Copies
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 
 if TYPE_CHECKING:
@@ -38,73 +33,6 @@ def test_samples_of_one_clock_are_bit_exact_for_any_division_of_reads(tmp_path: 
         assert valid.all()
         assert np.array_equal(whole, np.hstack([*raw.values()]).astype(float))
         assert np.array_equal(aligned.read(1234, 4321)[0], whole[1234:4321])
-
-
-def test_exact_times_align_samples_and_give_the_start(tmp_path: Path) -> None:
-    raw = {name: counts(3000, 1, seed) for seed, name in enumerate("abc")}
-    starts = {"a": 0.0055, "b": 0.1255, "c": 0.0355}  # 12 and 3 samples later
-    sensors = {n: Sensor(c, utc=True, start=starts[n]) for n, c in raw.items()}
-    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
-        aligned = AlignedRecording(recording)
-        assert aligned.is_exact
-        samples, valid = aligned.read(0, aligned.n_available)
-        assert len(samples) == 3000 - 12
-        assert valid.all()
-        expected = [raw["a"][12:, 0], raw["b"][:2988, 0], raw["c"][9:2997, 0]]
-        assert np.array_equal(samples, np.stack(expected, axis=1).astype(float))
-        assert aligned.start_utc_ns == 1_468_458_000_125_500_000
-
-
-@pytest.mark.parametrize("ahead", [0.0, 0.3, 30.0, -30.0, 10_800.0])  # of the host's UTC
-def test_a_sensor_with_utc_is_aligned_with_others_for_any_host_utc(
-    tmp_path: Path, ahead: float
-) -> None:
-    sensors = {
-        "a": Sensor(counts(3000, 1, 1), start=0.5),
-        "b": Sensor(counts(3000, 1, 2), start=0.7, utc=True, utc_ahead=ahead),
-        "c": Sensor(counts(3000, 1, 3), start=0.6, utc=True, utc_ahead=ahead),
-    }
-    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
-        aligned = AlignedRecording(recording)
-        offsets = [clock.offset for clock in aligned.clocks]
-        assert offsets == pytest.approx([0.5, 0.7, 0.6], abs=1e-3)
-        assert offsets[1] - offsets[2] == pytest.approx(0.1, abs=1e-9)
-        assert 2800 < aligned.n_available < 3000
-
-
-def test_unsynchronised_channels_delay_a_device_without_shifting_it(tmp_path: Path) -> None:
-    sensors = {
-        "a": Sensor(counts(6000, 1, 1)),
-        "b": Sensor(counts(6000, 1, 2), utc=True, late=7.5),
-    }
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, seconds in (("a", 0.5), ("b", 10.0)):
-        for block in blocks(name, sensors[name], seconds):
-            writer.append(block)
-    writer.close()
-    with Recording.open(tmp_path / "r.h5") as recording:
-        delays = AlignedRecording(recording).delays(np.array([3000.0]))
-        assert np.ptp(delays) < 1e-3
-
-
-@pytest.mark.parametrize("ahead", [3, -40])
-def test_a_correction_of_device_utc_moves_no_samples(tmp_path: Path, ahead: int) -> None:
-    sensors = {
-        "a": Sensor(counts(6000, 1, 1)),
-        "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
-    }
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            stated = block.device_counter
-            if stated is not None and block.first_sample < 500:
-                stated += ahead * 10**9
-            writer.append(replace(block, device_counter=stated))
-    writer.close()
-    with Recording.open(tmp_path / "r.h5") as recording:
-        aligned = AlignedRecording(recording)
-        at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
-        assert np.ptp(aligned.delays(at)) < 1e-3
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -240,77 +168,6 @@ def test_a_grid_faster_than_a_sensor_is_refused(tmp_path: Path) -> None:
         AlignedRecording(recording, sampling_rate=200.0)
 
 
-@pytest.mark.parametrize("begun", [0.0, 8.0])  # seconds after the recording was created
-def test_sensors_of_one_clock_with_different_starts_are_aligned_exactly(
-    tmp_path: Path, begun: float
-) -> None:
-    raw = counts(5000, 1, 8)
-    sensors = {
-        "a": Sensor(raw[:4000], clock="one", start=begun),
-        "b": Sensor(raw[137:4600], clock="one", start=begun + 1.37, late=1.2e-3),
-        "c": Sensor(raw[60:4700], clock="one", start=begun + 0.60, late=2.9e-3, restarts=(2000,)),
-    }
-    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
-        aligned = AlignedRecording(recording)
-        samples, valid = aligned.read(0, aligned.n_available)
-        assert valid.all()
-        assert len(samples) == 4000 - 137
-        assert np.array_equal(samples, np.repeat(raw[137:4000], 3, axis=1).astype(float))
-        assert {clock.source for clock in aligned.clocks} == {ClockSource.SHARED_CLOCK}
-        assert {clock.shared_clock for clock in aligned.clocks} == {"one"}
-        by_arrivals = OffsetSource.ARRIVAL_TIMES
-        assert [clock.offset_source for clock in aligned.clocks] == [None, by_arrivals, by_arrivals]
-
-
-def test_the_motion_gives_the_offset_of_shared_clocks_if_arrivals_cannot(tmp_path: Path) -> None:
-    rng = np.random.default_rng(9)
-    motion = np.cumsum(rng.standard_normal((12_200, 1)), axis=0)
-
-    def seen(first: int, seed: int) -> NDArray[np.int32]:
-        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
-        return np.round(1e5 * (motion[first : first + 12_000] + 0.01 * noise)).astype(np.int32)
-
-    sensors = {
-        "a": Sensor(seen(0, 1), clock="one"),
-        "b": Sensor(seen(0, 2), clock="one"),
-        "c": Sensor(seen(50, 3), clock="one", start=0.5, late=27e-3),  # nearly three samples late
-    }
-    path = write(tmp_path / "r.h5", sensors)
-    apart = {}
-    for clocks in ("arrivals", "refined"):
-        snapshot = estimate([path], Settings(segment=4.0, clocks=clocks))
-        apart[clocks] = -100.0 * (snapshot.drift[:, 3] - snapshot.drift[:, 1])
-        beside = snapshot.clocks[1]  # with "a" in every block
-        assert (beside.shared_clock, beside.offset_source) == ("one", None)
-    assert np.allclose(apart["arrivals"], -53.0)
-    assert np.allclose(apart["refined"], -50.0)
-    apart_by = snapshot.clocks[2]
-    assert (apart_by.shared_clock, apart_by.offset_source) == ("one", OffsetSource.SAMPLES)
-    assert np.median(snapshot.results["three-sensor"].noise_psd[10:, 2]) < 2 * 1e6 / 50
-
-
-def test_a_first_sensor_with_noise_only_does_not_prevent_refinement_of_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(segment_pass, "_VALUES_AT_ONCE", 1)  # as if there were very many sensors
-    motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
-
-    def seen(seed: int) -> NDArray[np.int32]:
-        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
-        return np.round(1e5 * (motion + 0.01 * noise)).astype(np.int32)
-
-    sensors = {
-        "a": Sensor(counts(12_000, 1, 4)),
-        "b": Sensor(seen(1)),
-        "c": Sensor(seen(2)),
-        "d": Sensor(seen(3), late=27e-3),  # nearly three samples
-    }
-    snapshot = estimate([write(tmp_path / "r.h5", sensors)], Settings(segment=4.0))
-    assert [clock.refined for clock in snapshot.clocks] == [False, False, True, True]
-    apart = snapshot.drift[:, 3:] - snapshot.drift[:, 2:3]
-    assert np.abs(apart).max() < 1e-4  # 2.7e-2 by arrival times
-
-
 def test_clocks_are_aligned_after_an_hour_of_suspension(tmp_path: Path) -> None:
     # CLOCK_MONOTONIC stands still in suspend; the sensors' counters do not.
     hour, n_before, n_after = 3600.0, 30_000, 30_000
@@ -347,67 +204,3 @@ def test_clocks_are_aligned_after_an_hour_of_suspension(tmp_path: Path) -> None:
             for column in (1, 2):
                 error = samples[rows, column] - samples[rows, 0]
                 assert np.std(error) < 1e-4 * np.std(samples[rows, 0])
-
-
-@pytest.mark.parametrize(
-    ("late", "missed"),
-    [
-        pytest.param(2e-4, 0, marks=pytest.mark.long),
-        pytest.param(7.3e-3, 0, marks=pytest.mark.long),
-        (7.3e-3, 130),
-    ],
-)
-def test_a_sensor_connected_twice_is_reported_and_does_not_stop_the_estimate(
-    tmp_path: Path, late: float, missed: int
-) -> None:
-    motion = np.cumsum(np.random.default_rng(1).standard_normal((16_000, 2)), axis=0)
-
-    def seen(seed: int) -> NDArray[np.int32]:
-        noise = np.random.default_rng(seed).standard_normal(motion.shape)
-        return np.round(1e4 * (motion + 0.05 * noise)).astype(np.int32)
-
-    twice = seen(2)
-    sensors = {n: Sensor(c) for n, c in (("a", seen(1)), ("b", twice), ("c", seen(3)))}
-    restarts = (6000,) if missed else ()  # of one of the wires
-    sensors["d"] = Sensor(twice[missed:], start=missed / 100.0, late=late, restarts=restarts)
-    methods = ("three-sensor", "maximum-likelihood")
-    path = write(tmp_path / "r.h5", sensors)
-    snapshot = estimate([path], Settings(segment=4.0, methods=methods))
-    copies = snapshot.diagnostics.advice[0]
-    assert isinstance(copies, Copies)
-    assert copies.channels == ((2, 6), (3, 7))  # d's and b's
-    apart = snapshot.drift[:, 4] - snapshot.drift[:, 2]
-    assert np.abs(apart - missed / 100.0).max() < 1e-6
-    for method in methods:
-        assert np.isfinite(snapshot.results[method].noise_psd[4:160, [0, 1, 4, 5]]).all()
-
-
-def test_coarse_counts_equal_by_chance_do_not_make_one_sensor(
-    tmp_path: Path,
-) -> None:
-    rng = np.random.default_rng(0)
-    tones, phases = rng.uniform(0.5, 40.0, (100, 1)), rng.uniform(0.0, 2 * np.pi, (100, 1))
-
-    def seen(ppm: float) -> Sensor:  # without noise, from the same instant on
-        rate = 100.0 * (1 + ppm * 1e-6)
-        motion = np.sin(2 * np.pi * tones * np.arange(12_000) / rate + phases).sum(axis=0)
-        return Sensor(np.round(motion / 14)[:, None].astype(np.int32), rate=rate, nominal=100.0)
-
-    sensors = {"a": seen(0.0), "b": seen(10.0)}
-    assert np.array_equal(sensors["a"].counts[:500], sensors["b"].counts[:500])
-    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
-        rates = [state.ppm for state in AlignedRecording(recording).clocks]
-    assert rates == pytest.approx([0.0, 10.0], abs=0.01)
-
-
-def test_a_shared_clock_has_a_rate(tmp_path: Path) -> None:
-    rate = 100.0 * (1 + 18e-6)
-    sensors = {
-        n: Sensor(counts(60_000, 1, 1), rate=rate, nominal=100.0, clock="one") for n in "abc"
-    }
-    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
-        aligned = AlignedRecording(recording)
-        assert aligned.is_exact
-        for state in aligned.clocks:
-            assert state.ppm == pytest.approx(18.0, abs=0.01)
-            assert state.ppm_std < 0.01

@@ -1,0 +1,83 @@
+"""Sensors that state UTC, on one grid with sensors that do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.alignment.aligned_recording import AlignedRecording
+from daq.recording.reader import Recording
+from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_exact_times_align_samples_and_give_the_start(tmp_path: Path) -> None:
+    raw = {name: counts(3000, 1, seed) for seed, name in enumerate("abc")}
+    starts = {"a": 0.0055, "b": 0.1255, "c": 0.0355}  # 12 and 3 samples later
+    sensors = {n: Sensor(c, utc=True, start=starts[n]) for n, c in raw.items()}
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        assert aligned.is_exact
+        samples, valid = aligned.read(0, aligned.n_available)
+        assert len(samples) == 3000 - 12
+        assert valid.all()
+        expected = [raw["a"][12:, 0], raw["b"][:2988, 0], raw["c"][9:2997, 0]]
+        assert np.array_equal(samples, np.stack(expected, axis=1).astype(float))
+        assert aligned.start_utc_ns == 1_468_458_000_125_500_000
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.3, 30.0, -30.0, 10_800.0])  # of the host's UTC
+def test_a_sensor_with_utc_is_aligned_with_others_for_any_host_utc(
+    tmp_path: Path, ahead: float
+) -> None:
+    sensors = {
+        "a": Sensor(counts(3000, 1, 1), start=0.5),
+        "b": Sensor(counts(3000, 1, 2), start=0.7, utc=True, utc_ahead=ahead),
+        "c": Sensor(counts(3000, 1, 3), start=0.6, utc=True, utc_ahead=ahead),
+    }
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        aligned = AlignedRecording(recording)
+        offsets = [clock.offset for clock in aligned.clocks]
+        assert offsets == pytest.approx([0.5, 0.7, 0.6], abs=1e-3)
+        assert offsets[1] - offsets[2] == pytest.approx(0.1, abs=1e-9)
+        assert 2800 < aligned.n_available < 3000
+
+
+def test_unsynchronised_channels_delay_a_device_without_shifting_it(tmp_path: Path) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=7.5),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, seconds in (("a", 0.5), ("b", 10.0)):
+        for block in blocks(name, sensors[name], seconds):
+            writer.append(block)
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        delays = AlignedRecording(recording).delays(np.array([3000.0]))
+        assert np.ptp(delays) < 1e-3
+
+
+@pytest.mark.parametrize("ahead", [3, -40])
+def test_a_correction_of_device_utc_moves_no_samples(tmp_path: Path, ahead: int) -> None:
+    sensors = {
+        "a": Sensor(counts(6000, 1, 1)),
+        "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
+    }
+    writer = create(tmp_path / "r.h5", sensors)
+    for name, sensor in sensors.items():
+        for block in blocks(name, sensor):
+            stated = block.device_counter
+            if stated is not None and block.first_sample < 500:
+                stated += ahead * 10**9
+            writer.append(replace(block, device_counter=stated))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        aligned = AlignedRecording(recording)
+        at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
+        assert np.ptp(aligned.delays(at)) < 1e-3

@@ -1,0 +1,1 @@
+"""GCF and the links it comes over."""

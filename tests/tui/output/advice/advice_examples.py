@@ -1,0 +1,331 @@
+"""One piece of advice of each kind, and words that its sentences must have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from estimator.diagnostics.advice import (
+    Advice,
+    Copies,
+    Delay,
+    Gain,
+    MissingChannels,
+    MissingDimension,
+    ModelMisfit,
+    MotionAcross,
+    MotionLeftIn,
+    NearlySingular,
+    NoSharedMotion,
+    NoSignal,
+    NotOrthogonal,
+    ReversedPolarity,
+    Rotated,
+    SwappedChannels,
+    TooFewDimensions,
+    TooFewSensors,
+    UnequalResponses,
+    WeakMotion,
+)
+from estimator.diagnostics.kinds import Level
+from estimator.diagnostics.misfit import DisturbedSegments, NoiseChanges, SharedNoise
+from tui.output.advice.sentences import Names
+
+BAND = (2.0, 8.0)
+MISFIT = ModelMisfit(
+    level=Level.PROBLEM,
+    band=BAND,
+    n_factors=3,
+    statistic=2.5,
+    worst_statistic=4.0,
+    worst_band=(4.0, 5.0),
+    p_value=1e-9,
+    unexplained=0.06,
+    error=0.6,
+    largest_error=6.0,
+    is_wrong=True,
+)
+FEW = TooFewDimensions(
+    level=Level.PROBLEM,
+    band=BAND,
+    n_factors=1,
+    statistic=3.0,
+    worst_statistic=4.0,
+    worst_band=(4.0, 5.0),
+)
+ACROSS = MotionAcross(
+    level=Level.NOTE,
+    band=BAND,
+    n_channels=2,
+    larger_sensors=(),
+    snr=150.0,
+    added_by_one_degree=0.046,
+)
+ROTATED = Rotated(
+    level=Level.NOTE,
+    sensors=(0, 1),
+    band=BAND,
+    angle_deg=4.12,
+    horizontal_deg=-2.5,
+    error_deg=0.1,
+)
+SKEWED = NotOrthogonal(level=Level.NOTE, sensors=(0, 1), band=BAND, deviation_deg=5.74)
+GAIN = Gain(level=Level.NOTE, sensors=(0, 1), band=BAND, channel=4, counterpart=1, ratio=1.05)
+LEADS = Delay(level=Level.WARNING, sensors=(0, 1), band=BAND, delay=-0.02, delay_samples=-0.8)
+SHARED = SharedNoise(
+    level=Level.WARNING,
+    sensors=(0, 1),
+    band=BAND,
+    channels=((0, 3), (1, 4)),
+    amounts=(0.1, -0.08),
+    errors=(0.004, 0.003),
+    alternatives=((0, 5), (2, 3)),
+    three_sensor=-0.07,
+    maximum_likelihood=0.06,
+    channel=3,
+)
+EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
+    (
+        SHARED,
+        (
+            "It may be a.x and b.z or a.z and b.x instead: these averages cannot tell.",
+            "Sensors a and b share noise at 2–8 Hz (a.x and b.x 10 ± 0.4 %, a.y and b.y -8 ± 0.3 %",
+            "The three-sensor noise is too low by up to 7 % and the maximum likelihood noise is",
+            "too high by up to 6 % (worst in b.x)",
+            "digitizer",
+        ),
+    ),
+    (
+        replace(SHARED, sensors=(0,), channels=((0, 1),), amounts=(0.1,), errors=(0.01,)),
+        ("Channels of a share noise", "a.x and a.y 10 ± 1 %"),
+    ),
+    (
+        DisturbedSegments(
+            level=Level.WARNING,
+            sensors=(1,),
+            n_disturbed=7,
+            n_segments=240,
+            times=(295.0, 300.0),
+            excess=0.4,
+            channel=4,
+        ),
+        (
+            "7 of 240 segments differ",
+            "most in b.y (from the start: 295 s, 300 s and 5 more)",
+            "add up to 40 % to the noise",
+            "--reject",
+        ),
+    ),
+    (
+        NoiseChanges(
+            level=Level.NOTE,
+            sensors=(1,),
+            band=BAND,
+            channel=4,
+            deviation=0.45,
+            expected=0.1,
+            n_parts=12,
+            inflation=1.36,
+        ),
+        (
+            "most in b.y at 2–8 Hz: by 45 % between 12 parts (10 % if it were steady)",
+            "the variance is 1.4 times that of steady noise",
+            "Intervals and tests allow for it",
+            "by 13 % (standard error)",
+        ),
+    ),
+    (
+        NoSignal(
+            level=Level.PROBLEM,
+            sensors=(1,),
+            channels=(4,),
+            whole_sensor=False,
+            share_of_frequencies=1.0,
+        ),
+        ("b.y has no signal (no power", "its noise cannot be estimated", "Check the cable"),
+    ),
+    (
+        NoSignal(
+            level=Level.PROBLEM,
+            sensors=(1,),
+            channels=(3, 4, 5),
+            whole_sensor=True,
+            share_of_frequencies=1.0,
+        ),
+        ("Sensor b has no signal on any channel", "their noise"),
+    ),
+    (
+        Copies(
+            level=Level.PROBLEM,
+            sensors=(0, 1),
+            channels=((1, 4), (2, 5)),
+            share_of_frequencies=1.0,
+        ),
+        ("b.y repeats a.y and b.z repeats a.z, sample for sample", "check the ports"),
+    ),
+    (
+        NoSharedMotion(
+            level=Level.PROBLEM,
+            sensors=(0,),
+            band=BAND,
+            partners=(1, 2),
+            share=0.012,
+            share_of_partners=0.98,
+        ),
+        (
+            "Sensor a records none of the motion that b and c share at 2–8 Hz",
+            "at most 1.2 % in common, b and c 98 % or more",
+            "and b and c have no third sensor",
+            "Check its input and its place",
+        ),
+    ),
+    (
+        NoSharedMotion(
+            level=Level.PROBLEM,
+            sensors=(0,),
+            band=BAND,
+            partners=(1, 2),
+            share=0.0,
+            share_of_partners=0.98,
+            for_part=True,
+        ),
+        (
+            "that b and c share at 2–8 Hz for a part of the recording",
+            "Estimate the part before (--end)",
+        ),
+    ),
+    (
+        TooFewSensors(level=Level.PROBLEM, sensors=(0, 1)),
+        ("Only sensors a and b have", "--method two-channel", "--method maximum-likelihood"),
+    ),
+    (
+        TooFewSensors(level=Level.PROBLEM),
+        ("Fewer than two sensors have", "until three have a signal"),
+    ),
+    (
+        MissingChannels(level=Level.WARNING, sensors=(1,), whole_sensors=(0, 2)),
+        ("Channels of b are missing", "no three-sensor estimate for a and c", "maximum-likelihood"),
+    ),
+    (
+        MissingChannels(level=Level.WARNING, sensors=(0, 1, 2), whole_sensors=()),
+        ("no three-sensor estimate for any sensor",),
+    ),
+    (
+        FEW,
+        ("fails at 2–8 Hz: one motion of 1 dimension does not", "3 times", "--dimension auto"),
+    ),
+    (
+        MISFIT,
+        (
+            "The model test fails at 2–8 Hz: one common motion does not explain",
+            "(test statistic 2.5 times its expectation, 4 at 4–5 Hz). Up to 6 % of the noise",
+            "The estimate is wrong by up to about 60 % of the noise, and by up to 600 % where",
+            "Put the sensors closer together",
+        ),
+    ),
+    (
+        replace(
+            MISFIT, level=Level.WARNING, worst_band=BAND, error=0.2, is_wrong=False, n_factors=2
+        ),
+        ("one motion of 2 dimensions", "expectation: significant, but small)", "may be wrong by"),
+    ),
+    (
+        replace(MISFIT, largest_error=float("inf")),
+        ("by any amount where waves cross", "which three sensors of 3 channels cannot detect"),
+    ),
+    (
+        ACROSS,
+        (
+            "Sensors of 2 channels sense 2 of three dimensions",
+            "At the SNR here (150), 1° between the planes adds up to 4.6 % of the noise",
+            "so that their planes are parallel, or use triaxial data.",
+        ),
+    ),
+    (
+        replace(ACROSS, sensors=(0, 1), n_channels=1, larger_sensors=(2,)),
+        (
+            "For a and b, three-sensor and three-channel estimates compare 1 channel of every",
+            "which sense 1 of three dimensions",
+            "their axes are parallel, or use maximum likelihood, which also compares the further",
+            "channels of c.",
+        ),
+    ),
+    (
+        MissingDimension(
+            level=Level.WARNING, band=BAND, n_dimensions=2.0, n_channels=3, condition=100.0
+        ),
+        ("At 2–8 Hz the motion has only 2 of 3 dimensions", "--dimension auto"),
+    ),
+    (
+        NearlySingular(level=Level.NOTE, band=BAND, condition=123.0),
+        ("At 2–8 Hz", "nearly singular (condition number 123)"),
+    ),
+    (
+        WeakMotion(level=Level.NOTE, band=BAND, snr=0.3),
+        ("At 2–8 Hz the motion that the sensors share is weaker than the rest (SNR at most 0.3)",),
+    ),
+    (
+        MotionLeftIn(level=Level.NOTE, band=BAND, share=0.085, n_effective=20.0),
+        ("too weak to be found in 20 averages", "up to about 8.5 %", "Record longer"),
+    ),
+    (
+        SwappedChannels(level=Level.WARNING, sensors=(0, 1), band=BAND, channels=((3, 1), (4, 0))),
+        ("Channels are swapped: b.x follows a.y and b.y follows a.x.", "order of the channels"),
+    ),
+    (
+        ROTATED,
+        (
+            "Sensors a and b are rotated against each other by 4.1° (−2.50° in the horizontal",
+            "no bias in the three-sensor",
+            "improve the precision",
+        ),
+    ),
+    (
+        SKEWED,
+        ("Channels of sensor a or b deviate by 5.7° from a right angle",),
+    ),
+    (
+        ReversedPolarity(level=Level.WARNING, sensors=(0, 1), band=BAND, channel=5, counterpart=2),
+        ("b.z has the opposite polarity to a.z: no bias", "sign of the sensitivity"),
+    ),
+    (
+        GAIN,
+        ("The gain of b.y is 1.050 times that of a.y", "Check the sensitivities"),
+    ),
+    (
+        replace(LEADS, delay=0.02, delay_samples=0.8),
+        ("Sensor b lags sensor a by 20 ms (0.8 samples)", "Synchronise the clocks"),
+    ),
+    (
+        LEADS,
+        ("Sensor a lags sensor b by 20 ms (0.8 samples)",),
+    ),
+    (
+        UnequalResponses(
+            level=Level.PROBLEM,
+            sensors=(1,),
+            band=BAND,
+            channel=3,
+            share=0.94,
+            share_without=0.94,
+            equalised_by=(),
+        ),
+        ("The response of b differs from that of the others at", "94 % of the estimate of b.x"),
+    ),
+    (
+        UnequalResponses(
+            level=Level.WARNING,
+            sensors=(0, 1, 2),
+            band=BAND,
+            channel=3,
+            share=0.12,
+            share_without=40.0,
+            equalised_by=("known", "estimated"),
+        ),
+        ("The responses of all sensors differ", "would be 40 times the noise of b.x", "12 % of"),
+    ),
+]
+
+
+def names(*sensors: str, n_channels: int = 3) -> Names:
+    channels = tuple(f"{sensor}.{channel}" for sensor in sensors for channel in "xyz"[:n_channels])
+    return Names(sensors, channels, (n_channels,) * len(sensors))

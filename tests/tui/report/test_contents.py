@@ -1,0 +1,152 @@
+"""The calibration report is complete: contents, verdict, events, provisos."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daq.estimation.estimation import estimate
+from daq.results.sources import sources
+from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
+from tests.tui.report.written_report import Reported, Words, tables, texts_of
+from tui.cli.main import app
+from tui.report.contents import report_of
+from tui.report.figures.drift import without_line
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) -> None:
+    text = Words(reported.page).text
+    digest = hashlib.sha256(reported.recording.read_bytes()).hexdigest()
+    for word in (
+        "pier & <floor>", "Ada <ada@lab>", "cellar", "night.h5", digest, "SN-0", "SN-2", "M-1",
+        "X (east), Y", "1000000", "2016-07-14 01:00:00 UTC", "2016-07-14 03:00:00 UTC+0200",
+        "Duration1m", "three-sensor", "1 s (100 samples)", "hann", "50 %", "Signature",
+        "Small-sample biasremoved",
+    ):  # fmt: skip
+        assert word in text
+
+
+def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
+    # 100 counts of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz, −97 dB
+    table, *_ = tables(reported.report, "Self-noise")
+    rows = {row[0]: row for row in table.rows}
+    assert float(rows["A.X"][2].replace("−", "-")) == pytest.approx(-96.99, abs=0.5)
+    low, high = (float(end.replace("−", "-")) for end in rows["A.X"][3].split(" … "))
+    assert low < -96.99 < high
+    assert float(rows["B.X"][7]) == pytest.approx(10 * np.log10(4000**2 / 100**2), abs=0.6)
+    assert rows[f"{HOSTILE}.Y"][1:3] == ("no signal", "?")
+
+
+def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path) -> None:
+    text = reported.report.verdict.text
+    assert text.startswith("NOT DECIDED: whether 1 of 8 channels are below data sheet")
+    assert f"There is no noise estimate for {HOSTILE}.Y" in text
+    assert "Record for" not in text  # time does not bring the dead channel back
+    (table,) = tables(reported.report, "Verdict")
+    rows = {row[0]: row for row in table.rows}
+    assert rows["A.X"][-1] == "PASS"
+    margin, low, high = re.findall(r"[+−-][\d.]+", rows["A.X"][5])
+    assert float(margin) == pytest.approx(10, abs=2)
+    assert 0 < float(low) < float(margin) < float(high)
+    assert rows[f"{HOSTILE}.Y"][-1] == "no estimate"
+
+    failing = record(tmp_path / "noisy.h5", psd=5e-11)
+    result = CliRunner().invoke(app, ["report", str(failing), "--out", str(tmp_path / "n.html")])
+    assert result.exit_code == 1
+    assert "FAIL: 7 of 8 channels above data sheet" in " ".join(result.stdout.split())
+    assert "FAIL" in (tmp_path / "n.html").read_text(encoding="utf-8")
+
+
+def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
+    reported: Reported,
+) -> None:
+    settings = replace(reported.settings, methods=("all",))
+    report = report_of(
+        estimate([reported.recording], settings), settings, sources([reported.recording])
+    )
+    table, _, methods = tables(report, "Self-noise")
+    assert "by the three-sensor method" in table.title
+    assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
+    assert report.verdict.text == reported.report.verdict.text
+
+
+def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
+    (table,) = tables(reported.report, "What happened")
+    assert [row[0] for row in table.rows] == sorted(row[0] for row in table.rows)
+    assert len(table.rows) == 5  # 240 events of four sensors and two gaps
+    words = [row[3] for row in table.rows]
+    assert sum("a frame was damaged (60 of this kind, until 01:00:59)" in w for w in words) == 4
+    (gaps,) = [row for row in table.rows if row[2] == "gap"]
+    assert gaps[3].startswith("about 130 samples missing (1.3 s): cable pulled (2 of this kind")
+    assert gaps[0] == "2016-07-14 01:00:09"  # the block before sample 1000 was received
+    assert "segments excluded where a sensor has a gap" in " ".join(texts_of(reported.report))
+
+
+def test_alignment_clocks_and_model_test_are_there(reported: Reported) -> None:
+    text = Words(reported.page).text
+    assert "Alignment of the sensors" in text
+    assert "Model test" in text
+    (clocks,) = tables(reported.report, "Clocks")
+    assert [row[0] for row in clocks.rows] == ["A", "B", "C", HOSTILE]
+
+
+def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
+    recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
+    record(recording, before_end=lambda: shutil.copyfile(recording, copy))
+    snapshot = estimate([copy], reported.settings)
+    report = report_of(snapshot, reported.settings, sources([copy]))
+    assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
+    assert hashlib.sha256(copy.read_bytes()).hexdigest() in texts_of(report)
+
+
+def test_where_the_motion_is_not_shared_the_report_says_so(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    motion, other = 4000 * rng.standard_normal((2, N_SAMPLES, 1))
+    source = tmp_path / "a.npz"
+    sensors = {
+        name: (motion + share * other + 100 * rng.standard_normal((N_SAMPLES, 1)))
+        for name, share in (("A", 0.0), ("B", 0.2), ("C", 0.0), ("D", 0.2))
+    }
+    np.savez(source, sampling_rate=RATE, **sensors)
+    runner = CliRunner()
+    recording = str(tmp_path / "a.h5")
+    assert runner.invoke(app, ["import", str(source), "--out", recording]).exit_code == 0
+    result = runner.invoke(app, ["report", recording, "--segment", "1s"])
+    assert result.exit_code == 0, result.output
+    text = Words((tmp_path / "a.html").read_text(encoding="utf-8")).text
+    assert re.search(r"The test fails at [\d.]+–50 Hz \(statistic \d+", text)
+    assert "No verdict: the bench file has no limits." in text
+
+
+def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
+    seconds = np.arange(0.0, 100.0)
+    delay = 3e-3 - 20e-6 * seconds
+    wander = 2e-6 * np.sin(seconds / 10)
+    delay[60:] += 0.4
+    left = without_line(seconds, delay + wander)
+    assert np.flatnonzero(np.isnan(left)).tolist() == [60]
+    line = np.polyfit(seconds, wander, 1)
+    assert np.nanmax(np.abs(left)) < 4e-6
+    whole = without_line(seconds, 3e-3 - 20e-6 * seconds + wander)
+    np.testing.assert_allclose(whole, wander - np.polyval(line, seconds), atol=1e-12)
+
+
+def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> None:
+    other = record(tmp_path / "second.h5")
+    files = [reported.recording, other]
+    snapshot = estimate(files, reported.settings)
+    report = report_of(snapshot, reported.settings, sources(files))
+    text = " ".join(texts_of(report))
+    assert "night.h5" in text
+    assert "second.h5" in text
+    assert f"{2 * reported.snapshot.n_segments} segments used" in text

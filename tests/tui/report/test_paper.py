@@ -1,0 +1,134 @@
+"""The report as PDF: the same each time, tagged, and nothing outside its pages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from pypdf import PdfReader
+from pypdf.generic import Destination
+from typer.testing import CliRunner
+
+from daq.estimation.estimation import estimate
+from daq.results.sources import sources
+from tests.tui.night_recording import RATE
+from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
+from tui.cli.main import app
+from tui.report.contents import report_of
+from tui.report.parts import Facts, Paragraph, Plot, Section, Table
+from tui.report.writing import write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pypdf import PageObject
+
+
+@pytest.mark.long
+def test_the_same_recording_gives_the_same_files(
+    reported: Reported, paper: PdfReader, tmp_path: Path
+) -> None:
+    """As PDF; that pages are the same, the test of the demo's reports shows."""
+    write(
+        reported.snapshot, tmp_path / "a.pdf", recordings=[reported.recording],
+        settings=reported.settings,
+    )  # fmt: skip
+    assert paper.stream is not None
+    paper.stream.seek(0)
+    assert (tmp_path / "a.pdf").read_bytes() == paper.stream.read()
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF-")
+
+
+def test_the_same_report_gives_the_same_paper(reported: Reported) -> None:
+    """With one plot; the long test above writes all of them."""
+    section = next(s for s in reported.report.sections if any(isinstance(p, Plot) for p in s.parts))
+    plot = next(part for part in section.parts if isinstance(part, Plot))
+    report = replace(reported.report, sections=(replace(section, parts=(plot,)),))
+    one, other = paper_of(report), paper_of(report)
+    assert one.getvalue() == other.getvalue()
+
+
+def places_of(page: PageObject) -> list[tuple[float, float]]:
+    """Return where the texts of a page begin, in points."""
+    places: list[tuple[float, float]] = []
+
+    def note(text: str, _matrix: object, place: list[float], _font: object, _size: float) -> None:
+        if text.strip():
+            places.append((place[4], place[5]))
+
+    page.extract_text(visitor_text=note)
+    return places
+
+
+@pytest.mark.long
+def test_paper_says_all_that_the_page_says(reported: Reported, paper: PdfReader) -> None:
+    whole = "".join(page.extract_text() for page in paper.pages)
+    letters = "".join(whole.split())
+    page = "".join(Words(reported.page).text.split())
+    for word in texts_of(reported.report):
+        assert "".join(word.split()) in page
+        for piece in word.split():  # lines are broken between words, cells stand side by side
+            assert piece in letters
+    assert f"{len(paper.pages)} / {len(paper.pages)}" in whole
+
+
+def test_paper_has_a_title_an_outline_and_tags(reported: Reported, paper: PdfReader) -> None:
+    report = reported.report
+    assert paper.metadata is not None
+    assert paper.metadata.title == f"{report.title}: {report.subtitle}"
+    titles = [section.title for section in report.sections]
+    outline = [str(entry.title) for entry in paper.outline if isinstance(entry, Destination)]
+    assert outline == [f"{number}   {title}" for number, title in enumerate(titles, start=1)]
+    root: Any = paper.root_object
+    assert root["/Lang"] == "en"
+    assert root["/MarkInfo"]["/Marked"]
+    (document,) = root["/StructTreeRoot"]["/K"]
+    tags = [entry.get_object() for entry in document.get_object()["/K"]]
+    assert [str(tag["/T"]) for tag in tags if tag["/S"] == "/H1"] == [report.title]
+    assert [str(tag["/T"]) for tag in tags if tag["/S"] == "/H2"] == outline
+    plots = [part for each in report.sections for part in each.parts if isinstance(part, Plot)]
+    assert [str(tag["/Alt"]) for tag in tags if tag["/S"] == "/Figure"] == [p.alt for p in plots]
+
+
+def test_signatures_are_not_alone_on_their_page(reported: Reported) -> None:
+    """However much of the last page but one is filled."""
+    test, *_, settings, signed = reported.report.sections
+    for n_lines in range(4, 40, 9):
+        filling = Section("Filling", tuple(Paragraph(f"line {n}") for n in range(n_lines)))
+        report = replace(reported.report, sections=(test, filling, settings, signed))
+        *_, last = PdfReader(paper_of(report)).pages
+        text = last.extract_text()
+        assert "Signature" in text
+        assert "Settings of the estimate" in text
+
+
+def test_a_text_of_any_length_fits_on_pages(reported: Reported) -> None:
+    long = Table(("what", "text"), (("a", "x" * 9000), ("b", "word " * 3000)), left=frozenset({1}))
+    section = Section("Long", (long, Paragraph("y" * 9000), Facts((("name", "z " * 9000),))))
+    report = replace(reported.report, sections=(section, *reported.report.sections[-2:]))
+    text = "".join(page.extract_text() for page in PdfReader(paper_of(report)).pages)
+    assert text.count("…") == 4  # each is cut, and says so
+
+
+@pytest.mark.long
+def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    motion = 4000 * rng.standard_normal((2000, 1))
+    source, recording = tmp_path / "a.npz", tmp_path / "a.h5"
+    sensors = {f"S{i:02}": motion + 100 * rng.standard_normal((2000, 1)) for i in range(15)}
+    np.savez(source, sampling_rate=RATE, **sensors)  # type: ignore[arg-type]  # names of arrays
+    runner = CliRunner()
+    assert runner.invoke(app, ["import", str(source), "--out", str(recording)]).exit_code == 0
+    snapshot = estimate([recording], reported.settings)
+    report = report_of(snapshot, reported.settings, sources([recording]))
+    plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
+    assert (
+        sum(len(plot.panels) for plot in plots) == 15 + 15 + 1
+    )  # spectra, Allan deviations, the model test
+    for page in PdfReader(paper_of(report)).pages:
+        places = places_of(page)
+        assert places
+        right, top = float(page.mediabox.right), float(page.mediabox.top)
+        assert all(0 < x < right and 0 < y < top for x, y in places)

@@ -1,0 +1,76 @@
+"""Report files: where they go, when they are preliminary, and none that is incomplete."""
+
+from __future__ import annotations
+
+import re
+import resource
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from daq.bench.masks.mask_file import masks_named
+from daq.drivers.bench_file import load
+from tests.tui.night_recording import record
+from tests.tui.report.written_report import ROOT, Reported, Words
+from tui.cli.main import app
+from tui.commands.tui_controls import BenchControls
+from tui.report.writing import ReportError, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.long
+def test_the_demo_s_reports_outlive_its_folder_and_have_its_noise_models(
+    reported: Reported, tmp_path: Path
+) -> None:
+    settings, path = reported.settings, ROOT / "tui" / "resources" / "demo.toml"
+    models = masks_named("nhnm")
+    controls = BenchControls(path, load(path), settings, reports=tmp_path, models=models)
+    out = controls.report(reported.recording, reported.snapshot, settings)
+    assert out == tmp_path / "night.html"
+    page = out.read_text(encoding="utf-8")
+    assert "NHNM" in page
+    assert "NHNM" not in reported.page
+
+
+def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
+    recording, out = tmp_path / "live.h5", tmp_path / "live.html"
+
+    def report() -> None:
+        result = CliRunner().invoke(app, ["report", str(recording)])
+        assert result.exit_code == 4, result.output  # a channel is dead
+
+    record(recording, before_end=report)
+    text = Words(out.read_text(encoding="utf-8")).text
+    assert "Still running, preliminary. NOT DECIDED" in text
+    assert "none: the file is still being written" in text
+
+
+def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
+    out = tmp_path / "old.html"
+    out.write_text("the old one", encoding="utf-8")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))  # as a disk that is full
+    try:
+        with pytest.raises(ReportError, match=r"old.html: the report cannot be written \(File too"):
+            write(
+                reported.snapshot, out, recordings=[reported.recording], settings=reported.settings
+            )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert out.read_text(encoding="utf-8") == "the old one"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize(
+    ("out", "said"), [("report.doc", r"\.html or \.pdf"), ("none/report.pdf", "no folder")]
+)
+def test_a_wrong_name_is_refused_before_anything_is_done(
+    reported: Reported, out: str, said: str, tmp_path: Path
+) -> None:
+    arguments = ["report", str(reported.recording), "--out", str(tmp_path / out)]
+    result = CliRunner().invoke(app, arguments, terminal_width=300)
+    assert result.exit_code == 2
+    assert re.search(said, result.stderr)

@@ -1,0 +1,100 @@
+"""A recording, its report, and the texts of both forms."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from functools import cached_property
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tui.report.page import page
+from tui.report.paper import write_paper
+from tui.report.parts import Facts, Items, Paragraph, Plot, Report, Table
+
+if TYPE_CHECKING:
+    from daq.estimation.settings import Settings
+    from daq.estimation.snapshot import Snapshot
+    from tui.report.parts import Part
+
+
+ROOT = Path(__file__).parents[3]
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A recording, its estimate, and the report of both."""
+
+    recording: Path
+    snapshot: Snapshot
+    settings: Settings
+    report: Report
+
+    @cached_property
+    def page(self) -> str:
+        """The report as a page, made when a test first reads it."""
+        return page(self.report)
+
+
+class Words(HTMLParser):
+    """The text of a page, and the tags it is made of."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note a tag."""
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+    def handle_data(self, data: str) -> None:
+        """Note text."""
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        """All of it, white space made even."""
+        return " ".join("".join(self.words).split())
+
+
+def words_of(part: Part) -> list[str]:
+    """Every text in a part of a report."""
+    match part:
+        case Paragraph():
+            return [part.text]
+        case Items():
+            return [entry.text for entry in part.entries]
+        case Facts():
+            return [word for row in part.rows for word in row]
+        case Table():
+            return [part.title, *part.header, *(word for row in part.rows for word in row)]
+        case Plot():
+            return [part.title]
+        case _:
+            return list(part.labels)
+
+
+def texts_of(report: Report) -> list[str]:
+    """Every text in a report."""
+    words = [report.title, report.subtitle, report.verdict.text]
+    for section in report.sections:
+        words += [section.title, *(word for part in section.parts for word in words_of(part))]
+    return [" ".join(word.split()) for word in words if word]
+
+
+def tables(report: Report, section: str) -> list[Table]:
+    """Return the tables of a section."""
+    (found,) = [each for each in report.sections if each.title.startswith(section)]
+    return [part for part in found.parts if isinstance(part, Table)]
+
+
+def paper_of(report: Report) -> io.BytesIO:
+    """Write a report as PDF."""
+    file = io.BytesIO()
+    write_paper(report, file)
+    return file
