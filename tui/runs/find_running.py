@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
-from daq.errors import HuddleError
+from daq.errors import HuddleError, RecordingError
 from daq.recording.control import ask
 from daq.recording.reader import Recording
+from daq.recording.storage.names import continuation_names, continued_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,10 +29,30 @@ def running_recording(bench: Bench) -> Path | None:
 
 
 def first_part(path: Path) -> Path:
-    """Return the recording that this one continues after a disk error; itself, if it does not."""
+    """Return the first of the recordings that this one continues after disk errors.
+
+    Itself, if it continues none, or if the one that it continues is no longer in its folder.
+    """
     with Recording.open(path) as recording:
-        first = path.with_stem(path.stem.rpartition("-")[0])  # as in `continuation_names`
-        return first if recording.continues and first.exists() else path
+        continues = recording.continues
+    start = continued_name(path)
+    if not continues or start is None:
+        return path
+    names = takewhile(lambda name: name != path, continuation_names(start))
+    parts = dict(_part(name) for name in (start, *names))
+    first = path
+    while continues in parts:
+        first, continues = parts.pop(continues)
+    return first
+
+
+def _part(path: Path) -> tuple[str, tuple[Path, str]]:
+    """Return the run_id of a recording, with its path and the run_id that it continues."""
+    try:
+        with Recording.open(path) as recording:
+            return recording.run_id, (path, recording.continues)
+    except RecordingError:  # there is none, or another file has such a name
+        return "", (path, "")
 
 
 def _runs(path: Path, name: str) -> bool:

@@ -80,6 +80,13 @@ def continuation_names(path: Path) -> Iterator[Path]:
     return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
 
 
+def continued_name(path: Path) -> Path | None:
+    """Return the name of which `continuation_names` yields this one, or None if of no name."""
+    stem, _, number = path.stem.rpartition("-")
+    is_continuation = stem and re.fullmatch("[1-9][0-9]*", number) and int(number) > 1
+    return path.with_stem(stem) if is_continuation else None
+
+
 def remove_leftovers(path: Path) -> None:
     """Remove temporary files left by killed writers of this recording."""
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*new"):

@@ -16,7 +16,6 @@ from daq.results.store import store_results
 from tests.tui.example_snapshot import SETTINGS, demo_bench, growing, made_snapshot
 from tui.application.recordings_view.rows import about, verdict
 from tui.runs.catalogue import catalogue, delete_recording
-from tui.runs.find_running import first_part
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +66,6 @@ def test_a_recording_in_parts_names_the_other_files(tmp_path: Path) -> None:
     assert [verdict(each).plain for each in (beginning, second)] == ["in parts", "part"]
     assert "goes on in run-2.h5" in about(beginning).plain
     assert "open that one for the result of all parts" in about(second).plain
-    assert [first_part(each.path) for each in (second, beginning)] == [beginning.path] * 2
 
 
 def test_files_that_have_not_changed_are_not_read_again(
