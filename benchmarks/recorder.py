@@ -94,9 +94,9 @@ async def play(n_sensors: int, sampling_rate: float) -> None:
         spec = DeviceSpec((name,), "epson", "tcp", sampling_rate, {name: channels})
         line = Line(EpsonDevice(spec, source), "tcp")
         one = serve.Served(line, clock, LineFaults((), name, begin=0.0), lambda *_: None)
-        await one.wire.open()
+        await one.port.open()
         served.append(one)
-    print(json.dumps([one.wire.address for one in served]), flush=True)
+    print(json.dumps([one.port.address for one in served]), flush=True)
     await asyncio.to_thread(sys.stdin.read)
     for one in served:
         await one.close()

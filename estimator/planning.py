@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 BOUND = "cramer-rao-bound"
 REFERENCE = 1e6  # number of averages at which the scatter of a method is evaluated
-FOUND = 30.0
+MIN_COHERENT_AVERAGES = 30.0
 """Averages times the coherence of two sensors in the direction of its minimum, from which the
 c.o.v. is as predicted: in simulations it is 5 % higher at 30, and 20 to 200 % higher at 8."""
 ROUNDING = 1e-24  # coherence that is zero within rounding
@@ -308,7 +308,7 @@ def _averages_to_find(method: str, csm: ComplexArray, dims: tuple[int, ...]) -> 
         others = [[g for pair, g in pairs.items() if i not in pair] for i in range(len(dims))]
         found = np.stack([over_pairs(each, axis=0) for each in others], axis=1)[:, sensor]
     there = found > ROUNDING
-    return np.where(there, FOUND / np.where(there, found, 1.0), np.nan)
+    return np.where(there, MIN_COHERENT_AVERAGES / np.where(there, found, 1.0), np.nan)
 
 
 def segments_needed(window: FloatArray, hop: int, n_effective: float) -> int:

@@ -12,7 +12,7 @@ RELEASED = datetime(2026, 11, 1, tzinfo=UTC)
 """Release of this software; a correct clock shows no earlier time."""
 JUMP = timedelta(hours=1)
 """Difference between the system's clock and elapsed time that counts as a jump of the clock."""
-DISTRUST = timedelta(days=1)
+REMOVAL_DELAY = timedelta(days=1)
 """Time after a jump in which nothing is removed."""
 
 
@@ -42,9 +42,9 @@ class ClockTrust:
             self._jumped = at
         if now < RELEASED:
             return f"the system's clock shows {now:%Y-%m-%d}, before this software was released"
-        if self._jumped is not None and at - self._jumped < DISTRUST.total_seconds():
+        if self._jumped is not None and at - self._jumped < REMOVAL_DELAY.total_seconds():
             return (
                 f"the system's clock was set by more than {JUMP.total_seconds() / 3600:.0f} h"
-                f" less than {DISTRUST.days} d ago, or the computer was asleep"
+                f" less than {REMOVAL_DELAY.days} d ago, or the computer was asleep"
             )
         return ""

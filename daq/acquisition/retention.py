@@ -9,7 +9,7 @@ from daq.recording.storage.journal import journal_path
 if TYPE_CHECKING:
     from pathlib import Path
 
-OF_A_RUN = (".json", ".csv", ".html", ".pdf")
+RUN_SUFFIXES = (".json", ".csv", ".html", ".pdf")
 """Suffixes of the other files of a recording, which are also removed."""
 
 
@@ -21,6 +21,6 @@ def remove_run(path: Path) -> None:
     OSError
         If a file cannot be removed.
     """
-    for other in (journal_path(path), *(path.with_suffix(suffix) for suffix in OF_A_RUN)):
+    for other in (journal_path(path), *(path.with_suffix(suffix) for suffix in RUN_SUFFIXES)):
         other.unlink(missing_ok=True)
     path.unlink(missing_ok=True)

@@ -45,7 +45,7 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PlacedBlock:
     """A block in the index of the recording, and the gap before it."""
 
     block: Block | None
@@ -81,7 +81,7 @@ class SampleIndexer:
         """
         self._reason = reason
 
-    def place(self, block: Block) -> Placed:
+    def place(self, block: Block) -> PlacedBlock:
         """Return a block in the index of the recording.
 
         Parameters
@@ -116,12 +116,12 @@ class SampleIndexer:
         missing = round(elapsed / _NS * self._rate)
         return Gap(self.next_sample, missing, reason, estimated=True) if missing > 0 else None
 
-    def _placed(self, block: Block, reason: str, *, estimated: bool) -> Placed:
+    def _placed(self, block: Block, reason: str, *, estimated: bool) -> PlacedBlock:
         first = block.first_sample + (self._offset or 0)
         missing = first - self.next_sample
         repeated = min(max(0, -missing), block.n_samples)
         if repeated == block.n_samples:
-            return Placed(None, repeated=repeated)
+            return PlacedBlock(None, repeated=repeated)
         gap = Gap(self.next_sample, missing, reason, estimated) if missing > 0 else None
         placed = replace(
             block,
@@ -133,7 +133,7 @@ class SampleIndexer:
         )
         self.next_sample = placed.end_sample
         self._last = placed
-        return Placed(placed, gap, repeated)
+        return PlacedBlock(placed, gap, repeated)
 
     def _missing_by_time(self, last: Block, block: Block) -> tuple[int, bool]:
         """Return the number of samples between two blocks, and whether it is an estimate."""

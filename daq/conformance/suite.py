@@ -44,7 +44,7 @@ LIMIT = 60.0
 """Seconds that any test may take."""
 PAUSE = 2.0
 """Seconds for which a connection pauses."""
-CALM = {EventKind.CONNECTED, EventKind.STATUS}
+NORMAL_EVENTS = {EventKind.CONNECTED, EventKind.STATUS}
 """Kinds of events of a device that nothing is wrong with."""
 SOCKET = "socket://"
 
@@ -196,7 +196,7 @@ def check_blocks(
     driver: DriverType, sensors: Sequence[Sensor], found: Sequence[Block | Event]
 ) -> None:
     """See that the blocks of a session follow one another, and that nothing was wrong."""
-    wrong = [item for item in found if isinstance(item, Event) and item.kind not in CALM]
+    wrong = [item for item in found if isinstance(item, Event) and item.kind not in NORMAL_EVENTS]
     assert not wrong
     for sensor in sensors:
         blocks = [b for b in found if isinstance(b, Block) and b.sensor == sensor.name]

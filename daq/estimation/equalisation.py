@@ -3,9 +3,9 @@
 Theory of operation
 -------------------
 Filters come from the poles and zeros of the bench file, from the responses that the averages show,
-or from both in turn. They are found from the first `SETTLED` segments of each recording, in a few
-rounds: each shows what the filters so far have left. So an estimate is a function of its files,
-whether these were followed while they grew or not.
+or from both in turn. They are found from the first `FILTER_SEGMENTS` segments of each recording, in
+a few rounds: each shows what the filters so far have left. So an estimate is a function of its
+files, whether these were followed while they grew or not.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
 
-SETTLED = 240
+FILTER_SEGMENTS = 240
 """Segments of each recording, from its start, that filters are found from."""
 ROUNDS = 3
 _METHOD = "three-sensor"  # whose noise the leakage is compared with: it takes little time

@@ -24,7 +24,7 @@ import numpy as np
 
 from daq.bench.units import canonical
 from daq.errors import CannotAlignError
-from daq.estimation.equalisation import ROUNDS, SETTLED, Equalisation
+from daq.estimation.equalisation import FILTER_SEGMENTS, ROUNDS, Equalisation
 from daq.estimation.noise_estimates import averages
 from daq.estimation.recording_set import (
     check_same,
@@ -291,7 +291,9 @@ class Estimation:
 
     def _equalise_growing(self) -> None:
         """Find filters from the segments so far; for good once there are enough of them."""
-        enough = all(each.n_seen >= SETTLED and each.aligned.is_exact for each in self._passes)
+        enough = all(
+            each.n_seen >= FILTER_SEGMENTS and each.aligned.is_exact for each in self._passes
+        )
         if enough:
             self._settle()
         elif self._equalisation.revise(averages(self._passes)):
@@ -304,9 +306,9 @@ class Estimation:
         """Find filters from the first segments: the same from a growing and a finished file."""
         self._equalisation.reset()
         for each in self._passes:
-            if each.filters is not self._equalisation.filters or each.n_seen > SETTLED:
+            if each.filters is not self._equalisation.filters or each.n_seen > FILTER_SEGMENTS:
                 each.equalise(self._equalisation.filters)
-            each.advance(progress, most=SETTLED)
+            each.advance(progress, most=FILTER_SEGMENTS)
         self._equalise_in_rounds(progress)
 
     def _equalise_in_rounds(self, progress: Callable[[int], None] | None) -> None:
@@ -315,7 +317,7 @@ class Estimation:
                 break
             self._filter()
             for each in self._passes:
-                each.advance(progress, most=SETTLED)
+                each.advance(progress, most=FILTER_SEGMENTS)
 
     def snapshot(self) -> Snapshot:
         """Return the estimate from the segments taken so far."""

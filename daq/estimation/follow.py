@@ -286,7 +286,7 @@ class _RemoteRecorder:
 
     @property
     def ended(self) -> bool:
-        if locking.IS_SEEN:
+        if locking.LOCKS_ARE_VISIBLE:
             return not locking.is_being_written(self._recording.path)
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from estimator.self_noise.band_means import FloatArray
 
-NOTHING, HARMLESS, MATTERS = 0.001, 0.01, 0.05
+NO_EFFECT, NEGLIGIBLE_EFFECT, SMALL_EFFECT = 0.001, 0.01, 0.05
 """Share of the noise that comes from the clocks: below it nothing, negligible, small."""
 
 
@@ -72,7 +72,7 @@ def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]
 
 def grade(share: float) -> Literal["good", "doubtful", "bad"]:
     """Return how bad it is that clocks make up this share of the noise."""
-    return "good" if share < HARMLESS else "doubtful" if share < MATTERS else "bad"
+    return "good" if share < NEGLIGIBLE_EFFECT else "doubtful" if share < SMALL_EFFECT else "bad"
 
 
 def residuals(snapshot: Snapshot) -> dict[str, float]:

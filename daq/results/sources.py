@@ -26,7 +26,7 @@ State: TypeAlias = Literal["closed", "growing", "continued", "left open"]
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class LoggedEvent:
     """An event or a gap: when (UTC), of which sensor ("" for the run), what kind, and in words."""
 
     utc_ns: int
@@ -67,7 +67,7 @@ class Source:
         recorder that was killed, and not repaired since.
     bench : Bench or None
     sensors : tuple of RecordedSensor
-    happenings : tuple of Happening
+    happenings : tuple of LoggedEvent
         In time order.
     """
 
@@ -83,7 +83,7 @@ class Source:
     state: State
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
-    happenings: tuple[Happening, ...]
+    happenings: tuple[LoggedEvent, ...]
 
 
 def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
@@ -111,7 +111,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
         default=created,
     )
     happenings = [
-        Happening(event.received.utc_ns, event.sensor, event.kind, event.text)
+        LoggedEvent(event.received.utc_ns, event.sensor, event.kind, event.text)
         for event in recording.events
     ]
     for sensor in recording.sensors:
@@ -149,7 +149,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
     )
 
 
-def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:
+def _gaps(sensor: SensorRecord, created_ns: int) -> list[LoggedEvent]:
     """Return gaps at the time at which the block before each was received."""
     gaps, received_ns = sensor.gaps, sensor.blocks["utc_ns"]
     before = np.searchsorted(sensor.blocks["first_sample"], gaps["first_sample"], side="left") - 1
@@ -162,7 +162,7 @@ def _gaps(sensor: SensorRecord, created_ns: int) -> list[Happening]:
             f" ({missing / sensor.sampling_rate:.3g} s): {gap['reason'].decode(errors='replace')}"
         )
         at = int(received_ns[place]) if place >= 0 else created_ns
-        found.append(Happening(at, sensor.name, "gap", text))
+        found.append(LoggedEvent(at, sensor.name, "gap", text))
     return found
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-AGREE = 0.3
+MIN_SHARED = 0.3
 """Share of common motion from which two sensors agree."""
 NONE = 0.1
 """Share of common motion, relative to that of the other sensors, below which a sensor has none."""
@@ -40,7 +40,7 @@ LESS = 0.9
 """Share of common motion, relative to that of others, above which a sensor left for no part."""
 ROOT_BYTES = 1 << 26
 """Bytes of matrix roots that are kept: 64 MB."""
-GROWN = 4.0
+NOISE_INCREASE = 4.0
 """Factor from which on a sensor records more besides the motion of the others."""
 
 
@@ -162,14 +162,14 @@ def outsiders(
         Number of frequencies of the band.
     """
     n_sensors = len(share)
-    agree = share >= AGREE
+    agree = share >= MIN_SHARED
     groups = [tuple(np.flatnonzero(row).tolist()) for row in agree | np.eye(n_sensors, dtype=bool)]
     group = max(groups, key=len, default=())
     if len(group) < 2 or 2 * len(group) <= n_sensors:  # no majority
         return
     least = min(share[j, k] for j, k in combinations(group, 2))
     error = ERRORS / (n_effective * np.sqrt(n_frequencies))
-    if least < AGREE:
+    if least < MIN_SHARED:
         return
     for i in range(n_sensors):
         if i not in group and max(share[i, j] for j in group) < NONE * least + error:
@@ -185,7 +185,7 @@ def may_have_moved(share: FloatArray) -> bool:
     for sensor in range(len(share)):
         others = [each for each in range(len(share)) if each != sensor]
         most = max((share[j, k] for j, k in combinations(others, 2)), default=0.0)
-        if most >= AGREE and min(share[sensor, each] for each in others) < LESS * most:
+        if most >= MIN_SHARED and min(share[sensor, each] for each in others) < LESS * most:
             return True
     return False
 
@@ -250,9 +250,11 @@ def _is_moved(sensor: int, looks: list[list[_Look]]) -> bool:
             before = [
                 other[number].besides(sensor, others)
                 for other in looks
-                if min(other[number].share[sensor, each] for each in others) >= AGREE
+                if min(other[number].share[sensor, each] for each in others) >= MIN_SHARED
             ]
-            if before and part[number].besides(sensor, others) > GROWN * float(np.median(before)):
+            if before and part[number].besides(sensor, others) > NOISE_INCREASE * float(
+                np.median(before)
+            ):
                 return True
     return False
 
@@ -260,4 +262,4 @@ def _is_moved(sensor: int, looks: list[list[_Look]]) -> bool:
 def _agreeing(share: FloatArray, sensor: int) -> bool:
     """Return whether two sensors besides this one agree."""
     others = [each for each in range(len(share)) if each != sensor]
-    return any(share[j, k] >= AGREE for j, k in combinations(others, 2))
+    return any(share[j, k] >= MIN_SHARED for j, k in combinations(others, 2))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 UNEXPLAINED = 1e-3
 """Smallest p value of the residual after removal of the found pairs; below it none is reported."""
-SEEN = 3.0
+BAND_SIGNIFICANCE = 3.0
 """Standard deviations from which a band shows shared noise of pairs already found."""
 OF_BANDS = 0.5
 """Level of all single bands together, over that of all frequencies."""
@@ -46,7 +46,7 @@ MAX_BINS = 16
 """Maximum number of frequencies for the effect on the estimates."""
 MAX_SHIFT = 5.0
 """Largest reported bias, in ln of the PSD: the theory is of first order."""
-AS_WELL = 9.0
+AMBIGUITY = 9.0
 """Decrease of the statistic by another pair, short of that by the named one, that leaves open which
 of them shares noise: the likelihood ratio is then at most 90."""
 MANY = 1e9
@@ -238,7 +238,7 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
     if unexplained < UNEXPLAINED and not 0 < left_over < SMALL_PART * statistic:
         return None
     amount, error = scores.amounts(chosen)
-    return chosen[np.abs(amount) > SEEN * error]
+    return chosen[np.abs(amount) > BAND_SIGNIFICANCE * error]
 
 
 def _alternatives(scores: Scores, chosen: IntArray, step: int) -> IntArray:
@@ -246,7 +246,7 @@ def _alternatives(scores: Scores, chosen: IntArray, step: int) -> IntArray:
     z = scores.without(np.delete(chosen, step)).z
     own = float(z[chosen[step]] ** 2)
     z[chosen] = 0.0
-    return np.flatnonzero((z**2 > own - AS_WELL) & (z**2 > AS_WELL))
+    return np.flatnonzero((z**2 > own - AMBIGUITY) & (z**2 > AMBIGUITY))
 
 
 def _in_place(chosen: IntArray, step: int, other: int) -> IntArray:
@@ -275,7 +275,9 @@ def _showing(scores: Mapping[int, Scores], chosen: IntArray) -> tuple[int, ...]:
     """Return the bands with the shared noise: all, unless their amounts differ."""
     if _is_steady(list(scores.values()), chosen):
         return tuple(scores)
-    showing = tuple(n for n, each in scores.items() if np.any(np.abs(each.z[chosen]) > SEEN))
+    showing = tuple(
+        n for n, each in scores.items() if np.any(np.abs(each.z[chosen]) > BAND_SIGNIFICANCE)
+    )
     return showing or tuple(scores)
 
 

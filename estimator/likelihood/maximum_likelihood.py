@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-BEYOND = 2
+EXTRA_FACTORS = 2
 """Additional factors covered by the standard error if there are more factors than usual."""
 
 
@@ -121,7 +121,10 @@ def maximum_likelihood(
         else:
             fits = _expecting(
                 matrix[rows],
-                (int(q), int(min(q + BEYOND, max_factors(p - absent[rows].sum(axis=1)).min()))),
+                (
+                    int(q),
+                    int(min(q + EXTRA_FACTORS, max_factors(p - absent[rows].sum(axis=1)).min())),
+                ),
                 expected_noise(noise_psd * given.psd, factors <= max(dims), kind)[rows]
                 / given.psd[rows],
                 kind=kind,

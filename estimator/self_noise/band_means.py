@@ -29,7 +29,7 @@ N_LAGS = 8
 NORMAL_95 = 1.959963984540054
 CERTAIN = 4.0
 """Standard deviations above zero from which a mean has a log-normal interval."""
-LEAKY = 0.4
+LEAKAGE_COV = 0.4
 """c.o.v. above which leaking motion dominates the scatter of a mean, which is then not that of a
 PSD."""
 
@@ -183,7 +183,7 @@ def interval_of_cov(
         more often than a log-normal variable.
     """
     student = quantile + (quantile**3 + quantile) / (4 * np.maximum(averages, 1.0))
-    like_psd = np.minimum(cov, LEAKY)
+    like_psd = np.minimum(cov, LEAKAGE_COV)
     root = 1 - like_psd**2 / 9 - quantile * like_psd / 3
     with np.errstate(invalid="ignore", divide="ignore"):
         chi_square = np.where(root > 0, 1 / root**3, np.inf)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 NEIGHBOURS = 16
 """Number of sampled frequencies on either side whose variances are averaged."""
-DENSE = 32
+DENSE_BINS = 32
 """Below this bin all are sampled, above it one in bin / 32: 22 per octave."""
 EXCLUDED_BINS = 1
 """Number of excluded bins on either side of a frequency: they share its scatter."""
@@ -111,7 +111,7 @@ def sampled(n_freqs: int) -> IntArray:
     bins, at = [], 0
     while at < n_freqs:
         bins.append(at)
-        at += max(1, at // DENSE)
+        at += max(1, at // DENSE_BINS)
     return np.array(bins, dtype=np.int64)
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 MAX_NEGATIVE = 0.9
 """Largest magnitude of a negative estimate, as a fraction of the power."""
-QUIETER = 0.2
+MAX_NOISE_RATIO = 0.2
 """Maximum noise of the target, as a fraction of the second-best partner's residuals."""
 MIN_EIGENVALUE = 1e-12
 """Smallest usable eigenvalue of the normal matrix, as a fraction of the largest."""
@@ -130,7 +130,7 @@ def quiet_sensor_noise(
     noise, error = regression @ score, np.sqrt(np.diag(covariance))
     largest = np.maximum(noise + quantile * error, 0.0)
     share = [float((each.real.diagonal(axis1=1, axis2=2) @ largest).mean()) for each in seen]
-    if sorted(s / len(other) for s, other in zip(share, others, strict=True))[1] > QUIETER:
+    if sorted(s / len(other) for s, other in zip(share, others, strict=True))[1] > MAX_NOISE_RATIO:
         return unknown, unknown, unknown
     # the solution is psi (1 + psi / motion), where the motion is the power minus psi
     level = 1 / np.einsum("fii->fi", inverse).real.mean(axis=0)

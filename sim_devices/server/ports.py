@@ -44,7 +44,7 @@ class Listener(Protocol):
         """Handle the last reader that closed the line."""
 
 
-class Wire(Protocol):
+class DevicePort(Protocol):
     """A line as its server sees it."""
 
     address: str
@@ -338,7 +338,7 @@ class UdpServer(asyncio.DatagramProtocol):
         self._listener.disconnected()
 
 
-def make_wire(kind: Kind, listener: Listener, *, scheme: str, number: int = 0) -> Wire:
+def make_port(kind: Kind, listener: Listener, *, scheme: str, number: int = 0) -> DevicePort:
     """Return a line of this kind, not yet open; ``number`` is that of a TCP port."""
     if kind == "pty":
         return PseudoTerminal(listener)

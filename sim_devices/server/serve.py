@@ -54,7 +54,7 @@ from sim_devices.devices.interface import (
     Source,
 )
 from sim_devices.faults import Fault, LineFaults, SampleFaults, parse
-from sim_devices.server.ports import Wire, make_wire
+from sim_devices.server.ports import DevicePort, make_port
 from sim_devices.server.world_clock import WorldClock
 from sim_devices.world.scenario import Scenario
 
@@ -108,7 +108,7 @@ class Served:
         self._timer: asyncio.TimerHandle | None = None
         self._last = -math.inf
         self._down = False
-        self.wire: Wire = make_wire(line.kind, self, scheme=line.scheme, number=number)
+        self.port: DevicePort = make_port(line.kind, self, scheme=line.scheme, number=number)
 
     def connected(self) -> None:
         """Handle a reader that opened the line."""
@@ -130,7 +130,7 @@ class Served:
 
     async def close(self) -> None:
         """Remove the line."""
-        await self.wire.close()
+        await self.port.close()
         if self._timer is not None:
             self._timer.cancel()
 
@@ -139,7 +139,7 @@ class Served:
             self._put(self._faults.send(units, self._clock.now()))
 
     def _put(self, units: Sequence[bytes]) -> None:
-        self.wire.send(units)
+        self.port.send(units)
         if self._tell_sent is not None and self._is_open:
             for unit in units:
                 self._tell_sent(self._clock.now(), unit)
@@ -149,13 +149,13 @@ class Served:
         now = self._clock.now()
         if self._down and now >= self._faults.down_until:
             self._down = False
-            self.wire.restore()
+            self.port.restore()
         faults, units = self._faults.act(now)
         self._put(units)
         for fault in faults:
             if fault.kind == "disconnect" and not self._down:
                 self._down = True
-                self.wire.hang_up()
+                self.port.hang_up()
             elif isinstance(self._endpoint, Faulty):
                 self._send(self._endpoint.fault(fault.kind, now, fault.duration))
         for at, fault in self._faults.struck:
@@ -254,7 +254,7 @@ async def serve(
     try:
         for one in served:
             opened.append(one)
-            await one.wire.open()
+            await one.port.open()
         announce(_announcement(device, served))
         await ended.wait()
     finally:
@@ -287,9 +287,9 @@ def _announcement(device: DeviceSpec, served: Sequence[Served]) -> dict[str, Any
     return {
         "sensors": list(device.sensors),
         "driver": device.driver,
-        "port": served[0].wire.address,
+        "port": served[0].port.address,
         "settings": {
-            one.line.setting: int(one.wire.address.rpartition(":")[2]) for one in served[1:]
+            one.line.setting: int(one.port.address.rpartition(":")[2]) for one in served[1:]
         },
     }
 

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from sim_devices.arrays import FloatArray
     from sim_devices.world.spectrum import Spectrum
 
-ELSEWHERE = frozenset({"speed", "clock", "devices", "faults"})
+OTHER_KEYS = frozenset({"speed", "clock", "devices", "faults"})
 """Keys of the `[simulation]` table that other modules read."""
 
 
@@ -90,7 +90,7 @@ class Scenario(Table):
         ScenarioError
             With key, value and expectation of every error.
         """
-        own: dict[str, Any] = {key: value for key, value in table.items() if key not in ELSEWHERE}
+        own: dict[str, Any] = {key: value for key, value in table.items() if key not in OTHER_KEYS}
         motion = own.get("motion")
         if isinstance(motion, dict):
             own["motion"] = {"kind": "common", **motion}

@@ -24,7 +24,7 @@ from daq.recording.monitor import RecordingMonitor
 from daq.recording.reader import Recording
 from sim_devices.world.world import World
 from tests.tui.example_snapshot import demo_bench, growing
-from tui.application.following import GROWN
+from tui.application.following import CURVE_GROWTH
 from tui.application.test_view.panels import alerts, findings
 from tui.application.test_view.recent_motion import RecentMotion, with_advice
 from tui.simulation.devices import scenario_of
@@ -112,7 +112,7 @@ def seconds_to_name(case: Case, seed: int) -> tuple[float, str]:
                 status = monitor.status_with_stuck_channels()
                 lines = [line.plain for line in alerts(status, estimation.settings)]
                 if estimation.n_seen >= wanted:
-                    wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + GROWN))
+                    wanted = max(estimation.n_seen + 1, estimation.n_seen * (1 + CURVE_GROWTH))
                     snapshot = estimation.snapshot()
                     snapshot = with_advice(snapshot, recent.strangers(snapshot))
                     found = [line.plain for line in findings(snapshot, width=200)]

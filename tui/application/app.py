@@ -136,7 +136,7 @@ class HuddleApp(FollowingApp):
         def stop(really: bool | None) -> None:
             if really:
                 self.state = replace(self.state, note="stopping …")
-                self._tell(path, "stop")
+                self._control(path, "stop")
 
         self.push_screen(StopScreen(clock_time(self.now.elapsed)), stop)
 
@@ -149,20 +149,20 @@ class HuddleApp(FollowingApp):
         def mark(text: str | None) -> None:
             if text is not None:
                 ago = time.monotonic() - began
-                self._tell(path, "mark", text + (f" ({ago:.0f} s ago)" * (ago >= SLOW_REMARK)))
+                self._control(path, "mark", text + (f" ({ago:.0f} s ago)" * (ago >= SLOW_REMARK)))
 
         self.push_screen(MarkScreen(), mark)
 
     @work(thread=True, group="control")
-    def _tell(self, path: Path, what: str, text: str = "") -> None:
-        def tell() -> bool:
+    def _control(self, path: Path, what: str, text: str = "") -> None:
+        def send() -> bool:
             if what == "stop":
                 self._controls.stop(path)
             else:
                 self._controls.mark(path, text)
             return True
 
-        if self._try(tell) and what == "mark":
+        if self._try(send) and what == "mark":
             self.call_from_thread(self.notify, f"marked: {text}", timeout=3, markup=False)
 
     def action_report(self) -> None:
@@ -188,13 +188,13 @@ class HuddleApp(FollowingApp):
             report = self._try(lambda: self._controls.report(path, snapshot, settings))
         if report is None:
             return
-        tell = partial(self.call_from_thread, self.notify, f"{report}", timeout=15, markup=False)
+        notify = partial(self.call_from_thread, self.notify, f"{report}", timeout=15, markup=False)
         if is_opened and not can_open():
-            tell(title="Report written; this terminal has no browser to open it in")
+            notify(title="Report written; this terminal has no browser to open it in")
         elif is_opened:
             self.call_from_thread(self.open_url, report.resolve().as_uri())
         else:
-            tell(title="Report written")
+            notify(title="Report written")
 
     def action_save(self) -> None:
         """Write the estimate as CSV and JSON, and the screen as a picture (SVG)."""

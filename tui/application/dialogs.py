@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from textual.app import ComposeResult
 
-EVERYWHERE = (
+GLOBAL_KEYS = (
     ("1 2 3 4", "the views: bench, test, result, recordings"),
     ("ctrl+p", "all commands by name"),
     ("q", "quit, as Ctrl-C does; a recording goes on, and is found again"),
@@ -57,7 +57,7 @@ def _pairs(pairs: tuple[tuple[str, str], ...], style: str) -> Table:
 
 def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:
     """Return what each key does and what each word on the screen means."""
-    return Group(_pairs((*keys, *EVERYWHERE), "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
+    return Group(_pairs((*keys, *GLOBAL_KEYS), "bold #4cc9f0"), "", _pairs(WORDS, "bold"))
 
 
 def item(text: str) -> Table:

@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Controls
 
 Outcome = TypeVar("Outcome")
-GROWN = 0.01  # of the segments, from which on curves change to the eye
+CURVE_GROWTH = 0.01  # of the segments, from which on curves change to the eye
 DIAGNOSES = 0.4  # of the cost of estimates: five triaxial sensors are diagnosed within a minute
 
 
@@ -211,7 +211,7 @@ class FollowingApp(App[None]):
                     settings,
                     messenger,
                     cancelled=ended,
-                    growth=GROWN,
+                    growth=CURVE_GROWTH,
                     of_diagnoses=DIAGNOSES,
                     whole=plan is not None and plan.ends_by_estimate,
                 )

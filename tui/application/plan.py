@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.verdict import LimitResult, TestVerdict
 
-SURER = 1.25
+INTERVAL_FACTOR = 1.25
 """How much wider than the interval of a verdict the one is that ends a test."""
 
 
@@ -63,8 +63,8 @@ def is_surely_decided(found: TestVerdict) -> bool:
     """Return whether a verdict is decided with more than its own interval.
 
     A test that may end at any of many looks gets as many chances of a wrong verdict. Its intervals
-    therefore count as `SURER` times as wide: at the three to four standard deviations of a verdict
-    on many bands this makes a single look ten times less likely to be wrong.
+    therefore count as `INTERVAL_FACTOR` times as wide: at the three to four standard deviations of
+    a verdict on many bands this makes a single look ten times less likely to be wrong.
     """
     if found.verdict is Verdict.FAIL:
         return any(each.verdict is Verdict.FAIL and _is_sure(each) for each in found.limits)
@@ -73,9 +73,9 @@ def is_surely_decided(found: TestVerdict) -> bool:
 
 def _is_sure(result: LimitResult) -> bool:
     if result.verdict is Verdict.PASS:
-        bound = result.noise_psd + SURER * (result.high - result.noise_psd)
+        bound = result.noise_psd + INTERVAL_FACTOR * (result.high - result.noise_psd)
         return bound < result.limit_psd
-    bound = result.noise_psd - SURER * (result.noise_psd - result.low)
+    bound = result.noise_psd - INTERVAL_FACTOR * (result.noise_psd - result.low)
     return bound > result.limit_psd
 
 

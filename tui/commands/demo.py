@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 METHODS = ("three-channel", "three-sensor")
-ALL_AT_ONCE = 2.773
+SIMULTANEOUS_95 = 2.773
 """Half width of a simultaneous 95 % interval of nine values in standard deviations, Bonferroni."""
 SHOWN_SHARE = 0.01
 """Share of the noise above which the table states the effect of the clocks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class NoiseComparison:
     """Noise of one channel in the band by one method, and the truth; PSD in unit²/Hz."""
 
     sensor: str
@@ -148,21 +148,21 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
     return interruption.pressed
 
 
-def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[Compared]:
+def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[NoiseComparison]:
     """Return the noise of every channel in the band by each method, with the truth."""
     band = band_of(settings, snapshot)
     edges = band_edges(snapshot.frequency, band)
     inside = snapshot.frequency[slice(*edges)]
     compared = []
     for method, noise in snapshot.results.items():
-        means = channel_means(noise, snapshot, settings, band, quantile=ALL_AT_ONCE)
+        means = channel_means(noise, snapshot, settings, band, quantile=SIMULTANEOUS_95)
         places: dict[str, int] = {}
         for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
             clocks = float(added_in_bands(snapshot, settings, edges, column)[0])
             compared.append(
-                Compared(
+                NoiseComparison(
                     sensor=label.sensor,
                     channel=label.channel,
                     method=method,
@@ -184,7 +184,9 @@ def _percent(share: float) -> str:
     )
 
 
-def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Settings) -> Table:
+def comparison_table(
+    compared: list[NoiseComparison], snapshot: Snapshot, settings: Settings
+) -> Table:
     """Return a row per channel: truth, each method's estimate, and whether that covers it."""
     band = band_of(settings, snapshot)
     data = data_means(snapshot, band)
@@ -210,7 +212,7 @@ def comparison_table(compared: list[Compared], snapshot: Snapshot, settings: Set
     return table
 
 
-def verdict(compared: list[Compared]) -> list[str]:
+def verdict(compared: list[NoiseComparison]) -> list[str]:
     """Return the conclusions from the table."""
     lines = []
     for method in METHODS:
@@ -231,7 +233,7 @@ def verdict(compared: list[Compared]) -> list[str]:
     return lines
 
 
-def _document(compared: list[Compared], snapshot: Snapshot) -> dict[str, Any]:
+def _document(compared: list[NoiseComparison], snapshot: Snapshot) -> dict[str, Any]:
     return {
         "segments": snapshot.n_segments,
         "unit": snapshot.unit,

@@ -21,7 +21,7 @@ from tui.output.console import for_people, write_json, write_whole
 from tui.output.extras import require
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.service.clock import SystemTime
-from tui.service.hooks import Teller
+from tui.service.hooks import HookRunner
 from tui.service.metrics import ServiceMetrics
 from tui.service.notify import Notifier
 from tui.service.processes.finish import options_table
@@ -143,9 +143,9 @@ async def serve(
 
         def notify(run: Run) -> None:
             metrics.note(run)
-            teller.tell(run)
+            hook_runner.submit(run)
 
-        teller = Teller(lambda: service.bench.hooks, store, folder, clock)
+        hook_runner = HookRunner(lambda: service.bench.hooks, store, folder, clock)
         service = Service(
             bench,
             steps=lambda bench: ProcessSteps(bench, _snapshot(bench, path)),
@@ -153,13 +153,13 @@ async def serve(
             clock=clock,
             options=options_table(wanted),
             reload=lambda: _again(path, wanted, bench),
-            tell=notify,
+            on_change=notify,
             tidy=tidied,
         )
-        metrics = ServiceMetrics(service, teller)
+        metrics = ServiceMetrics(service, hook_runner)
         _on_signals(service.request_stop, service.request_reload)
         helpers = [
-            asyncio.create_task(teller.work()),
+            asyncio.create_task(hook_runner.work()),
             asyncio.create_task(signs_of_life(service, notifier)),
         ]
         _LOGGER.info("serving %s; recordings go to %s", bench.name, folder)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Preview
     from tui.application.plan import TestPlan
 
-ALWAYS = ("three-sensor", "three-channel")
+COMPARISON_METHODS = ("three-sensor", "three-channel")
 """Cheap methods, shown for comparison with the chosen ones."""
 HOOK_TIMEOUT = 60.0
 """Seconds after which a command for events is ended."""
@@ -355,4 +355,4 @@ def with_comparison(settings: Settings, wanted: Mapping[str, Any]) -> Settings:
     """Add cheap methods for comparison, unless the user chose the methods."""
     if wanted.get("methods") is not None or "all" in settings.methods:
         return settings
-    return replace(settings, methods=tuple(dict.fromkeys((*settings.methods, *ALWAYS))))
+    return replace(settings, methods=tuple(dict.fromkeys((*settings.methods, *COMPARISON_METHODS))))

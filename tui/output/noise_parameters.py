@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MISFIT = 5.0
 """Standard errors from which on it is said that the terms do not describe the noise."""
-SEEN = 2.0
+SIGNIFICANT = 2.0
 """Standard errors from which on a term counts as seen."""
 COLUMNS = {
     Term.RANDOM_WALK: "random walk",
@@ -58,9 +58,9 @@ def term_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tup
 
 
 def _term(value: float, error: float) -> str:
-    if value > SEEN * error:
+    if value > SIGNIFICANT * error:
         return f"{level(value)} ±{10 / math.log(10) * error / value:.2f}"
-    return f"< {level(max(value, 0.0) + SEEN * error)}"
+    return f"< {level(max(value, 0.0) + SIGNIFICANT * error)}"
 
 
 def allan_table(found: Sequence[ChannelNoise]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

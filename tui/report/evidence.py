@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
-    from daq.results.sources import Happening, Source
+    from daq.results.sources import LoggedEvent, Source
     from daq.timing.clock_model import ClockState
     from estimator.diagnostics.band import BandDiagnosis
     from estimator.diagnostics.relative_response import RelativeResponse
@@ -316,12 +316,12 @@ def _clock_row(
     )
 
 
-def _together(happenings: Sequence[Happening]) -> list[tuple[Happening, int, int]]:
+def _together(happenings: Sequence[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:
     """Return what happened in time order: how often, until when; alike ones together if many."""
     ordered = sorted(happenings, key=lambda each: each.utc_ns)
     if len(ordered) <= LISTED:
         return [(each, 1, each.utc_ns) for each in ordered]
-    alike: dict[tuple[str, str], tuple[Happening, int, int]] = {}
+    alike: dict[tuple[str, str], tuple[LoggedEvent, int, int]] = {}
     for each in ordered:
         first, count, _ = alike.get((each.sensor, each.kind), (each, 0, 0))
         alike[each.sensor, each.kind] = (first, count + 1, each.utc_ns)

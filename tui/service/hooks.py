@@ -1,7 +1,7 @@
-"""Commands that are told what became of a run, with its JSON on standard input.
+"""Commands that run when a run ends, with its JSON on standard input.
 
-A hook that fails or takes too long is tried again. What was not told when the service ended is in
-the database, and told by the next service: each event at least once.
+A hook that fails or takes too long is tried again. Hooks that were pending when the service ended
+are in the database; the next service carries them out: each at least once.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def hook_document(run: Run, event: str, folder: Path) -> dict[str, Any]:
     return document
 
 
-class Teller:
+class HookRunner:
     """Carries out hooks, one after another, while the service goes on.
 
     Parameters
@@ -77,21 +77,21 @@ class Teller:
         self.n_failed = 0
         """Hooks that were given up."""
 
-    def tell(self, run: Run) -> None:
+    def submit(self, run: Run) -> None:
         """Have the hooks of a run carried out."""
-        if run.untold:
+        if run.pending_hooks:
             self._queue.put_nowait(run)
 
     async def work(self) -> None:
         """Carry out hooks until cancelled."""
         while True:
             run = await self._queue.get()
-            left = list(run.untold)
-            for event in run.untold:
+            left = list(run.pending_hooks)
+            for event in run.pending_hooks:
                 await self._carry_out(run, event)
                 left.remove(event)
                 try:
-                    self._store.set_untold(run, left)
+                    self._store.set_pending_hooks(run, left)
                 except StoreError as error:
                     _LOGGER.error("%s", error)  # noqa: TRY400 - its message says all
 

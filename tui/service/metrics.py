@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daq.bench.tables.unattended import Metrics
-    from tui.service.hooks import Teller
+    from tui.service.hooks import HookRunner
     from tui.service.service import Service
 
 
@@ -27,11 +27,11 @@ class ServiceMetrics:
     Parameters
     ----------
     service : Service
-    teller : Teller
+    hook_runner : HookRunner
     """
 
-    def __init__(self, service: Service, teller: Teller) -> None:
-        self._service, self._teller = service, teller
+    def __init__(self, service: Service, hook_runner: HookRunner) -> None:
+        self._service, self._hook_runner = service, hook_runner
         self._counts = dict.fromkeys((RunState.DONE, RunState.FAILED, RunState.MISSED), 0)
         self._last: dict[RunState, float] = {}
         self._done: Run | None = None
@@ -114,7 +114,7 @@ class ServiceMetrics:
         least = bench.storage.min_free
         yield from gauge("huddle_disk_min_free_bytes", "Space at which recordings end.", least)
         yield core.CounterMetricFamily(
-            "huddle_hooks_given_up", "Hooks without success.", value=self._teller.n_failed
+            "huddle_hooks_given_up", "Hooks without success.", value=self._hook_runner.n_failed
         )
         status = None if window is None else window.status
         if status is not None:

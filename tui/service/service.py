@@ -63,7 +63,7 @@ class Service:
         Settings of the estimate that replace those of the bench file, as its table has them.
     reload : callable
         Reads the bench file again when asked to; raises a HuddleError where it is faulty.
-    tell : callable
+    on_change : callable
         Receives every run that has changed its state.
     tidy : callable
         Removes what need not be kept; called before and after runs.
@@ -78,13 +78,13 @@ class Service:
         clock: Clock,
         options: Mapping[str, Any],
         reload: Callable[[], Bench],
-        tell: Callable[[Run], None] = lambda _: None,
+        on_change: Callable[[Run], None] = lambda _: None,
         tidy: Callable[[Bench], None] = lambda _: None,
     ) -> None:
         self.bench = bench
         self._make_steps, self._steps = steps, steps(bench)
         self._store, self._clock, self._options = store, clock, options
-        self._reload, self._tell, self._tidy = reload, tell, tidy
+        self._reload, self._on_change, self._tidy = reload, on_change, tidy
         self.stop = asyncio.Event()
         self._wake = asyncio.Event()
         self._wants_reload = False
@@ -160,8 +160,8 @@ class Service:
             elif run.state is RunState.ESTIMATING:
                 _LOGGER.info("run %s is taken up: it was being estimated", run.name)
                 self._estimates.put_nowait(run)
-            elif run.untold:
-                self._tell(run)
+            elif run.pending_hooks:
+                self._on_change(run)
         planned = [run for run in runs if run.state is RunState.DUE]
         for run in planned:
             if run.due < now - GRACE:
@@ -348,8 +348,8 @@ class Service:
             self._miss(run, OFF + (others if more and number == len(runs) else ""))
 
     def _note(self, run: Run) -> None:
-        """Write a run that has changed its state, log it, and have it told."""
-        run = replace(run, untold=events_of(run, self.bench.hooks))
+        """Write a run that has changed its state, log it, and pass it on."""
+        run = replace(run, pending_hooks=events_of(run, self.bench.hooks))
         self._save(run)
         verdict = f", verdict {run.verdict}" if run.verdict else ""
         recordings = f": {', '.join(run.parts)}" if run.parts else ""
@@ -359,7 +359,7 @@ class Service:
             *(run.name, run.state, verdict, recordings, run.reason and f" ({run.reason})"),
             extra=run.document() | {"run": run.state},
         )
-        self._tell(run)
+        self._on_change(run)
 
     def _save(self, run: Run) -> None:
         self._unsaved.pop(run.key, None)

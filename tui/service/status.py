@@ -49,7 +49,7 @@ def service_status(bench: Bench, runs: list[Run], now: datetime) -> dict[str, An
         "next": next((run.document() for run in planned if run.due > now), None),
         "last": max(over, key=lambda run: run.due).document() if over else None,
         "unfinished": sum(run.state in UNFINISHED for run in runs),
-        "untold": sum(len(run.untold) for run in over),
+        "untold": sum(len(run.pending_hooks) for run in over),
         "disk": _disk(folder, bench.storage.min_free),
         "clock": {"utc": utc_text(now), "synchronised": clock_is_synchronised()},
     }

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tui.service.processes.steps import Recorder, Steps
 
 _LOGGER = logging.getLogger(__name__)
-LOOK = 2.0
+LOOK_INTERVAL = 2.0
 """Seconds between looks at a recorder and the disk."""
 STALL = timedelta(minutes=2)
 """Time without progress after which a recorder is killed: devices that are lost do not matter."""
@@ -143,7 +143,7 @@ class Window:
         """Wait for the end of a recorder; end it where it must."""
         stalled = ""
         known, since = None, self._clock.now()
-        while not await recorder.ends_within(LOOK):
+        while not await recorder.ends_within(LOOK_INTERVAL):
             if self._stop.is_set():
                 await recorder.stop()
                 return _End.WITH_SERVICE, ""

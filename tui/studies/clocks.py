@@ -262,12 +262,12 @@ def _row(clocks: str, snapshot: Snapshot, oracle: Snapshot, scenario: Scenario) 
     )
 
 
-def clocks(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def clocks(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Study the effect of free-running clocks on the three-sensor estimate.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of an hour to simulate.
@@ -281,7 +281,7 @@ def clocks(told: ProgressCallback, *, length: float = 1.0) -> Study:
     for number, (n_dims, latency) in enumerate(cases):
         kind = {2: "biaxial", 3: "triaxial"}[n_dims]
         title = f"{kind}, {latency.kind} latency of {latency.spread * 1e3:g} ms"
-        told(f"clocks: {title}", number / len(cases))
+        progress(f"clocks: {title}", number / len(cases))
         with tempfile.TemporaryDirectory() as folder:
             rows = study(
                 Path(folder), n_dims=n_dims, duration=3600 * length, latency=latency, seed=1
@@ -295,12 +295,12 @@ LOADED = Latency("batching", 16e-3, stalled=0.3)
 RUNS, RUN_DURATION = 10, 1200.0
 
 
-def clock_coverage(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def clock_coverage(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Count how often intervals hold the true noise where clocks are hard to find.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `RUNS` to simulate.
@@ -309,7 +309,7 @@ def clock_coverage(told: ProgressCallback, *, length: float = 1.0) -> Study:
     edges = np.array(BANDS)
     covers = np.empty((n_runs, len(BANDS) - 1, 9))
     for run in range(n_runs):
-        told(f"clock-coverage: {n_runs} recordings of 20 minutes", run / n_runs)
+        progress(f"clock-coverage: {n_runs} recordings of 20 minutes", run / n_runs)
         scenario = free_running(n_dims=3, duration=RUN_DURATION, seed=run + 1)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "run.h5"

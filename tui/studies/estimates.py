@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 METHODS = ("three-sensor", "maximum-likelihood")
 NOMINAL = 0.95
-COVERS = 0.02
+COVERAGE_TOLERANCE = 0.02
 """By which the coverage of an interval of 95 % may be off."""
 WIDER = 0.05
 """The same below an SNR of 1, where intervals are wider than they need be."""
@@ -48,7 +48,7 @@ def share(x: float, hits: float, n: float, expected: float, allowed: float) -> P
     return Point(x, hits, expected, error, allowed)
 
 
-def coverage(told: ProgressCallback, length: float) -> Study:
+def coverage(progress: ProgressCallback, length: float) -> Study:
     """Intervals of 95 % at single frequencies, by SNR and by averages."""
     n_draws = max(40, round(1000 * length))
     by_snr: dict[str, list[Point]] = {method: [] for method in METHODS}
@@ -57,7 +57,7 @@ def coverage(told: ProgressCallback, length: float) -> Study:
     points = [(snr, 100, snr, by_snr) for snr in snrs]
     points += [(100.0, n, float(n), by_averages) for n in averages]
     for number, (snr, n, x, series) in enumerate(points):
-        told("coverage", number / len(points))
+        progress("coverage", number / len(points))
         rng = np.random.default_rng([20, number])
         csm = averaged(np.stack([bench(rng, snr=snr) for _ in range(n_draws)]), n, rng)
         for method in METHODS:
@@ -65,7 +65,7 @@ def coverage(told: ProgressCallback, length: float) -> Study:
             known = np.isfinite(found.high)
             covers = ((found.low < 1) & (found.high > 1))[known].mean()
             # Channels of a sensor share little, those of three sensors half of their scatter.
-            allowed = COVERS if snr >= 1 else WIDER
+            allowed = COVERAGE_TOLERANCE if snr >= 1 else WIDER
             series[method].append(share(x, float(covers), 3 * n_draws, NOMINAL, allowed))
     return Study(
         "coverage",
@@ -86,12 +86,12 @@ def coverage(told: ProgressCallback, length: float) -> Study:
     )
 
 
-def small_samples(told: ProgressCallback, length: float) -> Study:
+def small_samples(progress: ProgressCallback, length: float) -> Study:
     """Bias of few averages, with and without the correction."""
     n_draws = max(100, round(4000 * length))
     panels = []
     for number, d in enumerate((1, 2, 3)):
-        told("small samples", number / 3)
+        progress("small samples", number / 3)
         series: dict[bool, list[Point]] = {True: [], False: []}
         for n in (12, 20, 40, 100, 400):
             rng = np.random.default_rng([21, d, n])
@@ -118,12 +118,12 @@ def small_samples(told: ProgressCallback, length: float) -> Study:
     return Study("small-samples", "Bias of few averages", tuple(panels))
 
 
-def many_sensors(told: ProgressCallback, length: float) -> Study:
+def many_sensors(progress: ProgressCallback, length: float) -> Study:
     """Scatter of three to six sensors, beside the least that is possible."""
     n_draws, n = max(40, round(1000 * length)), 200
     series: dict[str, list[Point]] = {method: [] for method in METHODS}
     for number, n_sensors in enumerate((3, 4, 5, 6)):
-        told("many sensors", number / 4)
+        progress("many sensors", number / 4)
         rng = np.random.default_rng([22, n_sensors])
         dims, p = (3,) * n_sensors, 3 * n_sensors
         true = np.stack([bench(rng, n_sensors=n_sensors, snr=100.0) for _ in range(n_draws)])
@@ -150,14 +150,14 @@ def many_sensors(told: ProgressCallback, length: float) -> Study:
     )
 
 
-def quiet(told: ProgressCallback, length: float) -> Study:
+def quiet(progress: ProgressCallback, length: float) -> Study:
     """Measure the noise of a quiet sensor among sensors 30 dB louder, over a band."""
     n_draws, n, n_freqs, ratio = max(20, round(200 * length)), 226, 64, 1000.0
     noise_psd = np.array([1.0] * 3 + [ratio] * 6)
     points, biases = [], []
     snrs = (0.03, 0.1, 0.3, 1.0, 3.0)
     for number, snr in enumerate(snrs):
-        told("quiet among noisy", number / len(snrs))
+        progress("quiet among noisy", number / len(snrs))
         rng = np.random.default_rng([23, number])
         found = []
         for _ in range(n_draws):
@@ -170,7 +170,7 @@ def quiet(told: ProgressCallback, length: float) -> Study:
             )
         noise, low, high = np.array(found).swapaxes(0, 1)
         covers = float(((low < 1) & (high > 1)).mean())
-        points.append(share(snr, covers, 3 * n_draws, NOMINAL, COVERS))
+        points.append(share(snr, covers, 3 * n_draws, NOMINAL, COVERAGE_TOLERANCE))
         below = float((noise < 1).mean())
         biases.append(share(snr, below, 3 * n_draws, 0.5, 0.0))
     return Study(
@@ -195,12 +195,12 @@ def quiet(told: ProgressCallback, length: float) -> Study:
     )
 
 
-def unequal(told: ProgressCallback, length: float) -> Study:
+def unequal(progress: ProgressCallback, length: float) -> Study:
     """Three good sensors and two poor ones: the scatter of the good ones' noise."""
     n_draws, n = max(100, round(2000 * length)), 200
     points = []
     for number, ratio in enumerate((10.0, 100.0, 1000.0)):
-        told("unequal sensors", number / 3)
+        progress("unequal sensors", number / 3)
         rng = np.random.default_rng([24, number])
         noise_psd = np.array([1.0] * 9 + [ratio] * 6)
         true = bench(rng, n_sensors=5, snr=max(1e3, 10 * ratio), noise_psd=noise_psd)
@@ -230,7 +230,7 @@ TERMS = np.array([2e-13, 5e-12, 1e-12, 2e-16])
 """Random walk, flicker, white and f² at 1 Hz."""
 
 
-def noise_terms(told: ProgressCallback, length: float) -> Study:
+def noise_terms(progress: ProgressCallback, length: float) -> Study:
     """Noise parameters: bias, and coverage of their errors."""
     n_draws = max(30, round(400 * length))
     frequency: FloatArray = np.arange(1001, dtype=np.float64) * 0.1
@@ -238,7 +238,7 @@ def noise_terms(told: ProgressCallback, length: float) -> Study:
     true[1:] = terms_at(frequency[1:], 0.1) @ TERMS
     panels = []
     for number, n in enumerate((50, 400)):
-        told("noise parameters", number / 2)
+        progress("noise parameters", number / 2)
         rng = np.random.default_rng([26, n])
         cov: FloatArray = np.full(len(frequency), 1 / np.sqrt(n), dtype=np.float64)
         found = [
@@ -261,7 +261,7 @@ def noise_terms(told: ProgressCallback, length: float) -> Study:
                         "terms",
                         "share",
                         tuple(
-                            share(k, float(c), n_draws, NOMINAL, COVERS)
+                            share(k, float(c), n_draws, NOMINAL, COVERAGE_TOLERANCE)
                             for k, c in enumerate(covers)
                         ),
                     ),

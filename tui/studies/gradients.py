@@ -67,12 +67,12 @@ def scene(rng: np.random.Generator, frequency: FloatArray, n_sensors: int) -> Co
     return np.asarray(motion + np.eye(3 * n_sensors))
 
 
-def gradients(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def gradients(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Estimate the noise of sensors that waves cross.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `N_LAYOUTS` to simulate.
@@ -86,7 +86,7 @@ def gradients(told: ProgressCallback, *, length: float = 1.0) -> Study:
         dims = (3,) * n_sensors
         ratios, covered = [], []
         for number in range(n_layouts):
-            told(f"gradients: {n_sensors} sensors, {n} averages", number / n_layouts)
+            progress(f"gradients: {n_sensors} sensors, {n} averages", number / n_layouts)
             csm = averaged(scene(rng, frequency, n_sensors), n, rng)
             n_factors, choices = choose_dimension(
                 csm, frequency, dims=dims, n_effective=n, band=band, neighbours=INDEPENDENT

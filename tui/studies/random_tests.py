@@ -165,12 +165,12 @@ FALSE: dict[type[Advice], Callable[[Scene], bool]] = {
 """Kinds of advice, and in which scenes they are wrong."""
 
 
-def random_tests(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Judge intervals and advice on tests drawn at random.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `N_TESTS` to simulate.
@@ -179,7 +179,7 @@ def random_tests(told: ProgressCallback, *, length: float = 1.0) -> Study:
     covered: dict[tuple[str, int], list[float]] = {}
     said: dict[type[Advice], list[bool]] = {kind: [] for kind in FALSE}
     for number in range(n_tests):
-        told("random tests", number / n_tests)
+        progress("random tests", number / n_tests)
         rng = np.random.default_rng([SEED, number])
         scene = draw_scene(rng)
         samples, deviations = simulate(scene, rng)

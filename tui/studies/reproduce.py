@@ -47,7 +47,7 @@ DEFAULT_FOLDER = Path("reproduced")
 
 
 def reproduce(
-    names: Sequence[str], *, told: ProgressCallback, length: float = 1.0
+    names: Sequence[str], *, progress: ProgressCallback, length: float = 1.0
 ) -> Iterator[Study]:
     """Carry out studies, one by one.
 
@@ -55,7 +55,7 @@ def reproduce(
     ----------
     names
         Of `STUDIES`; ``all``, or none at all, stands for every one.
-    told
+    progress
         Takes progress.
     length
         Share of the paper's length to simulate.
@@ -71,22 +71,25 @@ def reproduce(
             f"no study {', '.join(map(repr, unknown))}; expected {', '.join(STUDIES)} or {ALL}"
         )
     wanted = STUDIES if ALL in names or not names else tuple(dict.fromkeys(names))
-    return _studies(wanted, told, length)
+    return _studies(wanted, progress, length)
 
 
-def _studies(names: tuple[str, ...], told: ProgressCallback, length: float) -> Iterator[Study]:
-    ingredients, laboratory = Ingredients(told, length=length), Laboratory(told, length=length)
+def _studies(names: tuple[str, ...], progress: ProgressCallback, length: float) -> Iterator[Study]:
+    ingredients, laboratory = (
+        Ingredients(progress, length=length),
+        Laboratory(progress, length=length),
+    )
     for name in names:
         if name == CLOCKS:
-            yield clocks(told, length=length)
+            yield clocks(progress, length=length)
         elif name == VERDICTS:
-            yield verdicts(told, length=length)
+            yield verdicts(progress, length=length)
         elif name == SHARED_NOISE:
-            yield shared(told, length)
+            yield shared(progress, length)
         elif name in ESTIMATES:
-            yield ESTIMATES[name](told, length)
+            yield ESTIMATES[name](progress, length)
         elif name in RESPONSES:
-            yield RESPONSES[name](told, length=length)
+            yield RESPONSES[name](progress, length=length)
         elif name in NUMERICAL:
             yield NUMERICAL[name](ingredients)
         else:
@@ -124,8 +127,8 @@ def run(
     started = time.monotonic()
     studies: list[Study] = []
     files: list[Path] = []
-    with _Progress() as told:
-        wanted = reproduce(names, told=told, length=length)
+    with _Progress() as report:
+        wanted = reproduce(names, progress=report, length=length)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -135,7 +138,7 @@ def run(
         for study in wanted:
             from tui.studies.figures import save  # noqa: PLC0415 - matplotlib takes a second
 
-            told(f"{study.name}: figure", 1.0)
+            report(f"{study.name}: figure", 1.0)
             files += save(study, folder)
             studies.append(study)
     elapsed = time.monotonic() - started
@@ -170,12 +173,12 @@ class _Progress:
 
     def __enter__(self) -> ProgressCallback:
         self._bar.start()
-        return self._tell
+        return self._report
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def _tell(self, what: str, share: float) -> None:
+    def _report(self, what: str, share: float) -> None:
         if what != self._what:
             self._what = what
             self._bar.reset(self._task, description=what, total=1.0)

@@ -37,12 +37,12 @@ _ALLOWED = 0.02
 _DIMS = (3, 3, 3)
 
 
-def calibration(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def calibration(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Count how often the truth lies within the uncertainties of a calibration.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `N_DRAWS` to simulate.
@@ -54,7 +54,7 @@ def calibration(told: ProgressCallback, *, length: float = 1.0) -> Study:
     for step, snr in enumerate(snrs):
         scores: dict[str, list[FloatArray]] = {name: [] for name in QUANTITIES}
         for draw in range(n_draws):
-            told("calibration: simulated tests", (step + draw / n_draws) / len(snrs))
+            progress("calibration: simulated tests", (step + draw / n_draws) / len(snrs))
             for name, score in _scores(rng, snr).items():
                 scores[name].append(score)
         for name, found in scores.items():
@@ -128,12 +128,12 @@ CASES = (
 """Name, SNR, response of sensors A and C, response of sensor B, and band."""
 
 
-def edges(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def edges(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Predict and equalise what unequal responses leak, at segments of 10 s.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `N_RUNS` to simulate.
@@ -145,7 +145,7 @@ def edges(told: ProgressCallback, *, length: float = 1.0) -> Study:
         rng = np.random.default_rng(SEED + number)
         runs = []
         for run in range(n_runs):
-            told(f"edges: {case[0]}", (number + run / n_runs) / len(CASES))
+            progress(f"edges: {case[0]}", (number + run / n_runs) / len(CASES))
             runs.append(_run(rng, case))
         mean = {name: float(np.mean([each[name] for each in runs])) for name in runs[0]}
         error = mean["scatter"] / np.sqrt(n_runs)

@@ -45,7 +45,7 @@ def _power(true: ComplexArray, pair: tuple[int, int], amount: float, n: int) -> 
     return NormalDist().cdf(float(mean) - limit)
 
 
-def shared(told: ProgressCallback, length: float) -> Study:
+def shared(progress: ProgressCallback, length: float) -> Study:
     """Noise that channels share: named rightly, and not where there is none."""
     n, n_tests, n_sound = 226, max(10, round(40 * length)), max(20, round(400 * length))
     named, amounts = [], []
@@ -70,7 +70,7 @@ def shared(told: ProgressCallback, length: float) -> Study:
         return set(found.pairs), set(found.alternatives), float(found.amount.mean()), power
 
     for number, (what, pairs, amount, n_freqs) in enumerate(CASES):
-        told(f"shared noise: {what}", 0.0)
+        progress(f"shared noise: {what}", 0.0)
         rng = np.random.default_rng([25, number])
         outcomes = [found_in(rng, pairs, amount, n_freqs) for _ in range(n_tests)]
         right = np.array(
@@ -87,7 +87,7 @@ def shared(told: ProgressCallback, length: float) -> Study:
     rng = np.random.default_rng(25)
     accused = 0
     for number in range(n_sound):
-        told("shared noise: sound tests", number / n_sound)
+        progress("shared noise: sound tests", number / n_sound)
         accused += bool(found_in(rng, (), 0.0, 120)[0])
     alarms = share(0, accused / n_sound, n_sound, 0.01, 0.005)
     x_label = "case (1)"

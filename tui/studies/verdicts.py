@@ -181,14 +181,14 @@ def outcomes(
     *,
     seed: int = SEED,
     method: str = METHOD,
-    told: ProgressCallback | None = None,
+    progress: ProgressCallback | None = None,
 ) -> list[Outcome]:
     """Simulate tests, and prolong those that are not decided."""
     rng = np.random.default_rng(seed)
     found = []
     for number in range(n_tests):
-        if told is not None:
-            told("verdicts: simulated tests", number / n_tests)
+        if progress is not None:
+            progress("verdicts: simulated tests", number / n_tests)
         above_db = rng.uniform(-FARTHEST_DB, FARTHEST_DB)
         seconds = float(np.exp(rng.uniform(np.log(SHORTEST), np.log(LONGEST))))
         snr = float(np.exp(rng.uniform(*np.log(SNRS))))
@@ -204,17 +204,17 @@ def outcomes(
     return found
 
 
-def verdicts(told: ProgressCallback, *, length: float = 1.0) -> Study:
+def verdicts(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """Count verdicts that are wrong, and predictions that hold.
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of `N_TESTS` to simulate.
     """
-    found = outcomes(max(20, round(N_TESTS * length)), told=told)
+    found = outcomes(max(20, round(N_TESTS * length)), progress=progress)
     wrong = tuple(
         Series(
             f"wrong {verdict.value}",

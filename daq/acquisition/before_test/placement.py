@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from daq.acquisition.before_test.preview import SensorPreview
     from daq.bench.model import Channel
 
-ALONE, TOGETHER = 0.3, 0.7
+LOW_CORRELATION, HIGH_CORRELATION = 0.3, 0.7
 """Correlation below which a sensor moves by itself, and from which on two others move together."""
 SLOW = 10.0
 """Hz up to which sensors are correlated: their clocks differ by milliseconds."""
@@ -87,7 +87,7 @@ def placed_wrongly(able: Sequence[SensorPreview]) -> Iterator[Finding]:
                 strongest[i, j] = strongest[j, i] = np.abs(both[:d, d:]).max()
     for i, each in enumerate(able):
         others = np.delete(np.delete(strongest, i, 0), i, 1)
-        if others.max() >= TOGETHER and strongest[i].max() < ALONE:
+        if others.max() >= HIGH_CORRELATION and strongest[i].max() < LOW_CORRELATION:
             yield Finding(Problem.ALONE, each.sensor.name, value=float(strongest[i].max()))
     yield from _reflected(able, slow)
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 ASK_AFTER = 1.0
 """Silence in s after which the driver tests whether the device was restarted."""
-GATHER = 0.25
+BLOCK_DURATION = 0.25
 """Duration in s of the frames decoded together: a row of ``blocks``."""
 WAITING = 0.05
 """Time limit in s for reading bytes already received."""
@@ -101,7 +101,10 @@ class EpsonSession:
         at: HostTime | None = None
         # A device waiting for a trigger also replies, so a reply does not prove a restart.
         ask_after = None if configuration.is_triggered else ASK_AFTER
-        n_frames, size = round(GATHER * configuration.sampling_rate), configuration.burst.size
+        n_frames, size = (
+            round(BLOCK_DURATION * configuration.sampling_rate),
+            configuration.burst.size,
+        )
         while True:
             self._stream.expect(n_frames, size, n_pending=self.decoder.n_pending)
             try:

@@ -33,7 +33,7 @@ REPLY_TIMEOUT = 2.0
 PACKETS_PER_SECOND = 10
 PRODUCTS = {7.0: "T7", 8.0: "T8"}
 MODBUS_PORT = 502
-OWN = ("inputs", "range", "negative_inputs")
+SENSOR_SETTINGS = ("inputs", "range", "negative_inputs")
 """Settings of each sensor; all others belong to the stream and to the port's first sensor."""
 BUFFERS = {"T7": 32768, "T8": 262144}
 
@@ -136,7 +136,7 @@ def inputs_of(
         If an input appears twice, or the number of inputs and channels differ, or sensors differ in
         common settings.
     """
-    require_alike(sensors, settings, LabJackSettings.model_fields.keys() - OWN)
+    require_alike(sensors, settings, LabJackSettings.model_fields.keys() - SENSOR_SETTINGS)
     inputs: dict[str, tuple[int, ...]] = {}
     taken: dict[int, str] = {}
     for sensor in sensors:

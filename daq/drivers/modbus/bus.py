@@ -41,7 +41,7 @@ TCP = "modbus-tcp://"
 MIN_TIMEOUT, MIN_SHORT_TIMEOUT = 0.2, 0.05
 """Shortest timeout of a reply, s: of a device with known reply times, and of one that may be
 absent."""
-KNOWN_AFTER = 5
+MIN_REPLIES = 5
 """Number of replies after which a device's reply time is known."""
 QUIET = 0.06
 """Silence in s that ends a message: longer than a USB adapter (16 ms) or a serial server (40 ms)
@@ -244,7 +244,7 @@ class ModbusBus:
         if self._is_short:
             longest = max((other.longest for other in self._reply_times.values()), default=seconds)
             seconds = max(MIN_SHORT_TIMEOUT, 4 * longest)
-        elif known is not None and known.n_replies >= KNOWN_AFTER:
+        elif known is not None and known.n_replies >= MIN_REPLIES:
             seconds = max(MIN_TIMEOUT, 4 * known.longest)
         return min(seconds, self._timeout)
 

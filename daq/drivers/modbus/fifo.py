@@ -40,7 +40,7 @@ ATTEMPTS = 3
 HIGHEST_RATE = 65_535
 STALLED = 2.0
 """Time without a sample, in s, after which the device has stopped."""
-NOT_LESS = 3.0
+MAX_FILLING_TIME = 3.0
 """Time without a decrease of the level, in s, after which the link is too slow."""
 
 
@@ -109,7 +109,7 @@ class FifoSession:
             level = self._decoder.level or math.inf  # unknown before the first reply
             if self._decoder.started or level < least or least == math.inf:
                 least, lessened = level, loop.time()
-            elif loop.time() - lessened > NOT_LESS:
+            elif loop.time() - lessened > MAX_FILLING_TIME:
                 raise NoAnswerError(
                     f"{self._stream.label}: the FIFO is never empty, {self._decoder.level} words"
                     " left: the link is too slow for the sampling rate; set a higher"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-IS_SEEN: bool = sys.platform != "win32"
+LOCKS_ARE_VISIBLE: bool = sys.platform != "win32"
 """Whether `is_being_written` works: Windows has only HDF5's own lock."""
 
 

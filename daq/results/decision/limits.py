@@ -30,7 +30,13 @@ from daq.results.band_summary import (
 )
 from daq.results.clock_effect import added_in_bands
 from daq.results.decision.decision_time import Margins, predict
-from daq.results.decision.verdict import SHRINKS, LimitResult, Obstacle, TestVerdict, Verdict
+from daq.results.decision.verdict import (
+    REMOVED_BY_TIME,
+    LimitResult,
+    Obstacle,
+    TestVerdict,
+    Verdict,
+)
 from daq.results.partners import without_partners
 from estimator.diagnostics.advice import ModelMisfit, TooFewDimensions
 from estimator.diagnostics.kinds import Level
@@ -81,12 +87,12 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
     if general or not limits:
         verdict = Verdict.NOT_DECIDED
     elif Verdict.FAIL in verdicts:
-        verdict, obstacles = Verdict.FAIL, tuple(o for o in obstacles if o not in SHRINKS)
+        verdict, obstacles = Verdict.FAIL, tuple(o for o in obstacles if o not in REMOVED_BY_TIME)
     else:
         undecided = Verdict.NOT_DECIDED in verdicts or bool(snapshot.not_estimated)
         verdict = Verdict.NOT_DECIDED if undecided else Verdict.PASS
     prediction = None
-    if verdict is Verdict.NOT_DECIDED and obstacles and set(obstacles) <= SHRINKS:
+    if verdict is Verdict.NOT_DECIDED and obstacles and set(obstacles) <= REMOVED_BY_TIME:
         prediction = _prediction(found, snapshot, quantile)
     return TestVerdict(verdict, limits, obstacles, prediction)
 

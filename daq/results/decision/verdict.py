@@ -45,7 +45,7 @@ class Obstacle(enum.StrEnum):
     """The limit lies within the interval: a longer recording narrows it."""
 
 
-SHRINKS = frozenset({Obstacle.TOO_FEW_AVERAGES, Obstacle.SPANS_LIMIT})
+REMOVED_BY_TIME = frozenset({Obstacle.TOO_FEW_AVERAGES, Obstacle.SPANS_LIMIT})
 """Obstacles that a longer recording removes."""
 
 

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from daq.acquisition.clock_trust import DISTRUST, ClockTrust
+from daq.acquisition.clock_trust import REMOVAL_DELAY, ClockTrust
 
 START = datetime(2026, 11, 21, 12, 0, 30, tzinfo=UTC)
 
@@ -38,7 +38,7 @@ def test_a_clock_is_not_plausible_for_a_day_after_a_jump(jump: timedelta) -> Non
     clocks.now += jump
     clocks.pass_time(timedelta(minutes=5))
     assert "was set by more than 1 h" in trust.doubt()
-    clocks.pass_time(DISTRUST / 2)
+    clocks.pass_time(REMOVAL_DELAY / 2)
     assert trust.doubt() != ""
-    clocks.pass_time(DISTRUST)
+    clocks.pass_time(REMOVAL_DELAY)
     assert trust.doubt() == ""

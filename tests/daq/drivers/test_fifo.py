@@ -136,8 +136,8 @@ async def test_replies_are_not_delayed(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = WorldClock(paced_clock().now_ns(), monotonic_ns=paced_clock().now_ns)
     served = Served(line, clock, LineFaults((), "A", begin=0.0), lambda *_: None)
     try:
-        await served.wire.open()
-        async with asyncio.timeout(10), open_port(served.wire.address, host_clock()) as stream:
+        await served.port.open()
+        async with asyncio.timeout(10), open_port(served.port.address, host_clock()) as stream:
             for _ in range(3):
                 await stream.write(rtu.read_request(1, 2, 1))
                 assert (await stream.read())[0]
@@ -146,7 +146,7 @@ async def test_replies_are_not_delayed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_a_link_that_is_too_slow_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daq.drivers.modbus.fifo.NOT_LESS", 0.4)
+    monkeypatch.setattr("daq.drivers.modbus.fifo.MAX_FILLING_TIME", 0.4)
     one = table("A", settings={"baud_rate": 115_200, "capacity": 6000})
     with serving(spec(one, sampling_rate=RATE)) as (running,):
         slow = sensors(running, one, settings={})[0]
@@ -156,7 +156,7 @@ async def test_a_link_that_is_too_slow_is_reported(monkeypatch: pytest.MonkeyPat
 
 async def test_a_lost_reply_is_not_reported_as_a_slow_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """However much waits: a link is slow where that never lessens."""
-    monkeypatch.setattr("daq.drivers.modbus.fifo.NOT_LESS", 0.4)
+    monkeypatch.setattr("daq.drivers.modbus.fifo.MAX_FILLING_TIME", 0.4)
 
     class Backlog:
         label, level, asked = "backlog", 6000, 0

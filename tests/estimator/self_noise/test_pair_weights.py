@@ -101,6 +101,6 @@ def test_sampled_frequencies_are_dense_below_and_rising() -> None:
     steps = np.diff(bins)
     assert bins[0] == 0
     assert np.all(steps >= 1)
-    assert np.all(steps <= np.maximum(1, bins[:-1] / pair_weights.DENSE))
+    assert np.all(steps <= np.maximum(1, bins[:-1] / pair_weights.DENSE_BINS))
     np.testing.assert_array_equal(bins[:64], np.arange(64))
     assert len(bins) < 250

@@ -19,7 +19,7 @@ from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
 from tui.cli.main import app
 from tui.report.figures import drawing
-from tui.report.figures.curves import BEYOND, noise_plots
+from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots
 from tui.report.figures.sheet import write_figure
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def test_a_model_far_off_widens_the_scale_so_far_and_no_farther() -> None:
     near = panels(models=[Mask("near", "m/s²", (1.0, 10.0), (1e-14, 1e-14))])[0].get_ylim()
     far = panels(models=[Mask("far", "m/s²", (1.0, 10.0), (1e-40, 1e-40))])[0].get_ylim()
     assert near[0] < -140 < usual[0]
-    assert usual[0] - BEYOND - 20 <= far[0] <= usual[0] - BEYOND + 20
+    assert usual[0] - MODEL_RANGE_DB - 20 <= far[0] <= usual[0] - MODEL_RANGE_DB + 20
     assert near[1] == far[1] == usual[1]
 
 

@@ -58,7 +58,7 @@ class VirtualClock(SystemTime):
 
 @dataclass
 class FakeRecorder:
-    """Records for a while, unless it is told to end or to fail."""
+    """Records for a while, unless it is ordered to end or to fail."""
 
     steps: FakeSteps
     path: Path
@@ -154,7 +154,7 @@ class Place:
         self.store = RunStore(self.bench.recording_directory)
         self.steps = FakeSteps(self.bench.recording_directory)
         self.clock = VirtualClock()
-        self.told: list[Run] = []
+        self.changes: list[Run] = []
         self.reload: Callable[[], Bench] = lambda: self.bench
 
     def service(self) -> Service:
@@ -166,7 +166,7 @@ class Place:
             clock=self.clock,
             options={},
             reload=self._load_again,
-            tell=self.told.append,
+            on_change=self.changes.append,
         )
 
     async def serve(self, seconds: float, *, killed: bool = False) -> Service:

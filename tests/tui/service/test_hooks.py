@@ -1,9 +1,11 @@
-"""Hooks: what they read, how often they are tried, and that they are told after a restart."""
+"""Hooks: what they read, how often they are tried, and which the next service carries out."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import sqlite3
 import sys
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -13,7 +15,7 @@ import pytest
 from daq.bench.tables.unattended import Hooks
 from tests.tui.service.bench_files import HOURLY, START, Place, VirtualClock
 from tests.waiting import limit
-from tui.service.hooks import Teller, events_of, run_hook
+from tui.service.hooks import HookRunner, events_of, run_hook
 from tui.service.records.run_state import BandNoise, Run, RunState
 from tui.service.records.store import RunStore
 
@@ -51,15 +53,17 @@ async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path
     hooks = Hooks(on_limit=("sh", "-c", script), retries=2, retry_after=0.001)
     store = RunStore(tmp_path)
     run = done("fail")
-    run = Run(**{name: getattr(run, name) for name in Run.__slots__} | {"untold": ("on_limit",)})
+    run = Run(
+        **{name: getattr(run, name) for name in Run.__slots__} | {"pending_hooks": ("on_limit",)}
+    )
     store.save(run)
     (tmp_path / "a.json").write_text("{}", encoding="utf-8")
-    teller = Teller(lambda: hooks, store, tmp_path, VirtualClock())
-    task = asyncio.create_task(teller.work())
-    teller.tell(run)
+    runner = HookRunner(lambda: hooks, store, tmp_path, VirtualClock())
+    task = asyncio.create_task(runner.work())
+    runner.submit(run)
     async with asyncio.timeout(limit()):
         while True:
-            if not store.runs()[0].untold:
+            if not store.runs()[0].pending_hooks:
                 break
             await asyncio.sleep(0.01)
     task.cancel()
@@ -72,7 +76,7 @@ async def test_a_hook_that_fails_is_tried_again_and_reads_the_run(tmp_path: Path
     assert document["noise"][0]["serial_number"] == "S1"
     assert document["noise"][0]["high"] is None
     assert (tmp_path / "tries").read_text(encoding="utf-8").count("x") == 2
-    assert teller.n_failed == 0
+    assert runner.n_failed == 0
 
 
 @pytest.mark.parametrize(
@@ -95,11 +99,21 @@ async def test_what_was_not_told_is_told_by_the_next_service(tmp_path: Path) -> 
     place = Place(tmp_path, HOURLY + '[hooks]\non_finished = ["true"]\non_missed = ["true"]\n')
     await place.serve(4600.0)
     (run, _) = place.store.runs()
-    assert run.untold == ("on_finished",)
-    place.told.clear()
+    assert run.pending_hooks == ("on_finished",)
+    place.changes.clear()
     place.clock.set_by += timedelta(hours=1)
     await place.serve(60.0)
-    assert [(run.state, run.untold) for run in place.told] == [
+    assert [(run.state, run.pending_hooks) for run in place.changes] == [
         (RunState.DONE, ("on_finished",)),
         (RunState.MISSED, ("on_missed",)),
     ]
+
+
+def test_hooks_that_an_earlier_version_left_are_pending(tmp_path: Path) -> None:
+    """Its databases have the column `untold`."""
+    store = RunStore(tmp_path)
+    store.save(done())
+    with contextlib.closing(sqlite3.connect(store.path)) as database, database:
+        database.execute("UPDATE runs SET untold = ?", ('["on_finished"]',))
+    (run,) = store.runs()
+    assert run.pending_hooks == ("on_finished",)

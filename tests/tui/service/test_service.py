@@ -39,7 +39,7 @@ async def test_runs_when_due_and_estimates_after(tmp_path: Path) -> None:
     assert place.steps.started[0][1] == 600
     assert run.ended is not None
     assert run.ended - run.due >= timedelta(seconds=630)
-    assert [run.state for run in place.told] == ["recording", "estimating", "done"] * 2
+    assert [run.state for run in place.changes] == ["recording", "estimating", "done"] * 2
 
 
 async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_rest(

@@ -1,4 +1,4 @@
-"""What systemd and Prometheus are told."""
+"""What systemd and Prometheus receive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from daq.bench.tables.unattended import Metrics
 from tests.tui.service.bench_files import HOURLY, Place
 from tui.output.logs.journal import JournalHandler
 from tui.output.logs.lines import fields_of
-from tui.service.hooks import Teller
+from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
 from tui.service.supervision import is_alive, signs_of_life
@@ -77,11 +77,11 @@ def test_the_interval_is_half_of_what_systemd_allows(monkeypatch: pytest.MonkeyP
 async def test_metrics_show_runs_sensors_and_disk(tmp_path: Path) -> None:
     place = Place(tmp_path, HOURLY)
     service = place.service()
-    teller = Teller(lambda: service.bench.hooks, place.store, tmp_path, place.clock)
-    metrics = ServiceMetrics(service, teller)
+    hook_runner = HookRunner(lambda: service.bench.hooks, place.store, tmp_path, place.clock)
+    metrics = ServiceMetrics(service, hook_runner)
     task = asyncio.create_task(service.run())
     await asyncio.sleep(2 * 3600.0)  # 14:00:30
-    for run in place.told:
+    for run in place.changes:
         metrics.note(run)
     with metrics.served(Metrics(port=0)) as port:
         with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):

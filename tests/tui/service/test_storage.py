@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from daq.recording.storage.locking import WriterLock
 from tests.tui.service.bench_files import START, bench_of
 from tui.service.records.run_state import Run, RunState
-from tui.service.records.storage import KEPT, tidy
+from tui.service.records.storage import MIN_KEPT_RUNS, tidy
 from tui.service.records.store import RunStore
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def test_old_runs_go_with_all_their_files_but_for_the_newest(tmp_path: Path) -> 
     bench = bench_of(tmp_path, '[storage]\nkeep_for = "30d"\n')
     removed = tidy(bench, store, START)
     assert [run.parts for run in removed] == [("50.h5",), ("40.h5",)]
-    assert len(left(store)) == KEPT
+    assert len(left(store)) == MIN_KEPT_RUNS
     assert not list(store.path.parent.glob("50*[!t]"))
     assert (store.path.parent / "50.txt").exists()  # not ours
     assert [run.removed for run in store.runs()][:3] == [START, START, None]

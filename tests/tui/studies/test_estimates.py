@@ -28,7 +28,7 @@ def test_averages_scatter_about_the_true_matrix_as_so_many_do() -> None:
 
 @pytest.mark.parametrize("name", ["small-samples", "quiet", "unequal"])
 def test_short_studies_agree(name: str) -> None:
-    (study,) = reproduce([name], told=quiet, length=0.02)
+    (study,) = reproduce([name], progress=quiet, length=0.02)
     assert study.name == name
     assert study.agrees
 
@@ -44,5 +44,5 @@ def test_an_estimate_that_is_wrong_fails(monkeypatch: pytest.MonkeyPatch) -> Non
         return self_noise(method, csm, n_effective=2 * n_effective, **known)  # type: ignore[arg-type]
 
     monkeypatch.setattr("tui.studies.estimates.self_noise", twice)
-    (study,) = reproduce(["coverage"], told=quiet, length=0.05)
+    (study,) = reproduce(["coverage"], progress=quiet, length=0.05)
     assert not study.agrees

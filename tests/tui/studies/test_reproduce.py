@@ -110,7 +110,7 @@ def test_the_window_smooths_what_a_laboratory_expects() -> None:
         },
     }
     scenario = Scenario.from_dict(table, sampling_rate=200.0)
-    measured = measure(scenario, duration=1500.0, told=lambda share: quiet("test", share))
+    measured = measure(scenario, duration=1500.0, progress=lambda share: quiet("test", share))
     assert measured.n_effective > 250
     expected = np.einsum("fcc->fc", measured.motion).real + measured.noise
     power = np.einsum("fcc->fc", measured.csm).real / expected
@@ -125,7 +125,7 @@ def test_the_window_smooths_what_a_laboratory_expects() -> None:
 @pytest.mark.long
 def test_a_laboratory_case_in_four_minutes() -> None:
     """Above 5 Hz, where so few averages still find the motion."""
-    (study,) = reproduce(["setup2"], told=quiet, length=0.02)
+    (study,) = reproduce(["setup2"], progress=quiet, length=0.02)
     spectra, biases = study.panels
     assert [curve.label for curve in spectra.curves] == [
         "motion and noise",
@@ -191,7 +191,7 @@ def test_an_unknown_study_is_refused_before_anything_is_simulated() -> None:
     with pytest.raises(
         ScenarioError,
     ):
-        reproduce(["fig4", "fig6"], told=quiet)
+        reproduce(["fig4", "fig6"], progress=quiet)
     assert set(STUDIES) >= {"fig4", "fig5", "fig9", "fig12", "fig13", "setup1", "setup2", "fig14"}
 
 

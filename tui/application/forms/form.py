@@ -109,9 +109,9 @@ class Form(ModalScreen[Result | None], Generic[Result]):
         """Say what a field means, or what is wrong with it; one to be filled in is not wrong."""
         problem = self.problem(name) if is_refused or self.value(name) else ""
         self.query_one(f"#{name}", Input).set_class(bool(problem), "-wrong")
-        self.tell(problem or self.hint(name), is_wrong=bool(problem))
+        self.show_message(problem or self.hint(name), is_wrong=bool(problem))
 
-    def tell(self, text: str, *, is_wrong: bool = False) -> None:
+    def show_message(self, text: str, *, is_wrong: bool = False) -> None:
         """Write a line below the fields."""
         hint = self.query_one("#hint", Static)
         hint.set_class(is_wrong, "-wrong")

@@ -37,7 +37,7 @@ HINTS = {
     "unit": "Such as m/s², g or m/s: one for all channels, or one for each. Empty: m/s².",
     "direction": "Such as east north up: one for each channel. May be empty.",
 }
-KEPT = ("model", "serial_number", "port", "sampling_rate")
+KEPT_FIELDS = ("model", "serial_number", "port", "sampling_rate")
 
 
 class PortForm(Form[tuple[str, dict[str, Any]]]):
@@ -81,7 +81,7 @@ class PortForm(Form[tuple[str, dict[str, Any]]]):
         if driver:
             self.dismiss((driver, {"port": port}))
             return
-        self.tell(f"looking at {port} for {search_description(port)} …")
+        self.show_message(f"looking at {port} for {search_description(port)} …")
         self._look(port)
 
     @work(thread=True, exclusive=True)
@@ -89,11 +89,11 @@ class PortForm(Form[tuple[str, dict[str, Any]]]):
         try:
             found = self._find(port)
         except (HuddleError, OSError) as error:
-            self.app.call_from_thread(self.tell, str(error), is_wrong=True)
+            self.app.call_from_thread(self.show_message, str(error), is_wrong=True)
             return
         if not found:
             text = f"{port}: found nothing; name the driver, or check cable and power"
-            self.app.call_from_thread(self.tell, text, is_wrong=True)
+            self.app.call_from_thread(self.show_message, text, is_wrong=True)
             return
         first = found[0]
         values: dict[str, Any] = {"port": port, "settings": first.settings}
@@ -131,7 +131,10 @@ class SensorForm(Form[str]):
         }
         fields = [
             Field("name", "name", str(values.get("name", ""))),
-            *(Field(name, name.replace("_", " "), _shown(values.get(name))) for name in KEPT),
+            *(
+                Field(name, name.replace("_", " "), _shown(values.get(name)))
+                for name in KEPT_FIELDS
+            ),
             Field("channels", "channels", " ".join(str(one.get("name")) for one in channels)),
             *(Field(name, name, _of_channels(channels, name)) for name in OF_CHANNELS),
             *(
@@ -170,7 +173,7 @@ class SensorForm(Form[str]):
         """Save, unless the file would have errors that it had not before."""
         new = [fault for fault in self._faults() if fault not in self._faults_before]
         if new:
-            self.tell(str(new[0]), is_wrong=True)
+            self.show_message(str(new[0]), is_wrong=True)
         else:
             self.dismiss(self._edited())
 
@@ -184,7 +187,7 @@ class SensorForm(Form[str]):
         if key.startswith("channels"):
             about = {fault.key.rpartition(".")[2], fault.expected.partition(":")[0]}
             return next((name for name in OF_CHANNELS if name in about), "channels")
-        return key if key in KEPT else "name"
+        return key if key in KEPT_FIELDS else "name"
 
     def _faults(self) -> tuple[FileFault, ...]:
         edited = self._edited()
@@ -198,7 +201,7 @@ class SensorForm(Form[str]):
         sensitivity = [_value(text or "") for text in of_each.pop("sensitivity")]
         values = {
             "name": self.value("name"),
-            **{name: self.value(name) or None for name in KEPT},
+            **{name: self.value(name) or None for name in KEPT_FIELDS},
             "driver": self._driver,
             "sampling_rate": _value(self.value("sampling_rate")),
             "channels": [

@@ -32,9 +32,9 @@ BLANK: Cell = (" ", "")
 JUMP = 8
 """Equal cells from which on it is shorter to set the cursor behind them."""
 _ATTRIBUTES = {"1", "2", "4", "7"}
-COLOURED = 0.25
+MIN_SATURATION = 0.25
 """Saturation from which on a colour is sent."""
-STRONG = 0.66
+MIN_COMPONENT = 0.66
 """Share of the strongest of red, green and blue from which on another one counts."""
 
 
@@ -201,7 +201,7 @@ def _reduced(codes: list[str]) -> str:
 def _colour(red: int, green: int, blue: int) -> list[str]:
     """Return the code of the nearest of eight colours; none for greys."""
     most, least = max(red, green, blue), min(red, green, blue)
-    if most - least < COLOURED * max(most, 1):
+    if most - least < MIN_SATURATION * max(most, 1):
         return []
-    bits = (value > STRONG * most for value in (red, green, blue))
+    bits = (value > MIN_COMPONENT * most for value in (red, green, blue))
     return [str(30 + sum(bit << n for n, bit in enumerate(bits)))]

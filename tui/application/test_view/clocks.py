@@ -10,9 +10,9 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.clock_effect import (
-    HARMLESS,
-    MATTERS,
-    NOTHING,
+    NEGLIGIBLE_EFFECT,
+    NO_EFFECT,
+    SMALL_EFFECT,
     effect_by_sensor,
     grade,
     lags,
@@ -66,11 +66,11 @@ def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
     if not shares:
         return "effect not known yet", MUTED
     worst = max(shares)
-    if worst < NOTHING:
+    if worst < NO_EFFECT:
         said = f"no effect on noise ({percent(worst)})"
-    elif worst < HARMLESS:
+    elif worst < NEGLIGIBLE_EFFECT:
         said = f"negligible, {percent(worst)} of the noise"
-    elif worst < MATTERS:
+    elif worst < SMALL_EFFECT:
         said = f"small, {percent(worst)} of the noise"
     else:
         said = f"they matter here, {percent(worst)} of the noise"
@@ -162,6 +162,6 @@ def microseconds(seconds: float) -> str:
 
 def percent(share: float) -> str:
     """Return a share as percent, to what makes sense."""
-    if share < NOTHING:
+    if share < NO_EFFECT:
         return "<0.1 %"
     return f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 SPAN = 60.0
 """Seconds that are looked at, at least."""
-APART = 15.0
+SNAPSHOT_INTERVAL = 15.0
 """Seconds from one kept snapshot to the next."""
-EVERY = 5.0
+UPDATE_INTERVAL = 5.0
 """Seconds from one look to the next."""
 AVERAGES = 4
 """Averages for each channel of a sensor, at least."""
@@ -39,7 +39,7 @@ class RecentMotion:
 
     def __init__(self) -> None:
         self._kept: list[_Sum] = []
-        self._looked = -EVERY
+        self._looked = -UPDATE_INTERVAL
         self._found: tuple[NoSharedMotion, ...] = ()
 
     def strangers(self, snapshot: Snapshot) -> tuple[NoSharedMotion, ...]:
@@ -50,7 +50,7 @@ class RecentMotion:
         snapshot : Snapshot
             Later than those before. Its diagnosis names the bands that are looked at.
         """
-        if snapshot.elapsed - self._looked < EVERY:
+        if snapshot.elapsed - self._looked < UPDATE_INTERVAL:
             return self._found
         self._looked = snapshot.elapsed
         now = _Sum(snapshot.elapsed, snapshot.n_segments, snapshot.csm)
@@ -58,7 +58,7 @@ class RecentMotion:
         while len(kept) > 1 and kept[1].elapsed <= now.elapsed - SPAN:
             del kept[0]
         self._kept = kept
-        if not kept or now.elapsed - kept[-1].elapsed >= APART:
+        if not kept or now.elapsed - kept[-1].elapsed >= SNAPSHOT_INTERVAL:
             self._kept = [*kept, now]
         is_long = bool(kept) and kept[0].elapsed <= now.elapsed - SPAN
         self._found = _strangers(snapshot, kept[0], now) if is_long else ()

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 
-OF_A_SNAPSHOT = {
+SNAPSHOT_ACTIONS = {
     *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "pick", "freeze"),
     *("cursor", "zoom", "pan", "whole"),
 }
@@ -112,7 +112,7 @@ class TestView(View):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
-        return action not in OF_A_SNAPSHOT or self.state.snapshot is not None
+        return action not in SNAPSHOT_ACTIONS or self.state.snapshot is not None
 
     def _change(self, change: Callable[[Choice, Snapshot], Choice]) -> None:
         """Look at something else."""

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-OURS = ("daq", "estimator", "sim_devices", "tui", "huddle")
+OWN_LOGGERS = ("daq", "estimator", "sim_devices", "tui", "huddle")
 """Packages that log from the chosen level on; others log from WARNING on."""
-UNHEARD = ("pymodbus",)
+SILENCED = ("pymodbus",)
 """Libraries whose messages repeat errors of our own."""
 COMMAND = logging.getLogger("huddle")
 """The logger of the command itself."""
@@ -130,9 +130,9 @@ def configure(
     handler.set_name(COMMAND.name)
     root.addHandler(handler)
     root.setLevel(logging.WARNING)
-    for name in OURS:
+    for name in OWN_LOGGERS:
         logging.getLogger(name).setLevel(_number(level))
-    for name in UNHEARD:
+    for name in SILENCED:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     reserve_standard_error(for_json=style is not LogFormat.TEXT and file is None)
     logging.raiseExceptions = False  # a full disk below standard error

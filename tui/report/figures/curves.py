@@ -38,7 +38,7 @@ WIDTH = 7.1
 """Of a plot in inches: that of A4 between its margins."""
 KEY_COLUMN = 1.2
 """Width of an entry of the key, in inches."""
-BEYOND = 60.0
+MODEL_RANGE_DB = 60.0
 """By how many dB a noise model may widen the vertical scale."""
 
 
@@ -310,8 +310,8 @@ def _scale(curves: list[_Curves]) -> tuple[float, float]:
         span = curves[0].frequency[[0, -1]]
         psd = [psd[(at >= span[0]) & (at <= span[1])] for at, psd in curves[0].models.values()]
         shown = _decibels(np.concatenate(psd))
-        low = min(low, max(shown.min(initial=math.inf), low - BEYOND))
-        high = max(high, min(shown.max(initial=-math.inf), high + BEYOND))
+        low = min(low, max(shown.min(initial=math.inf), low - MODEL_RANGE_DB))
+        high = max(high, min(shown.max(initial=-math.inf), high + MODEL_RANGE_DB))
     return 10 * math.floor(low / 10 - 0.3), 10 * math.ceil(high / 10 + 0.1)
 
 

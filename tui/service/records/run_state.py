@@ -111,7 +111,7 @@ class Run:
         Whether it must be kept.
     removed : datetime or None
         When its files were removed.
-    untold : tuple of str
+    pending_hooks : tuple of str
         Hooks that have not been carried out.
     """
 
@@ -130,7 +130,7 @@ class Run:
     attempts: int = 0
     pinned: bool = False
     removed: datetime | None = None
-    untold: tuple[str, ...] = ()
+    pending_hooks: tuple[str, ...] = ()
     noise: tuple[BandNoise, ...] = field(default=(), compare=False)
 
     @property

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tui.service.records.store import RunStore
 
 _LOGGER = logging.getLogger(__name__)
-KEPT = 3
+MIN_KEPT_RUNS = 3
 """Number of the newest runs that neither age nor a full disk removes."""
 
 
@@ -67,13 +67,13 @@ def tidy(
         reason = ""
         if storage.keep_runs is not None and n_newer >= storage.keep_runs:
             reason = f"{storage.keep_runs} newer runs are kept"
-        elif n_newer >= KEPT and _is_old(run, now, keep_for):
+        elif n_newer >= MIN_KEPT_RUNS and _is_old(run, now, keep_for):
             if doubt:
                 _LOGGER.warning("no run is removed for its age: %s", doubt)
                 keep_for = None
             else:
                 reason = "older than the bench file wants"
-        elif n_newer >= KEPT and storage.keep_free is not None:
+        elif n_newer >= MIN_KEPT_RUNS and storage.keep_free is not None:
             found = free(folder)
             if found < storage.keep_free:
                 reason = f"{found / 1e6:.0f} MB of free space are too few"

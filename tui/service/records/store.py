@@ -43,6 +43,7 @@ _COLUMNS = (
     *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
     *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
 )
+# `untold` holds Run.pending_hooks: renamed, earlier versions could not open the database.
 _NOISE = tuple(field.name for field in fields(BandNoise))
 
 
@@ -94,11 +95,11 @@ class RunStore:
                 "UPDATE runs SET pinned = ? WHERE key = ?", [(int(pinned), key) for key in keys]
             )
 
-    def set_untold(self, run: Run, untold: Sequence[str]) -> None:
+    def set_pending_hooks(self, run: Run, events: Sequence[str]) -> None:
         """Write which hooks of a run have still to be carried out."""
         with self._changed() as database:
             database.execute(
-                "UPDATE runs SET untold = ? WHERE key = ?", (json.dumps(list(untold)), run.key)
+                "UPDATE runs SET untold = ? WHERE key = ?", (json.dumps(list(events)), run.key)
             )
 
     def set_removed(self, run: Run, when: datetime) -> None:
@@ -209,7 +210,7 @@ def _row(run: Run) -> dict[str, Any]:
         "attempts": run.attempts,
         "pinned": int(run.pinned),
         "removed": utc_text(run.removed),
-        "untold": json.dumps(run.untold),
+        "untold": json.dumps(run.pending_hooks),
     }
 
 
@@ -230,7 +231,7 @@ def _run(row: dict[str, Any], noise: tuple[BandNoise, ...]) -> Run:
         attempts=row["attempts"],
         pinned=bool(row["pinned"]),
         removed=from_text(row["removed"]),
-        untold=tuple(json.loads(row["untold"])),
+        pending_hooks=tuple(json.loads(row["untold"])),
         noise=noise,
     )
 

@@ -54,7 +54,7 @@ STYLES = {"three-channel": "k-", "three-sensor": "C0-", "maximum-likelihood": "C
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredSpectra:
     """Cross-spectral matrix of a scenario, and the same without statistical error.
 
     That is `motion` (n_freqs, n_channels, n_channels) and `noise` (n_freqs, n_channels) on its
@@ -67,7 +67,7 @@ class Measured:
     noise: FloatArray
     n_effective: float
 
-    def of(self, sensors: tuple[str, ...]) -> Measured:
+    def of(self, sensors: tuple[str, ...]) -> MeasuredSpectra:
         """Return the part that belongs to some sensors, in their order."""
         first = {name: 3 * number for number, name in enumerate(self.scenario.names)}
         used = np.concatenate([first[name] + np.arange(3) for name in sensors])
@@ -80,23 +80,25 @@ class Measured:
 class Laboratory:
     """The set-ups' cross-spectral matrices, simulated when first wanted."""
 
-    def __init__(self, told: ProgressCallback, *, length: float = 1.0) -> None:
-        self._told = told
+    def __init__(self, progress: ProgressCallback, *, length: float = 1.0) -> None:
+        self._progress = progress
         self._duration = DURATION * length
-        self._measured: dict[str, Measured] = {}
+        self._measured: dict[str, MeasuredSpectra] = {}
 
-    def measured(self, name: str) -> Measured:
+    def measured(self, name: str) -> MeasuredSpectra:
         """Simulate a named scenario at the paper's length, and transform what its sensors read."""
         if name not in self._measured:
             self._measured[name] = measure(
                 paper_scenarios.named(name),
                 duration=self._duration,
-                told=lambda share: self._told(f"{name}: five triaxial sensors", share),
+                progress=lambda share: self._progress(f"{name}: five triaxial sensors", share),
             )
         return self._measured[name]
 
 
-def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None]) -> Measured:
+def measure(
+    scenario: Scenario, *, duration: float, progress: Callable[[float], None]
+) -> MeasuredSpectra:
     """Simulate triaxial sensors for a duration in seconds, and transform what they read."""
     world = World(scenario)
     spectra = CrossSpectra(HANN, 3 * len(scenario.names))
@@ -113,8 +115,8 @@ def measure(scenario: Scenario, *, duration: float, told: Callable[[float], None
             starts = np.arange(0, len(together) - length + 1, hop)
             spectra.add(together, starts)
             kept = [together[len(starts) * hop :]]
-            told((first + n) / n_samples)
-    return Measured(
+            progress((first + n) / n_samples)
+    return MeasuredSpectra(
         scenario=scenario,
         csm=spectra.csm()[SHOWN],
         motion=smoothed(lambda f: world.motion_csm(scenario.names, f), HANN)[SHOWN],
@@ -178,7 +180,7 @@ class Noise:
 
 
 def estimate(
-    measured: Measured, sensors: tuple[str, ...], method: str, *, n_channels: int = 1
+    measured: MeasuredSpectra, sensors: tuple[str, ...], method: str, *, n_channels: int = 1
 ) -> Noise:
     """Estimate the noise of the leading channels of some sensors.
 
@@ -201,7 +203,7 @@ def estimate(
     )
 
 
-def estimate_any_dimension(measured: Measured, *, n_channels: int) -> Noise:
+def estimate_any_dimension(measured: MeasuredSpectra, *, n_channels: int) -> Noise:
     """Estimate by maximum likelihood, with as many dimensions of motion as the test asks for.
 
     Theory expects the true noise, though only as far as the motion has no further dimensions.
@@ -268,7 +270,7 @@ def _spectra(
     return Panel(title, FREQUENCY_LABEL, PSD_LABEL, curves=(record, *curves), log="xy")
 
 
-def _record(measured: Measured, sensor: str) -> Curve:
+def _record(measured: MeasuredSpectra, sensor: str) -> Curve:
     power = measured.of((sensor,)).csm[:, 0, 0].real
     return Curve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
 

@@ -77,14 +77,14 @@ class Ingredients:
 
     Parameters
     ----------
-    told
+    progress
         Takes progress.
     length
         Share of the paper's length.
     """
 
-    def __init__(self, told: ProgressCallback, *, length: float = 1.0) -> None:
-        self._told = told
+    def __init__(self, progress: ProgressCallback, *, length: float = 1.0) -> None:
+        self._progress = progress
         self._length = length
         self._matrices: dict[int, tuple[ComplexArray, int]] = {}
 
@@ -104,7 +104,7 @@ class Ingredients:
             n = min(SEGMENTS_AT_ONCE, n_segments - spectra.n_segments) * length
             samples = [world.samples(name, first, n) for name in scenario.names]
             spectra.add(np.concatenate(samples, axis=1), np.arange(0, n, length))
-            self._told(
+            self._progress(
                 f"white motion and noise, {n_segments} segments", spectra.n_segments / n_segments
             )
         return spectra.csm()[BAND]
