@@ -18,7 +18,7 @@ from tui.cli.examples import EXAMPLES
 from tui.cli.subcommands import MODULES, PANELS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     Rows = Iterable[tuple[str, tuple[str, str]]]
     """Panel, and a form with its help."""
@@ -30,9 +30,20 @@ _HYPHEN = "\N{NON-BREAKING HYPHEN}"
 class HelpfulCommand(TyperCommand):
     """A subcommand."""
 
+    def __init__(self, *args: Any, **declared: Any) -> None:
+        super().__init__(*args, **declared)
+        parameters: list[Any] = list(self.params)
+        for parameter in parameters:
+            converter = _Converter(parameter.get_runtime_param)
+            parameter.get_runtime_param = converter.itself
+
     def get_help(self, ctx: Any) -> str:
         """Return the page."""
         return super().get_help(ctx).replace(_HYPHEN, "-")
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return ``--help``, off by default."""
+        return _off_by_default(super().get_help_option(ctx))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a section for each panel of options."""
@@ -52,6 +63,27 @@ class HelpfulCommand(TyperCommand):
         return super().invoke(ctx)
 
 
+class _Converter:
+    """Converts the value of a parameter as typer does, if one is given.
+
+    Typer makes a converter with Pydantic for every parameter: those of thirty options take longer
+    than all the rest of reading a command line.
+    """
+
+    def __init__(self, of_typer: Callable[[], Any]) -> None:
+        self._of_typer = of_typer
+
+    def itself(self) -> _Converter:
+        """Return the converter: in place of typer's ``get_runtime_param``."""
+        return self
+
+    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the value; that of typer if none is given."""
+        if value is None:
+            return () if param.multiple or param.nargs == -1 else None
+        return self._of_typer().coerce(value, param=param, ctx=ctx)
+
+
 class LazyGroup(TyperGroup):
     """The subcommands of `PANELS`; one is built when it is used."""
 
@@ -62,11 +94,8 @@ class LazyGroup(TyperGroup):
                 self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
 
     def get_help_option(self, ctx: Any) -> Any:
-        """Return ``--help``. By its default it is off, so no Pydantic is needed to read nothing."""
-        option = super().get_help_option(ctx)
-        if option is not None:
-            option.default = False
-        return option
+        """Return ``--help``, off by default."""
+        return _off_by_default(super().get_help_option(ctx))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a subcommand with its options; None if there is none of this name."""
@@ -90,6 +119,13 @@ def subcommand(name: str) -> Any:
     epilog = "\n".join(EXAMPLES[function.__name__])
     alone.command(name, cls=HelpfulCommand, epilog=epilog)(function)
     return typer.main.get_command(alone)
+
+
+def _off_by_default(switch: Any) -> Any:
+    """Return a switch that is off if it is not given: Pydantic is not needed to read nothing."""
+    if switch is not None:
+        switch.default = False
+    return switch
 
 
 def _options(parameters: Iterable[Any], ctx: Any) -> Rows:

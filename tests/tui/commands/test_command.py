@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,26 @@ def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
         "serial",
     }
     assert not loaded & unwanted
+
+
+@pytest.mark.parametrize("given", [[], ["--band", "1:20"]])
+def test_only_given_options_are_converted(
+    given: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Typer would make a converter for each of thirty options, which takes long."""
+    adapters = import_module("typer._adapters")
+    build, made = adapters.try_build_adapter, []
+
+    def counted(annotation: object, parameter_info: object) -> object:
+        made.append(annotation)
+        return build(annotation, parameter_info)
+
+    monkeypatch.setattr(adapters, "try_build_adapter", counted)
+    subcommand.cache_clear()
+    context = subcommand("estimate").make_context("estimate", ["night.h5", *given])
+    assert context.params["files"] == [Path("night.h5")]
+    assert context.params["csv"] is None
+    assert len(made) == 1 + len(given) // 2
 
 
 def test_a_report_without_matplotlib_names_the_extra_before_anything_is_estimated(
