@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -17,7 +17,15 @@ from daq.results.noise_parameters import noise_parameters as parameters_of
 from daq.results.noise_parameters import quantisation_shares
 from daq.results.sources import sources
 from tui.output.advice.diagnostics import details, summary
-from tui.output.console import check_places, for_people, hint, progress, write_json, write_text
+from tui.output.console import (
+    check_places,
+    for_people,
+    hint,
+    progress,
+    shows_progress,
+    write_json,
+    write_text,
+)
 from tui.output.json_document import document
 from tui.output.noise_parameters import (
     allan_table,
@@ -31,12 +39,13 @@ from tui.output.verdict_text import EXIT_CODES, STYLES, headline, limit_line, no
 from tui.runs.estimate_settings import settings_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from rich.console import Console
 
     from daq.bench.model import Bench
+    from daq.estimation.estimation import Progress
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from daq.results.decision.verdict import TestVerdict
@@ -98,21 +107,33 @@ def estimated(
     """Estimate recordings, showing the progress; return also the settings and the first bench."""
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
-        progress(
-            TextColumn("segments"),
-            BarColumn(),
-            TextColumn("{task.completed} of {task.total}"),
-            TimeRemainingColumn(),
-        ) as bar,
+        _counted_segments() as count,
     ):
         settings, bench = settings_of(first, start=start, end=end, **wanted)
-        task = bar.add_task("")
-        snapshot = estimate(
-            [first, *files[1:]],
-            settings,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+        snapshot = estimate([first, *files[1:]], settings, progress=count)
     return snapshot, settings, bench
+
+
+@contextmanager
+def _counted_segments() -> Iterator[Progress | None]:
+    """Show how many segments of all are taken; None where that is not shown."""
+    if not shows_progress():
+        yield None
+        return
+    from rich.progress import (  # noqa: PLC0415 - files and pipes show none
+        BarColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    with progress(
+        TextColumn("segments"),
+        BarColumn(),
+        TextColumn("{task.completed} of {task.total}"),
+        TimeRemainingColumn(),
+    ) as bar:
+        task = bar.add_task("")
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def show_result(

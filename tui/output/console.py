@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn
 from rich.segment import Segment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rich.console import ConsoleOptions, RenderableType
+    from rich.progress import Progress, ProgressColumn
 
 STANDARD_OUTPUT = "-"
 WIDTH_OF_FILES = 110
@@ -82,18 +82,24 @@ def _width(stream: TextIO) -> int | None:
     return None if stream.isatty() else WIDTH_OF_FILES
 
 
+def shows_progress() -> bool:
+    """Whether it is shown how far something is: on terminals only, not in files and pipes."""
+    return notices().is_terminal and not notices().quiet
+
+
 def progress(*columns: str | ProgressColumn, per_second: float = 2) -> Progress:
-    """Return a display of how far something is, on terminals; files and pipes get none.
+    """Return a display of how far something is, where `shows_progress`.
 
     It is drawn so many times `per_second`.
     """
-    screen = notices()
+    from rich.progress import Progress  # noqa: PLC0415 - recorders and services show none
+
     return Progress(
         *columns,
-        console=screen,
+        console=notices(),
         refresh_per_second=per_second,
         transient=True,
-        disable=screen.quiet or not screen.is_terminal,
+        disable=not shows_progress(),
     )
 
 
