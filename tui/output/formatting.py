@@ -16,6 +16,10 @@ ONE_SIDED = 1.1
 """Lower half of an interval over its upper half, from which on both are shown."""
 ONE_SIDED_DB = 0.02
 """Halves that differ by less are shown as one, the larger."""
+_PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n"}
+_PREFIXED = {"m/s²", "m/s", "m", "g", "Gal", "V", "rad"}
+"""Units that take a prefix."""
+_MOST_DECIMALS = 3
 
 
 def utc(ns: int) -> str:
@@ -91,6 +95,41 @@ def signed(value: float, spec: str) -> str:
 def several(count: int, one: str, more: str | None = None) -> str:
     """Return a count with its noun."""
     return f"{count:,} {one if count == 1 else more or one + 's'}".replace(",", "\u202f")
+
+
+def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
+    """Return readings of one unit as decimal numbers, and the unit that all of them have then.
+
+    The unit gets the SI prefix, or the power of ten where it takes none, with which the largest
+    reading is between 1 and 1000. All have as many decimals as show three digits of the largest
+    and two of the smallest, but at most three.
+    """
+    own = next((n for n, prefix in _PREFIXES.items() if n and unit.removeprefix(prefix) != unit), 0)
+    base = unit.removeprefix(_PREFIXES[own])
+    if base not in _PREFIXED:
+        base, own = unit, 0
+    exponents = [math.floor(math.log10(abs(value))) for value in values if value]
+    if not exponents:
+        return ["0"] * len(values), unit
+    takes_prefix = base in _PREFIXED
+    largest = 3 * ((max(exponents) + own) // 3)
+    if takes_prefix:
+        shift = min(max(largest, min(_PREFIXES)), 0)
+    else:
+        shift = 0 if largest in {0, 3} else largest
+    digits = max(2 - max(exponents), 1 - min(exponents)) + shift - own
+    decimals = min(max(digits, 0), _MOST_DECIMALS)
+    least = 10.0**-decimals
+    texts = []
+    for value in values:
+        text = signed(value * 10.0 ** (own - shift), f".{decimals}f")
+        if value and not any(digit in text for digit in "123456789"):
+            text = f"<{least:.{decimals}f}" if value > 0 else f">−{least:.{decimals}f}"
+        texts.append(text)
+    if takes_prefix:
+        return texts, _PREFIXES[shift] + base
+    power = str(shift).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return texts, f"10{power} {unit}" if shift else unit
 
 
 def degrees(angle: float) -> str:

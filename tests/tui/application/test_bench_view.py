@@ -18,7 +18,7 @@ from tests.tui.application.screen_text import assert_looks_as_before, screen_tex
 from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tui.application.app import HuddleApp
-from tui.application.bench_view.sensors import sensors_of_bench
+from tui.application.bench_view.sensors import channel_traces, sensors_of_bench
 from tui.application.bench_view.traces import trace
 from tui.application.state import State
 
@@ -80,6 +80,19 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         reading.is_over.wait(60)
         await shown(pilot, app)
         assert "last 10 s" not in screen_text(app)
+
+
+def test_channels_of_several_units_have_each_its_own() -> None:
+    first, second, _ = SOUND
+    channels = tuple(each.model_copy(update={"unit": "V"}) for each in second.sensor.channels)
+    other = replace(second, sensor=second.sensor.model_copy(update={"channels": channels}))
+    header, *rows = channel_traces((first, other), width=100).plain.splitlines()
+    assert header.split() == ["channel", "mean", "RMS", "peak", "last", "10", "s"]
+    units = [row.split()[2:7:2] for row in rows]
+    assert units[0] == units[1] == units[2]
+    assert units[3] == units[4] == units[5]
+    assert all(unit.endswith("m/s²") for unit in units[0])
+    assert all(unit.endswith("V") for unit in units[3])
 
 
 async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(

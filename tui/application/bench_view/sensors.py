@@ -12,7 +12,7 @@ from daq.acquisition.before_test.findings import Problem
 from daq.acquisition.before_test.preflight import check_before_test, is_complete
 from tui.application.bench_view.traces import trace
 from tui.application.columns import columns, width_of
-from tui.output.formatting import listed, signed
+from tui.output.formatting import listed, readings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MUTED, GOOD, DOUBTFUL, BAD = "#9aa5b8", "green", "yellow", "bold #ff6b6b"
 LEAST_TRACE, WIDEST_TRACE = 12, 60  # columns
-NUMBERS = {"Hz", "°C", "mean", "RMS", "peak"}
+NUMBERS = {"Hz", "°C"}
 ADVICE: Mapping[Problem, str] = {
     Problem.TROUBLE: "{text}",
     Problem.NO_SAMPLES: "{sensor} answers and sends no samples: check its settings",
@@ -128,7 +128,7 @@ def _state(each: SensorPreview) -> Text:
 
 def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Text:
     """Return a row per channel: the last second as numbers, the last ten as a trace."""
-    rows, shown = [], []
+    names, units, shown, numbers = [], [], [], []
     for each in sensors:
         second = each.samples[-max(1, round(each.sensor.sampling_rate)) :]
         for n, channel in enumerate(each.sensor.channels):
@@ -136,17 +136,16 @@ def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Text:
                 continue
             values = second[:, n]
             mean = float(values.mean())
+            names.append(Text(f"{each.sensor.name}.{channel.name}", "bold"))
+            units.append(channel.unit)
             shown.append(each.samples[:, n])
-            rows.append(
-                (
-                    Text(f"{each.sensor.name}.{channel.name}", "bold"),
-                    Text(signed(mean, ".3g")),
-                    Text(f"{values.std():.2g}"),
-                    Text(f"{np.abs(values - mean).max():.2g}"),
-                    Text(channel.unit, MUTED),
-                )
-            )
-    titles = ("channel", "mean", "RMS", "peak", "unit")
+            numbers.append((mean, float(values.std()), float(np.abs(values - mean).max())))
+    rows: list[tuple[Text, ...]] = [(name,) for name in names]
+    titles = ["channel"]
+    for n, title in enumerate(("mean", "RMS", "peak")):
+        cells, header = _readings(title, [each[n] for each in numbers], units)
+        rows = [(*row, Text(cell)) for row, cell in zip(rows, cells, strict=True)]
+        titles.append(header)
     room = min(max(LEAST_TRACE, width - width_of(titles, rows)), WIDEST_TRACE)
     return columns(
         (*titles, "last 10 s"),
@@ -154,8 +153,22 @@ def channel_traces(sensors: Sequence[SensorPreview], *, width: int) -> Text:
             (*row, Text(trace(values, width=room), "#4cc9f0"))
             for row, values in zip(rows, shown, strict=True)
         ],
-        right=NUMBERS,
+        right=titles[1:],
     )
+
+
+def _readings(
+    title: str, column: Sequence[float], units: Sequence[str]
+) -> tuple[Sequence[str], str]:
+    """Return the cells of a column and its header, which has the unit if all channels share it."""
+    cells = [""] * len(column)
+    found = ""
+    for unit in dict.fromkeys(units):
+        at = [n for n, each in enumerate(units) if each == unit]
+        texts, found = readings([column[n] for n in at], unit)
+        for n, text in zip(at, texts, strict=True):
+            cells[n] = text if len(at) == len(units) else f"{text} {found}"
+    return cells, f"{title}, {found}" if len(set(units)) == 1 else title
 
 
 def checks(sensors: Sequence[SensorPreview]) -> list[Text]:
