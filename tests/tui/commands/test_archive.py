@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from daq.archive.answers import answer
 from daq.archive.store import Store
+from daq.bench.masks.mask_file import masks_named
 from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
 from tests.daq.archive.months import (
@@ -38,6 +39,7 @@ from tests.tui.output.test_result_schema import SCHEMA as RESULT
 from tests.tui.output.test_result_schema import strict
 from tests.waiting import finish, wait_until
 from tui.cli.main import app
+from tui.report.figures import drawing
 from tui.report.figures.archive import days_figure, density_figure
 
 if TYPE_CHECKING:
@@ -223,5 +225,13 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
     for axes in days.axes:
         labels = axes.get_legend_handles_labels()[1]
         assert {"drift", "change beyond uncertainty"} <= set(labels)
-    density = density_figure(found)
+    density = density_figure(found, masks_named("nlnm,nhnm"))
     assert [axes.get_title() for axes in density.axes[:6]] == titles
+    with drawing.look():
+        for figure in (days, density):
+            figure.draw_without_rendering()
+            (key,) = figure.legends
+            box = key.get_window_extent()
+            assert box.x0 >= 0
+            assert box.x1 <= figure.bbox.width
+            assert box.y0 >= max(axes.title.get_window_extent().y1 for axes in figure.axes[:6])

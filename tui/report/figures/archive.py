@@ -190,13 +190,17 @@ def _labels(figure: Figure, panels: Sequence[Axes], x: str, y: str) -> None:
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)
-    figure.legend(
-        handles=list(named.values()),
-        labels=list(named),
-        loc="outside upper left",
-        ncols=6,
-        frameon=False,
-    )
+    for n_columns in range(len(named), 0, -1):
+        key = figure.legend(
+            handles=list(named.values()),
+            labels=list(named),
+            loc="outside upper left",
+            ncols=n_columns,
+            frameon=False,
+        )
+        if key.get_window_extent().width <= figure.bbox.width or n_columns == 1:
+            return
+        key.remove()
 
 
 def _decibel_axis(axes: Axes) -> None:
