@@ -99,7 +99,7 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
     aligned = huddle.plan(snr=250, fs=200, segment="10s")
     assert "or use six sensors: five on a circle of 12 cm" in aligned.remarks[-1]
     four = huddle.plan(snr=250, fs=200, segment="10s", sensors=4)
-    assert "no band is called accepted" in four.remarks[-1]
+    assert "no band is accepted" in four.remarks[-1]
     six = huddle.plan(snr=250, fs=200, segment="10s", sensors=6)
     assert "six sensors" not in six.remarks[-1]
     assert aligned.waves is not None

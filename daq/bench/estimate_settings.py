@@ -157,8 +157,8 @@ class EstimateSettings:
         float,
         Option(
             "Use segments with gaps of up to this share of their length, by a window that is zero"
-            " in them, where fewer than half of the segments have no gap; 0 excludes them always"
-            " (default 0.6). Not with --octaves or --reject.",
+            " in them, where fewer than half of the segments have no gap; 0 excludes them always."
+            " Not with --octaves or --reject.",
             check=values.share,
             flags=("--bridge",),
             metavar="SHARE",
@@ -178,8 +178,9 @@ class EstimateSettings:
         int | Literal["auto"] | None,
         Option(
             "Dimensions of the common motion for maximum likelihood: a number, or auto for as many"
-            " as the model test of each band requires; with four or more sensors by gradients of"
-            " the motion where they explain it. Default: as many as a sensor has channels.",
+            " as the model test of each band requires; with four or more sensors, auto uses"
+            " gradients of the motion where they explain it. Default: as many as a sensor has"
+            " channels.",
             check=values.dimension,
             flags=("--dimension",),
             metavar="N|auto",

@@ -37,8 +37,9 @@ def tui(
         typer.Option(
             "--on-event",
             metavar="COMMAND",
-            help="Command to start when a test ends and when a sensor is lost. It gets"
-            " HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and HUDDLE_RECORDING.",
+            help="Command to start when a test ends and when a sensor is lost, with"
+            " the environment variables HUDDLE_EVENT (ended, trouble), HUDDLE_TEXT and"
+            " HUDDLE_RECORDING.",
         ),
     ] = "",
     baud: Annotated[
@@ -132,7 +133,7 @@ def record(
     duration: DurationOption = None,
     operator: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Operator in place of that of the bench file."),
+        typer.Option(metavar="NAME", help="Operator (default: from the bench file)."),
     ] = None,
     until_stopped: Annotated[
         bool,

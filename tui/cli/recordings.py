@@ -100,10 +100,10 @@ def calibrate(
 ) -> None:
     """Calibrate sensors against one of them by their common motion.
 
-    Sensitivity, cross-axis response, angles, delay and skew of every
-    channel, each with its uncertainty, and an uncertainty budget by the GUM.
-    Results are absolute if the bench file has a certificate for each channel
-    of the reference.
+    The command prints sensitivity, cross-axis response, angles, delay and
+    skew of every channel, each with its uncertainty, and an uncertainty
+    budget according to the GUM. Results are absolute if the bench file has a
+    certificate for each channel of the reference.
 
     Options not given come from the bench file inside the recording.
     """
@@ -265,16 +265,16 @@ def import_(
     net: Annotated[
         str, typer.Option("--net", metavar="CODE", help="Network in an SDS archive, or a pattern.")
     ] = "*",
-    sta: Annotated[str, typer.Option("--sta", metavar="CODE", help="Station, as --net.")] = "*",
+    sta: Annotated[str, typer.Option("--sta", metavar="CODE", help="Station, or a pattern.")] = "*",
     loc: Annotated[
-        str, typer.Option("--loc", metavar="CODE", help="Location, as --net; -- if empty.")
+        str, typer.Option("--loc", metavar="CODE", help="Location, or a pattern; -- if empty.")
     ] = "*",
     json: JsonOption = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Convert files of other programs into a recording.
 
-    A sensor may be in several files. Files of any length take little memory. A file or channel that
+    A sensor may be in several files. Memory does not depend on their length. A file or channel that
     cannot be used is listed at the end; the others are imported, and the exit code is 3.
 
     miniSEED: a sensor is network.station.location, a channel is its code.
@@ -339,7 +339,7 @@ def export(
 ) -> None:
     """Write samples or noise curves for other programs.
 
-    mseed: all samples (times to 0.5 % of a sample), and StationXML.
+    mseed: all samples (times within 0.5 % of the sampling interval), and StationXML.
 
     csv, parquet: a row for each method, channel and frequency.
 

@@ -20,8 +20,8 @@ WAVES = 150.0  # m/s, of a floor; the ground is faster
 ASSUMED_RADIUS = 0.12  # m, of a bench of unknown positions
 _AT = 20.0  # Hz, where precision is compared
 _SIX = (
-    "five on a circle of {radius:.0f} cm and one in its centre, each turned by another angle, no"
-    " multiple of 90°"
+    "five on a circle of {radius:.0f} cm and one in its centre, each rotated by a different angle,"
+    " none of them a multiple of 90°"
 )
 
 
@@ -54,9 +54,11 @@ class Waves:
     @property
     def sentences(self) -> str:
         """What to expect, and what to do."""
-        stand = "as they stand" if self.is_known else f"on a circle of {100 * self.radius:.0f} cm"
+        where = (
+            "at their positions" if self.is_known else f"on a circle of {100 * self.radius:.0f} cm"
+        )
         text = (
-            f"Waves of {WAVES:g} m/s across the sensors, {stand}, bias the three-sensor estimate by"
+            f"Waves of {WAVES:g} m/s across the sensors, {where}, bias the three-sensor estimate by"
             f" 1 % of the noise at {self.one_percent:.2g} Hz and by 100 % at"
             f" {10 * self.one_percent:.2g} Hz."
         )
@@ -68,8 +70,8 @@ class Waves:
             )
         elif not math.isfinite(self.cost) or self.n_sensors < MIN_DETERMINED_SENSORS:
             text += (
-                f" {self.n_sensors} sensors tell gradients of the motion from noise only if like"
-                " channels have like noise, and no band is called accepted. Put them closer"
+                f" {self.n_sensors} sensors tell gradients of the motion from noise only if"
+                " corresponding channels have equal noise, and no band is accepted. Put them closer"
                 " together, or use six sensors:"
             )
         else:
@@ -79,8 +81,11 @@ class Waves:
             )
             if self.cost <= 1.1 * self.cost_of_six:
                 return text
-            text += " Better are six sensors:"
-        return f"{text} {six}; {self.cost_of_six:.2g}/√n at {_AT:g} Hz."
+            text += " Six sensors are better:"
+        return (
+            f"{text} {six}. With them the c.o.v. of one frequency is {self.cost_of_six:.2g}/√n at"
+            f" {_AT:g} Hz, for n averages."
+        )
 
 
 def waves_across(
