@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from daq.alignment.resampling import USABLE
+from daq.timing.quantiles import median
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -171,7 +172,7 @@ class DelayEstimator:
                 for number, xj in enumerate(sensors)
                 if number != reference
             }
-            spreads = [float(np.median(spread)) for _, spread in found.values()]
+            spreads = [median(spread) for _, spread in found.values()]
             n_shared = sum(spread * self.sampling_rate < _SHARED for spread in spreads)
             if n_shared > most:
                 best, most = (reference, found), n_shared

@@ -122,7 +122,7 @@ def resample(samples: FloatArray, positions: FloatArray, *, ratio: float = 1.0) 
     out = np.empty((len(positions), samples.shape[1]))
     for first in range(0, len(starts), _SPANS_AT_ONCE):
         spans = slice(first, first + _SPANS_AT_ONCE)
-        for count in np.unique(delays[spans]):
+        for count in sorted(set(delays[spans].tolist())):
             for run in _runs(np.flatnonzero(delays[spans] == count) + first):
                 rows = slice(run[0] * SPAN, (run[-1] + 1) * SPAN)
                 if count > _MOST_DELAYS:

@@ -14,6 +14,7 @@ from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.timing.arrival_times import ArrivalTimes
 from daq.timing.clock_model import MeasuredDelays, OffsetSource, from_instants
+from daq.timing.quantiles import median
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -254,7 +255,7 @@ class SensorSource:
                 mine &= np.isfinite(measured.std)
                 if mine.any():
                     position = known.position(measured.seconds[mine])
-                    apart = float(np.median(position - measured.index[mine]))
+                    apart = median(position - measured.index[mine])
                 else:
                     by_samples = False
             stretches.append((begin, end, round(apart)))

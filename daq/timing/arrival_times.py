@@ -40,6 +40,7 @@ from daq.protocols.block import BlockFlag
 from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
+from daq.timing.quantiles import median
 from daq.timing.usb_polling import BEATS_PER_WINDOW, Polls, shows
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ class ArrivalTimes:
         above = self._late - slope * self._index - np.array(anchors)[self._epoch]
         duration = float(self._index[-1] - self._index[0]) / self.sampling_rate
         drift = slope * self.sampling_rate
-        std = float(np.median(above)) / duration if duration else math.nan
+        std = median(above) / duration if duration else math.nan
         return -drift / (1 + drift) * 1e6, std * 1e6
 
     def solve(self, sensor: str, measured: MeasuredDelays | None = None) -> Clock:

@@ -109,7 +109,7 @@ def smooth(observations: Observations, *, least_noise: float = 0.0) -> Smoothed:
     least_noise : float
         Standard deviation of arrivals, in s, that they have at least.
     """
-    strengths = _WALKS, np.unique(np.maximum(_NOISES, least_noise))
+    strengths = _WALKS, np.array(sorted(set(np.maximum(_NOISES, least_noise).tolist())))
     walks, noises = (grid.ravel() for grid in np.meshgrid(*strengths, indexing="ij"))
     likelihood = _filter(observations, walks, noises, None)
     likelihood -= (np.log10(walks / _USUAL) / _USUALLY) ** 2 / 2

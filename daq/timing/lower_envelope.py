@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.timing.quantiles import median
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -35,7 +37,7 @@ def levelled(index: IntArray, late: FloatArray, epoch: IntArray, *, second: floa
         rows = np.arange(begins[first], ends[first])
         half = len(rows) // 2
         rise = late[rows[half:]] - late[rows[: len(rows) - half]]
-        slope = float(np.median(rise / (index[rows[half:]] - index[rows[: len(rows) - half]])))
+        slope = median(rise / (index[rows[half:]] - index[rows[: len(rows) - half]]))
         if abs(slope * second) > _STEEP:
             late[rows] -= slope * index[rows]
     return late
@@ -58,7 +60,7 @@ def scatter_of_least(late: FloatArray, least: FloatArray, begins: BoolArray) -> 
     others = max(len(late) - len(least) - 1, 1)  # one more lies on the line that was taken out
     above = late - least[np.cumsum(begins) - 1]
     if above.any():
-        above = np.minimum(above, _FAR * np.median(above[above > 0]))
+        above = np.minimum(above, _FAR * median(above[above > 0]))
     # Known from few, it may be too little by as much.
     return float(above.sum() / others * (1 + 3 / others) * len(least) / len(late))
 

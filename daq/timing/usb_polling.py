@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.timing.quantiles import median, quantile
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -78,11 +80,11 @@ class Polls:
         for index, late in windows:
             gaps = np.diff(np.sort(late - slope * index)[: len(index) // 2 + 1])
             largest.append(float(gaps.max()))
-            usual.append(float(np.median(gaps)))
+            usual.append(median(gaps))
         if not largest:
             return 0.0
-        step = float(np.median(largest))
-        return step if step > _CLUSTERED * float(np.median(usual)) else 0.0
+        step = median(largest)
+        return step if step > _CLUSTERED * median(usual) else 0.0
 
 
 def shows(seconds: FloatArray, late: FloatArray, *, step: float, beat: float) -> bool:
@@ -97,5 +99,5 @@ def shows(seconds: FloatArray, late: FloatArray, *, step: float, beat: float) ->
     """
     begins = np.flatnonzero(np.diff(seconds // (BEATS_PER_WINDOW * beat))) + 1
     stretches = np.split(late, begins)
-    spans = [float(np.quantile(each, 0.9) - each.min()) for each in stretches]
-    return len(spans) >= _STRETCHES and float(np.median(spans)) > _WHOLE * step
+    spans = [quantile(each, 0.9) - float(each.min()) for each in stretches]
+    return len(spans) >= _STRETCHES and median(spans) > _WHOLE * step

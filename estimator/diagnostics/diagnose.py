@@ -192,6 +192,7 @@ def diagnose(
     canonical = CanonicalCoherence(matrix)
     dimension = _dimension(canonical, matrix, there.dims, n_effective)
     number = bands(frequency)
+    insides = [number == band for band in sorted(set(number.tolist()))]
     found = tuple(
         BandDiagnosis(
             low=float(frequency[inside][0]),
@@ -205,7 +206,7 @@ def diagnose(
             shared=_shared(canonical, there, len(dims), inside=inside, n_effective=n_effective),
             n_frequencies=int(inside.sum()),
         )
-        for inside in (number == b for b in np.unique(number))
+        for inside in insides
     )
     shared, steady, left = None, None, frozenset[int]()
     if course is not None:
@@ -225,7 +226,7 @@ def diagnose(
             found = tuple(replace(b, test=deflated(b.test, steady.inflation)) for b in found)
         shared = shared_noise(
             tested,
-            [number == b for b in np.unique(number)],
+            insides,
             dims=there.dims,
             n_effective=n_effective,
             neighbours=between,

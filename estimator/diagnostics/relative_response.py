@@ -15,7 +15,13 @@ import numpy as np
 
 from estimator.diagnostics.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError, InsufficientDataError
-from estimator.self_noise.coherency import check_dims, check_frequency, coherency, own_channels
+from estimator.self_noise.coherency import (
+    check_dims,
+    check_frequency,
+    coherency,
+    other_channels,
+    own_channels,
+)
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
@@ -169,7 +175,7 @@ def relative_response(
     usable &= ~(given.flags != 0).any(axis=1)
     coherence = coherence or CanonicalCoherence(given.matrix)
     own = [np.array(own_channels(dims, sensor)) for sensor in (first, second)]
-    rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
+    rest = other_channels(dims, first, second)
     if len(rest) < d:
         raise InsufficientDataError(
             f"sensors {first} and {second}: the others have {len(rest)} channels; expected {d}"
@@ -265,7 +271,7 @@ def _delay(
 def _parts(weight: FloatArray) -> list[BoolArray]:
     """Return parts of the band of about equal weight, as masks; none with few frequencies."""
     share = np.minimum(np.cumsum(weight) / weight.sum() * _PARTS, _PARTS - 1e-9).astype(np.int64)
-    parts = [share == number for number in np.unique(share)]
+    parts = [share == number for number in sorted(set(share.tolist()))]
     return parts if len(parts) >= _MIN_PARTS and len(weight) >= 2 * _PARTS else []
 
 

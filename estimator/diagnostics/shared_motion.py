@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.median import median
 from estimator.self_noise.coherency import own_channels
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ def _is_moved(sensor: int, looks: list[list[_Look]]) -> bool:
                 if min(other[number].share[sensor, each] for each in others) >= MIN_SHARED
             ]
             if before and part[number].besides(sensor, others) > NOISE_INCREASE * float(
-                np.median(before)
+                median(np.array(before))
             ):
                 return True
     return False

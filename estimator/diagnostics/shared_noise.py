@@ -20,6 +20,7 @@ import numpy as np
 from estimator.likelihood.chi_square import upper_tail
 from estimator.likelihood.goodness_of_fit import REJECT
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
+from estimator.median import median
 from estimator.self_noise.three_sensor import three_sensor
 
 if TYPE_CHECKING:
@@ -336,4 +337,4 @@ def _largest(biases: FloatArray) -> FloatArray:
 def _median(values: FloatArray) -> FloatArray:
     """Return the median of the finite numbers of each column; NaN without any."""
     known = [column[np.isfinite(column)] for column in values.T]
-    return np.array([float(np.median(each)) if len(each) else math.nan for each in known])
+    return np.array([float(median(each)) if len(each) else math.nan for each in known])

@@ -20,6 +20,7 @@ import numpy as np
 
 from estimator.likelihood import fisher
 from estimator.likelihood.score_test import usable
+from estimator.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,7 +86,7 @@ class Scatter:
     def typically_expected(self) -> FloatArray:
         """Return medians of `expected` over the live channels, (n_groups,); NaN without any."""
         rows = [row[np.isfinite(row)] for row in self.expected]
-        return np.array([np.median(row) if len(row) else np.nan for row in rows])
+        return np.array([median(row) if len(row) else np.nan for row in rows])
 
     def among(self, channels: Sequence[int], n_channels: int) -> Scatter:
         """Return the same with channels numbered among all, dead ones included."""
@@ -213,9 +214,9 @@ def _disturbed(residual: ComplexArray, groups: list[IntArray]) -> BoolArray:
     power = np.stack(
         [(np.abs(residual[:, group]) ** 2).sum(axis=(1, 2)) for group in groups], axis=1
     )
-    median = np.median(power, axis=0)
-    scatter = 1.4826 * np.median(np.abs(power - median), axis=0)
-    out = ((power - median) > DISTURBED * scatter).any(axis=1)
+    middle = median(power)
+    scatter = 1.4826 * median(np.abs(power - middle))
+    out = np.asarray(((power - middle) > DISTURBED * scatter).any(axis=1))
     return out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)
 
 

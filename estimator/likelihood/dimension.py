@@ -17,6 +17,7 @@ from estimator.likelihood.factor_analysis import max_factors, maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
+from estimator.median import median
 from estimator.self_noise.coherency import (
     check_averages,
     check_dims,
@@ -278,7 +279,9 @@ class _Fit:
     def median_cov(self, band: int) -> float:
         """Return the median c.o.v. in a band; infinite if the noise is undetermined."""
         known = self.cov[(self.number == band) & np.isfinite(self.psi).all(axis=1)]
-        return float(np.median(np.nan_to_num(known, nan=np.inf))) if len(known) else float("nan")
+        return (
+            float(median(np.nan_to_num(known, nan=np.inf).ravel())) if len(known) else float("nan")
+        )
 
 
 class _Search:

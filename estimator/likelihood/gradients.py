@@ -27,6 +27,7 @@ from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF, BandTest, ModelTest, model_test, pool
 from estimator.likelihood.known_loadings import known_loadings_test, maximise_known
 from estimator.likelihood.prior import expected_noise, kinds
+from estimator.median import median
 from estimator.self_noise.coherency import coherency
 from estimator.self_noise.result import Flag, SelfNoise
 
@@ -257,7 +258,7 @@ def _chosen(
         n_factors=n_factors,
         accepted=enough,
         test=pooled,
-        cov=float(np.median(fit.standard_error(n_effective) / fit.psi)),
+        cov=float(median((fit.standard_error(n_effective) / fit.psi).ravel())),
         gradients=True,
     )
 

@@ -22,7 +22,7 @@ import numpy as np
 from estimator.diagnostics.relative_response import relative_response
 from estimator.errors import InsufficientDataError
 from estimator.responses.derived_quantities import Value, with_errors
-from estimator.self_noise.coherency import own_channels
+from estimator.self_noise.coherency import other_channels, own_channels
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray
@@ -130,7 +130,7 @@ def _pair(
     inside = (frequency >= start.low) & (frequency <= start.high) & (frequency > 0)
     inside &= np.isfinite(csm).all(axis=(1, 2))
     own = [np.array(own_channels(dims, each)) for each in (sensor, reference)]
-    rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate(own))
+    rest = other_channels(dims, sensor, reference)
     part, f = csm[inside], frequency[inside]
     S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
     S_kk = part[:, rest[:, None], rest]

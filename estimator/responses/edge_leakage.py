@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.likelihood.dimension import bands
-from estimator.self_noise.coherency import check_dims, own_channels
+from estimator.self_noise.coherency import check_dims, other_channels, own_channels
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
@@ -223,7 +223,7 @@ def _directions(
     part = csm[some] / (scale[:, :, None] * scale[:, None, :])
     for j in range(len(dims)):
         for i in range(len(dims)):
-            rest = np.setdiff1d(np.arange(sum(dims)), np.concatenate([own[i], own[j]]))
+            rest = other_channels(dims, i, j)
             if i == j or len(rest) < dims[j]:
                 continue
             S_jk = part[:, own[j][:, None], rest]

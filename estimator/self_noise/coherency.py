@@ -87,6 +87,12 @@ def own_channels(dims: tuple[int, ...], sensor: int) -> range:
     return range(sum(dims[:sensor]), sum(dims[: sensor + 1]))
 
 
+def other_channels(dims: tuple[int, ...], *sensors: int) -> IntArray:
+    """Return the indices of all channels but those of these sensors, ascending."""
+    own = {channel for sensor in sensors for channel in own_channels(dims, sensor)}
+    return np.array([channel for channel in range(sum(dims)) if channel not in own], np.int64)
+
+
 def check_averages(n_effective: float, d: int = 0) -> None:
     """Raise an error unless the averages are finite and exceed the dimension of the motion."""
     if not (np.isfinite(n_effective) and n_effective > 0):

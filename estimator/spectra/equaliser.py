@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError
+from estimator.median import median
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
@@ -215,7 +216,7 @@ def _needed(taps: FloatArray) -> int:
     energy[1:] += taps[:reach][::-1] ** 2
     edges = np.linspace(1, reach + 1, _BLOCKS + 1).astype(np.int64)
     mean = np.add.reduceat(energy, edges[:-1]) / np.diff(edges)
-    floor = max(float(np.median(mean[-_BLOCKS // 3 :])), _ROUNDING * float(energy.max()))
+    floor = max(float(median(mean[-_BLOCKS // 3 :])), _ROUNDING * float(energy.max()))
     above = np.flatnonzero(mean > _ABOVE_NOISE * floor)
     last = int(edges[above[-1] + 1]) if len(above) else 1
     return min(reach, int(last / _FLAT) + 1)
@@ -231,7 +232,7 @@ def _fade(reach: int) -> FloatArray:
 def bounded(response: ComplexArray) -> ComplexArray:
     """Return a response in units of its median size, no larger than `MAX_AMPLIFICATION`."""
     size = np.abs(response)
-    scale = float(np.median(size)) or 1.0
+    scale = float(median(size.ravel())) or 1.0
     limit = np.minimum(1.0, MAX_AMPLIFICATION * scale / np.maximum(size, 1e-300))
     return np.asarray(response / scale * limit)
 

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.errors import EstimatorError
+from estimator.median import median
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
@@ -293,9 +294,9 @@ class SelectedSpectra:
 
     def _median(self, levels: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
         stack = np.stack(list(levels))
-        median = np.median(stack, axis=0)
-        scatter = 1.4826 * np.median(np.abs(stack - median), axis=0)
-        return median, np.maximum(scatter, self._least[:, None])
+        middle = median(stack)
+        scatter = 1.4826 * median(np.abs(stack - middle))
+        return middle, np.maximum(scatter, self._least[:, None])
 
     def _leave_out(self, rejected: Rejected) -> None:
         self.counts[rejected.reason] += 1

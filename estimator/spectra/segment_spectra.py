@@ -33,7 +33,8 @@ def kept_bins(n_freqs: int) -> IntArray:
     highest = int(0.9 * (n_freqs - 1))
     if highest <= 2:
         return np.empty(0, np.int64)
-    return np.unique(np.round(np.geomspace(2, highest, KEPT_FREQUENCIES))).astype(np.int64)
+    kept = np.round(np.geomspace(2, highest, KEPT_FREQUENCIES)).astype(np.int64)
+    return np.array(sorted(set(kept.tolist())), dtype=np.int64)
 
 
 class SegmentSpectra:

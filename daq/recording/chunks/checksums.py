@@ -50,7 +50,7 @@ def intact_blocks(blocks: NDArray[np.void], counts: NDArray[Any]) -> NDArray[np.
     stored = np.ascontiguousarray(counts).view(f"V{row_bytes}")[:, 0]
     rows = np.ascontiguousarray(blocks).view(np.uint8).reshape(len(blocks), -1)[:, :_ROW_BYTES]
     first = blocks["first_row"] - blocks["first_row"][0]
-    for length in np.unique(blocks["n_samples"]).tolist():
+    for length in sorted(set(blocks["n_samples"].tolist())):
         which = np.flatnonzero(blocks["n_samples"] == length)
         n_bytes = length * row_bytes
         content = np.empty((len(which), n_bytes + _ROW_BYTES), np.uint8)

@@ -115,6 +115,18 @@ def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
     assert not loaded & unwanted
 
 
+@pytest.mark.parametrize("scenario", ["fig9", "tui/resources/demo.toml"])
+def test_an_estimate_loads_no_masked_arrays(scenario: str, tmp_path: Path) -> None:
+    """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
+    path = tmp_path / "short.h5"
+    named = str(ROOT / scenario) if scenario.endswith(".toml") else scenario
+    huddle("simulate", named, "--duration", "2min", "--out", str(path))
+    run = f"import sys; from tui.cli.main import main; sys.argv[1:] = ['estimate', {str(path)!r}]"
+    loaded = modules_after(f"{run}\ntry:\n    main()\nexcept SystemExit:\n    print()")
+    assert "daq.estimation.estimation" in loaded
+    assert not loaded & {"numpy.ma", "numpy.random", "numpy.polynomial", "scipy"}
+
+
 @pytest.mark.parametrize("given", [[], ["--band", "1:20"]])
 def test_only_given_options_are_converted(
     given: list[str], monkeypatch: pytest.MonkeyPatch
