@@ -1,24 +1,37 @@
-"""What it costs to start the command: processor time of whole processes, the least of several."""
+"""What it costs to start the command, and what a short recording costs it.
+
+Processor time of whole processes, the median of several. A short recording is mostly start: of the
+imports, a good part is that of the libraries alone.
+"""
 
 from __future__ import annotations
 
 import os
+import statistics
 import subprocess
+import sys
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks.estimate_file import recorded_file, sensor_samples
 from benchmarks.row import Row
 from daq.python_process import python_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-REPEATS = 5
+REPEATS = 7
+CLOCKS = {"one clock": (0.0, 0.0, 0.0), "three clocks": (0.0, 15.0, -20.0)}
+"""How far the clocks of three sensors are off, in ppm."""
+LIBRARIES = "import typer.main, rich.console, rich.table, pydantic.fields, numpy, h5py"
 
 
 def processor_time(command: Sequence[str]) -> float:
-    """Return the processor time of a process, in s."""
+    """Return the processor time of a process, in s; modules it imports are compiled already."""
+    kept = {key: text for key, text in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     before = os.times()
-    subprocess.run(command, check=True, capture_output=True)
+    subprocess.run(command, check=True, capture_output=True, env=kept)
     after = os.times()
     return (
         after.children_user + after.children_system - before.children_user - before.children_system
@@ -28,13 +41,46 @@ def processor_time(command: Sequence[str]) -> float:
 def run() -> list[Row]:
     """Return the rows."""
     limits = {"--version": 0.15, "--help": 0.3, "estimate --help": 0.45}
-    return [
-        Row(f"huddle {arguments}, whole process", least, "s", at_most=limit, note="processor time")
+    rows = [
+        Row(
+            f"huddle {arguments}, whole process",
+            usual_time(python_command("tui", *arguments.split())),
+            "s",
+            at_most=limit,
+            note="processor time",
+        )
         for arguments, limit in limits.items()
-        for least in [least_time(python_command("tui", *arguments.split()))]
     ]
+    recorder = usual_time([sys.executable, "-c", "import tui.cli.main, tui.commands.record"])
+    rows.append(Row("imports of the recorder's process", recorder, "s", note="processor time"))
+    return rows + short_recordings()
 
 
-def least_time(command: Sequence[str]) -> float:
-    """Return the least processor time of several runs of a process, in s."""
-    return min(processor_time(command) for _ in range(REPEATS))
+def short_recordings() -> list[Row]:
+    """Return the rows of the estimate of four minutes."""
+    libraries = usual_time([sys.executable, "-c", LIBRARIES])
+    ours = usual_time([sys.executable, "-c", "import tui.cli.main, tui.commands.estimate"])
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for clocks, ppm in CLOCKS.items():
+            path = recorded_file(
+                Path(folder) / f"{len(rows)}.h5", sensor_samples(4 / 60, ppm=ppm), ppm=ppm
+            )
+            command = python_command("tui", "estimate", str(path), "--json", f"{path}.json")
+            rows.append(
+                Row(
+                    f"huddle estimate of four minutes, 9 × 200 Hz, {clocks}: processor time",
+                    usual_time(command),
+                    "s",
+                    at_most=0.8,
+                    note=f"process start included; imports {ours:.2f} s, of which libraries"
+                    f" {libraries:.2f} s",
+                )
+            )
+    return rows
+
+
+def usual_time(command: Sequence[str]) -> float:
+    """Return the median processor time of several runs of a process, in s."""
+    processor_time(command)  # once, so that its modules are compiled
+    return statistics.median(processor_time(command) for _ in range(REPEATS))

@@ -60,34 +60,17 @@ def run() -> list[Row]:
     """Measure what a recording costs, with one clock and with three."""
     with tempfile.TemporaryDirectory() as folder:
         return [
-            _four_minutes(Path(folder)),
             *_three_hours(Path(folder)),
             *_a_day(Path(folder)),
         ]
 
 
-def _four_minutes(folder: Path) -> Row:
-    ppm = (0.0, 15.0, -20.0)
-    short = _record(folder / "short.h5", _samples(4 / 60, ppm=ppm), ppm=ppm)
-    _command(short)  # once, so that compiled modules are there
-    command, start = _least(
-        lambda: _command(short), lambda: _run("-c", "import tui.commands.estimate"), repeats=5
-    )
-    return Row(
-        "huddle estimate of four minutes, 9 × 200 Hz, three clocks: processor time",
-        command.work,
-        "s",
-        at_most=0.8,
-        note=f"process start included; imports alone {start.work:.2f} s",
-    )
-
-
 def _three_hours(folder: Path) -> list[Row]:
-    samples = _samples(HOURS)
-    recorded = _record(folder / "recorded.h5", samples)
-    imported = _record(folder / "imported.h5", samples, chunk_rows=BLOCK_ROWS)
+    samples = sensor_samples(HOURS)
+    recorded = recorded_file(folder / "recorded.h5", samples)
+    imported = recorded_file(folder / "imported.h5", samples, chunk_rows=BLOCK_ROWS)
     ppm = (0.0, 15.0, -20.0)
-    free = _record(folder / "free.h5", _samples(HOURS, ppm=ppm), ppm=ppm)
+    free = recorded_file(folder / "free.h5", sensor_samples(HOURS, ppm=ppm), ppm=ppm)
     frames = np.lib.stride_tricks.sliding_window_view(samples, LENGTH, axis=0)[:: LENGTH // 2]
     window = np.hanning(LENGTH)
 
@@ -174,9 +157,11 @@ def _three_hours(folder: Path) -> list[Row]:
 
 
 def _a_day(folder: Path) -> list[Row]:
-    samples = _samples(SLOW_HOURS, rate=SLOW_RATE)
-    recorded = _record(folder / "day.h5", samples, rate=SLOW_RATE)
-    imported = _record(folder / "day-imported.h5", samples, rate=SLOW_RATE, chunk_rows=BLOCK_ROWS)
+    samples = sensor_samples(SLOW_HOURS, rate=SLOW_RATE)
+    recorded = recorded_file(folder / "day.h5", samples, rate=SLOW_RATE)
+    imported = recorded_file(
+        folder / "day-imported.h5", samples, rate=SLOW_RATE, chunk_rows=BLOCK_ROWS
+    )
     channels = np.ascontiguousarray(samples.T.astype(float))
     spectra, of_recorded, of_imported = _least(
         lambda: _mlab(channels),
@@ -217,7 +202,7 @@ def _work() -> float:
     return time.process_time() + of_processes.ru_utime + of_processes.ru_stime
 
 
-def _samples(
+def sensor_samples(
     hours: float, *, rate: int = RATE, ppm: tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """Three triaxial sensors on one white motion, in counts, each sampled by its own clock."""
@@ -235,7 +220,7 @@ def _samples(
     return samples
 
 
-def _record(
+def recorded_file(
     path: Path,
     samples: np.ndarray,
     *,
@@ -243,6 +228,7 @@ def _record(
     ppm: tuple[float, ...] = (0.0, 0.0, 0.0),
     chunk_rows: int | None = None,
 ) -> Path:
+    """Write the samples as a recording of three sensors, by one clock or by three."""
     shared = len(set(ppm)) == 1
     layouts = [
         SensorLayout(
