@@ -1,26 +1,63 @@
-"""The settings of a driver in words, from the JSON schema of its model."""
+"""The settings of a driver in words, from its model.
+
+What a setting means is said by the docstring below its field. It is read from the source when
+someone asks: a recorder, which imports a driver to record, needs none of it.
+"""
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from pydantic import BaseModel
 
-def settings_of(schema: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return name, values, default and meaning of each property of a JSON schema."""
+
+def settings_of(model: type[BaseModel]) -> list[dict[str, str]]:
+    """Return name, values, default and meaning of each field of the settings of a driver."""
+    schema = model.model_json_schema()
     required = schema.get("required", ())
     definitions = schema.get("$defs", {})
+    meanings = docstrings(model)
     return [
         {
             "name": name,
             "values": _values(one, definitions),
             "default": "needed" if name in required else _default(one.get("default")),
-            "meaning": " ".join(str(one.get("description", "")).replace("``", "").split()),
+            "meaning": _plain(str(one.get("description") or meanings.get(name, ""))),
         }
         for name, one in schema.get("properties", {}).items()
     ]
+
+
+def docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Return the docstring of each field that has one; none if there is no source."""
+    found: dict[str, str] = {}
+    for each in reversed(model.__mro__):
+        if each.__module__.partition(".")[0] in {"builtins", "pydantic"}:
+            continue
+        try:
+            source = textwrap.dedent(inspect.getsource(each))
+        except (OSError, TypeError):
+            continue
+        body = getattr(ast.parse(source).body[0], "body", [])
+        for field, text in pairwise(body):
+            match field, text:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(meaning))),
+                ):
+                    found[name] = inspect.cleandoc(meaning)
+    return found
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.replace("``", "").split())
 
 
 def _values(one: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:

@@ -51,14 +51,10 @@ ChannelPattern = Annotated[str, Field(pattern=r"^[A-Z0-9?]{3}$")]
 class SeedLinkSettings(BaseModel):
     """``[sensors.settings]`` of a station on a SeedLink server."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    network: Code
-    """Code of the network, such as ``"GE"``."""
-    station: Code
-    """Code of the station."""
+    network: Code = Field(description='Code of the network, such as ``"GE"``.')
+    station: Code = Field(description="Code of the station.")
     location: Annotated[str, Field(pattern=r"^(\*|--|[A-Z0-9?]{2})$")] = "*"
     """Location code, ``"--"`` if blank, ``"*"`` for any; ``?`` matches any character."""
     channels: Annotated[tuple[ChannelPattern, ...], Strict(strict=False)] | None = None

@@ -56,9 +56,7 @@ PRESETS = {"raspberry-shake": RASPBERRY_SHAKE, "lily": LILY, "none": TextFormat(
 class TextSettings(BaseModel):
     """``[sensors.settings]`` of a device that sends text."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     preset: Literal["none", "raspberry-shake", "lily"] = "none"
     layout: Literal["row", "labelled", "json", "channel"] | None = None

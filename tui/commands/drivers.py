@@ -24,7 +24,7 @@ def list_settings(name: str, *, json: str | None) -> None:
         known = "\n".join(f"  {other}  {summary}" for other, summary in summaries().items())
         raise typer.BadParameter(f"{name!r} is no driver; expected one of\n{known}")
     driver = driver_type(name)
-    settings = settings_of(driver.settings.model_json_schema())
+    settings = settings_of(driver.settings)
     write_json(json, {"driver": name, "summary": driver.summary, "settings": settings})
     screen = for_people(json)
     screen.print(f"{name}: {driver.summary}\n", markup=False, highlight=False)

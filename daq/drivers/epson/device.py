@@ -47,9 +47,7 @@ EXTERNAL = {
 class EpsonSettings(BaseModel):
     """``[sensors.settings]`` of an Epson accelerometer."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: Literal[460800, 230400, 115200] = 460800
     """Baud rate of the device (460800 by default)."""

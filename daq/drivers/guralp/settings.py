@@ -15,7 +15,7 @@ StreamId = Annotated[
 class GuralpSettings(BaseModel):
     """``[sensors.settings]`` of a Güralp digitizer."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     streams: tuple[StreamId, ...] | None = None
     """Stream ID of each channel, such as ``("DEMOZ2", "DEMON2", "DEMOE2")``. Default: the streams

@@ -57,7 +57,7 @@ class LabJackSettings(BaseModel):
     Inputs and range belong to each sensor; all other settings to the port's first sensor.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     inputs: tuple[Input, ...] | None = None
     """The analog input of each channel, such as ``["AIN0", "AIN1", "AIN2"]``; default: the inputs

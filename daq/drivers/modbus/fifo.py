@@ -47,9 +47,7 @@ MAX_FILLING_TIME = 3.0
 class FifoSettings(BaseModel):
     """``[sensors.settings]`` of a device with a block FIFO."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: PositiveInt = 3_000_000
     parity: Literal["N", "E", "O"] = "N"

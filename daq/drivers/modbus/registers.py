@@ -61,7 +61,7 @@ Address = Annotated[int, Field(ge=0, le=65535)]
 class RegisterSettings(BaseModel):
     """``[sensors.settings]`` of the register poller."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: Literal["witmotion", "labjack-ain"] | None = None
     """Settings of a known device; explicit settings override them."""

@@ -34,9 +34,7 @@ BLOCK_SECONDS = 0.1
 class AX3Settings(BaseModel):
     """``[sensors.settings]`` of an AX3."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     baud_rate: PositiveInt = 115200
     """Of the serial port."""

@@ -126,7 +126,7 @@ class SensorForm(Form[str]):
         channels, given = values.get("channels", []), values.get("settings", {})
         self._settings = {
             SETTING + one["name"]: one
-            for one in settings_of(driver_type(driver).settings.model_json_schema())
+            for one in settings_of(driver_type(driver).settings)
             if not _has_tables(given.get(one["name"]))  # they stay as they are
         }
         fields = [
