@@ -17,6 +17,7 @@ from daq.drivers.interface import DeviceInformation
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, shown
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
+from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.bench_view.sensors import channel_traces, sensors_of_bench
 from tui.application.bench_view.traces import trace
@@ -52,7 +53,7 @@ class Reading:
         """Show them."""
         show(self.sensors)
         self.begun.set()
-        ended.wait(60)
+        ended.wait(limit())
         self.is_over.set()
 
 
@@ -73,11 +74,11 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
     app = HuddleApp(told)
     async with app.run_test(size=size) as pilot:
         await pilot.press("p")
-        reading.begun.wait(60)
+        reading.begun.wait(limit())
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-bench")
         await pilot.press("p")
-        reading.is_over.wait(60)
+        reading.is_over.wait(limit())
         await shown(pilot, app)
         assert "last 10 s" not in screen_text(app)
 
@@ -106,7 +107,7 @@ async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
         await pilot.press("p")
-        reading.begun.wait(60)
+        reading.begun.wait(limit())
         await shown(pilot, app)
         text = screen_text(app)
     for said in (
@@ -127,11 +128,11 @@ async def test_the_ports_are_released_before_a_test_and_with_the_view(
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
         await pilot.press("p")
-        reading.begun.wait(60)
+        reading.begun.wait(limit())
         await shown(pilot, app)
         await pilot.press(key, *(["enter"] if key == "s" else []))
         await shown(pilot, app)
-        assert reading.is_over.wait(60)
+        assert reading.is_over.wait(limit())
 
 
 async def test_frozen_traces_stay(told: ProgressCallback) -> None:
@@ -139,7 +140,7 @@ async def test_frozen_traces_stay(told: ProgressCallback) -> None:
     app = HuddleApp(told)
     async with app.run_test(size=NARROW) as pilot:
         await pilot.press("p")
-        reading.begun.wait(60)
+        reading.begun.wait(limit())
         await shown(pilot, app)
         await pilot.press("f")
         await shown(pilot, app)

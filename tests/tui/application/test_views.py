@@ -12,6 +12,7 @@ from tests.tui.application.test_app import NARROW, ended, running, shown
 from tests.tui.application.test_bench_view import SOUND, Reading
 from tests.tui.application.test_recordings import entries, settled
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
+from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.messages import CatalogueRead, SnapshotReady
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
@@ -118,19 +119,19 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
     """Verdict, sensors, progress and alert are there at any size."""
     told.path = told.path.__class__("/bench/run.h5")  # as the pictures show it
     told.sensors = reading = Reading(SOUND)
-    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
-    told.bench = demo_bench().model_copy(update={"limits": (limit,)})
+    mask = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
+    told.bench = demo_bench().model_copy(update={"limits": (mask,)})
     app = HuddleApp(told)
     async with app.run_test(size=size) as pilot:
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-idle")
         await pilot.press("p")
-        reading.begun.wait(60)
+        reading.begun.wait(limit())
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-bench")
         assert "ready: s starts a test" in screen_text(app)
         await shown(pilot, app, *running())
-        assert reading.is_over.wait(60)
+        assert reading.is_over.wait(limit())
         await assert_looks_as_before(pilot, f"{name}-running")
         text = screen_text(app)
         for said in ("1:40  FAIL", "known to 46 %", "C has been silent", "X −119.9"):

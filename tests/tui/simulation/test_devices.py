@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from daq.drivers.bench_file import parse
 from daq.python_process import python_command
+from tests.waiting import limit
 from tui.cli.main import app
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
         assert set(json.loads(process.stdout.readline())["ports"]) == {"A", "B", "C"}
         assert list(folder.iterdir())
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 130
+        assert process.wait(limit()) == 130
     assert not list(folder.iterdir())
 
 
