@@ -25,3 +25,9 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
 @pytest.fixture(scope="session")
 def paper(reported: Reported) -> PdfReader:
     return PdfReader(paper_of(reported.report))
+
+
+@pytest.fixture
+def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures empty, for tests of the rest: curves take most of a report's time."""
+    monkeypatch.setattr("tui.report.figures.drawing.draw", lambda *_, **__: None)

@@ -47,6 +47,7 @@ def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
     assert rows[f"{HOSTILE}.Y"][1:3] == ("no signal", "?")
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path) -> None:
     text = reported.report.verdict.text
     assert text.startswith("NOT DECIDED: whether 1 of 8 channels are below data sheet")
@@ -109,6 +110,7 @@ def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_pat
     assert hashlib.sha256(copy.read_bytes()).hexdigest() in texts_of(report)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_where_the_motion_is_not_shared_the_report_says_so(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     motion, other = 4000 * rng.standard_normal((2, N_SAMPLES, 1))

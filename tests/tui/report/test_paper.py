@@ -74,8 +74,10 @@ def test_paper_says_all_that_the_page_says(reported: Reported, paper: PdfReader)
     assert f"{len(paper.pages)} / {len(paper.pages)}" in whole
 
 
-def test_paper_has_a_title_an_outline_and_tags(reported: Reported, paper: PdfReader) -> None:
+@pytest.mark.usefixtures("empty_figures")
+def test_paper_has_a_title_an_outline_and_tags(reported: Reported) -> None:
     report = reported.report
+    paper = PdfReader(paper_of(report))
     assert paper.metadata is not None
     assert paper.metadata.title == f"{report.title}: {report.subtitle}"
     titles = [section.title for section in report.sections]

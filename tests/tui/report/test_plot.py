@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
@@ -80,8 +81,14 @@ def panels(
     return drawn(noise_plots(snapshot, SETTINGS, bench, models))
 
 
+@functools.cache
+def usual() -> list[Axes]:
+    """Draw the example's noise by one method, once for all tests."""
+    return panels()
+
+
 def test_curves_are_the_estimate() -> None:
-    for number, axes in enumerate(panels()):
+    for number, axes in enumerate(usual()):
         x, y = line(axes, "self-noise")
         noise = SNAPSHOT.results["three-sensor"].noise_psd[:, number]
         single = np.isin(x, SNAPSHOT.frequency)  # points of one frequency
@@ -89,7 +96,7 @@ def test_curves_are_the_estimate() -> None:
         assert single.sum() > 20
         np.testing.assert_allclose(y[single], 10 * np.log10(expected))
         assert axes.get_xlabel() == "frequency (Hz)"
-    assert panels()[0].get_ylabel() == "dB re 1 (m/s²)²/Hz"
+    assert usual()[0].get_ylabel() == "dB re 1 (m/s²)²/Hz"
 
 
 def test_all_methods_are_overlaid() -> None:
@@ -119,12 +126,12 @@ def test_limits_and_models_are_lines_in_the_unit_of_the_result() -> None:
 
 
 def test_a_model_far_off_widens_the_scale_so_far_and_no_farther() -> None:
-    usual = panels()[0].get_ylim()
+    low, high = usual()[0].get_ylim()
     near = panels(models=[Mask("near", "m/s²", (1.0, 10.0), (1e-14, 1e-14))])[0].get_ylim()
     far = panels(models=[Mask("far", "m/s²", (1.0, 10.0), (1e-40, 1e-40))])[0].get_ylim()
-    assert near[0] < -140 < usual[0]
-    assert usual[0] - MODEL_RANGE_DB - 20 <= far[0] <= usual[0] - MODEL_RANGE_DB + 20
-    assert near[1] == far[1] == usual[1]
+    assert near[0] < -140 < low
+    assert low - MODEL_RANGE_DB - 20 <= far[0] <= low - MODEL_RANGE_DB + 20
+    assert near[1] == far[1] == high
 
 
 def test_a_model_of_another_quantity_is_refused() -> None:
@@ -162,13 +169,16 @@ def test_the_same_estimate_gives_the_same_file(tmp_path: Path) -> None:
     assert not root.findall(".//{*}text")  # letters are shapes: no font is needed
 
 
-def test_the_command_writes_what_the_suffix_says(tmp_path: Path) -> None:
+def test_the_command_writes_what_the_suffix_says(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     recording = record(tmp_path / "night.h5")
     runner = CliRunner()
     arguments = ["plot", str(recording), "--segment", "1s", "--models", "nlnm"]
     result = runner.invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert (tmp_path / "night.svg").read_text(encoding="utf-8").startswith("<?xml")
+    request.getfixturevalue("empty_figures")
     out = tmp_path / "n.png"
     out.write_bytes(b"old")
     result = runner.invoke(app, [*arguments, "-o", str(out), "--width", "90"])

@@ -35,6 +35,7 @@ def test_the_demo_s_reports_outlive_its_folder_and_have_its_noise_models(
     assert "NHNM" not in reported.page
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
     recording, out = tmp_path / "live.h5", tmp_path / "live.html"
 
@@ -48,6 +49,7 @@ def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
     assert "none: the file is still being written" in text
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
     out = tmp_path / "old.html"
     out.write_text("the old one", encoding="utf-8")
