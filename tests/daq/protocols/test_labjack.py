@@ -348,7 +348,7 @@ def test_a_late_repeated_packet_is_recognised_by_its_timer() -> None:
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 20), (20, 20), (40, 20)]
 
 
-@pytest.mark.parametrize("jitter", [1, 400, 4000])
+@pytest.mark.parametrize("jitter", [1, 4000])
 def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
     """Ticks of 25 ns, over more than two wraps: what was long ago is not what was just now."""
     rng = np.random.default_rng(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -83,6 +84,14 @@ def killed(path: Path, n_lines: int) -> dict[str, int]:
     return rows
 
 
+@pytest.fixture(scope="module")
+def of_killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recording of a recorder that was killed, for tests that work on a copy."""
+    path = tmp_path_factory.mktemp("killed") / "r.h5"
+    killed(path, 40)
+    return path
+
+
 def make(path: Path, n_rows: int = 250) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
     counts = np.random.default_rng(2).integers(-1000, 1000, (n_rows, 1)).astype(np.int32)
     channels = (Channel(name="x", sensitivity=1.0),)
@@ -160,9 +169,11 @@ def test_is_being_written_does_not_disturb_a_reader(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.1, 0.7])
-def test_a_truncated_file_of_a_killed_recorder_is_handled(tmp_path: Path, kept: float) -> None:
+def test_a_truncated_file_of_a_killed_recorder_is_handled(
+    of_killed: Path, tmp_path: Path, kept: float
+) -> None:
     path = tmp_path / "r.h5"
-    killed(path, 40)
+    shutil.copyfile(of_killed, path)
     with path.open("r+b") as raw:
         raw.truncate(int(kept * path.stat().st_size))
     if kept < 0.5:
@@ -271,9 +282,11 @@ def test_results_that_cannot_be_written_do_not_change_the_recording(tmp_path: Pa
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
-def test_a_recording_left_open_is_closed_before_results_are_written(tmp_path: Path) -> None:
+def test_a_recording_left_open_is_closed_before_results_are_written(
+    of_killed: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "r.h5"
-    killed(path, 3)
+    shutil.copyfile(of_killed, path)
     write_results(path, {"m": ({"x": np.arange(3.0)}, {})})
     assert verify(path).closed
     with Recording.open(path) as recording:

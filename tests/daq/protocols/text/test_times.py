@@ -46,7 +46,7 @@ def test_rows_are_placed_by_their_time() -> None:
 def test_a_clock_that_drifts_and_times_that_jitter_lose_nothing() -> None:
     """100 ppm fast, stamped up to 0.3 periods late and rounded: each row is one sample."""
     rng = np.random.default_rng(5)
-    n = 20_000
+    n = 12_000
     true = 1000 + np.arange(n) / 100 * (1 - 1e-4)
     times = true + rng.uniform(0, 0.003, n)
     index, _, events = split(rows_at(times.tolist(), (true + 0.01).tolist(), 100.0))
