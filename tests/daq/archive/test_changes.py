@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+import scipy
 
 from daq.archive.changes import DAYS_PER_YEAR, changes, drift
 
@@ -28,9 +28,9 @@ def test_the_rate_of_false_alarms_is_as_stated(scatter: float) -> None:
         changes(*series(rng, scatter=scatter), false_alarm=rate).found.any() for _ in range(n)
     )
     # At most so many, with a chance of one in a thousand that this test fails by accident.
-    assert alarms <= binom.ppf(0.999, n, rate)
+    assert alarms <= scipy.stats.binom.ppf(0.999, n, rate)
     if scatter == 4.0:  # scatter from day to day is measured, so the rate is reached
-        assert alarms >= binom.ppf(0.001, n, rate / 2)
+        assert alarms >= scipy.stats.binom.ppf(0.001, n, rate / 2)
 
 
 def test_a_change_is_found_with_its_day_and_size() -> None:
@@ -79,7 +79,7 @@ def test_the_interval_of_the_slope_covers_the_truth(scatter: float) -> None:
     for _ in range(n):
         found = drift(DAYS, *series(rng, scatter=scatter))
         covered += int(np.sum((found.low < 0) & (found.high > 0)))
-    assert covered >= binom.ppf(0.001, 8 * n, 0.93)
+    assert covered >= scipy.stats.binom.ppf(0.001, 8 * n, 0.93)
 
 
 def test_a_level_below_zero_has_no_drift_in_decibels() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scipy import optimize, stats
+import scipy
 
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import maximise
@@ -93,13 +93,13 @@ def test_pooled_false_alarms_under_a_taper(overlap: float) -> None:
     runs = np.array(statistic)
     p_values = []
     for run in runs:
-        test = ModelTest(run, np.full(len(run), 10.0), stats.chi2.sf(run, 10))
+        test = ModelTest(run, np.full(len(run), 10.0), scipy.stats.chi2.sf(run, 10))
         for first in range(0, len(run) - 20, 20):
             band = np.zeros(len(run), np.bool_)
             band[first : first + 20] = True
             p_values.append(pool(test, band, neighbours=r).p_value)
     assert len(p_values) > 150
-    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+    assert scipy.stats.kstest(p_values, "uniform").pvalue > 1e-3
     centred = runs / runs.mean() - 1
     for h in (1, 2):
         seen = np.mean(centred[:, h:] * centred[:, :-h]) / np.mean(centred**2)
@@ -123,7 +123,7 @@ def test_incoherence_with_half_the_noise_as_bias_is_detected_in_an_octave() -> N
     def excess(snr: float) -> float:
         return three_sensor_bias(plane_waves(np.array([7.0]), positions, snr=snr)[0]) - 0.5
 
-    snr = optimize.brentq(excess, 1.0, 1e6)
+    snr = scipy.optimize.brentq(excess, 1.0, 1e6)
     csm = plane_waves(np.array([7.0]), positions, snr=float(snr))[0]
     n_octaves = 100
     rng = np.random.default_rng(5)
@@ -158,7 +158,7 @@ def test_pooling_allows_for_correlated_neighbours() -> None:
     test = ModelTest(np.full(10, 13.0), np.full(10, 10.0), np.full(10, 0.2))
     spread = 1 + 2 * 9 * 0.5**2 / 10
     band = pool(test, np.ones(10, np.bool_), neighbours=np.array([0.5]))
-    assert band.p_value == pytest.approx(stats.chi2.sf(130 / spread, 100 / spread))
+    assert band.p_value == pytest.approx(scipy.stats.chi2.sf(130 / spread, 100 / spread))
 
 
 def test_a_model_without_degrees_of_freedom_is_refused() -> None:

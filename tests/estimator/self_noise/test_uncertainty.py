@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from estimator.methods import METHODS, self_noise
 from estimator.self_noise.result import SelfNoise
@@ -17,7 +17,7 @@ from tests.estimator.csm_models import common_motion
 def test_the_interval_of_a_psd_is_chi_squared(n: int) -> None:
     """Either end by itself, to second order of Cornish and Fisher's expansion, 1 / n."""
     low, high = score_interval(np.ones(1), np.ones((3, 1)), averages=n)
-    exact = 2 * n / stats.chi2.ppf([0.975, 0.025], 2 * n)
+    exact = 2 * n / scipy.stats.chi2.ppf([0.975, 0.025], 2 * n)
     np.testing.assert_allclose([low[0], high[0]], exact, rtol=0.15 / n)
 
 
@@ -27,7 +27,7 @@ def test_an_estimated_scatter_gives_the_interval_of_student() -> None:
     traces = np.array([[0.5], [0.0], [0.125]])  # eigenvalues +- 1/2 of omega G
     low, high = score_interval(np.zeros(1), traces, averages=n)
     assert high[0] == -low[0]
-    quantile = stats.t.ppf(0.975, n)
+    quantile = scipy.stats.t.ppf(0.975, n)
     kappa = quantile**2 / n
     # the variance grows with the value sought: delta**2 = kappa (t2 + t4 / t2**2 delta**2)
     assert high[0] == pytest.approx(np.sqrt(0.5 * kappa / (1 - 0.5 * kappa)), rel=3e-3)
