@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
+    from estimator.self_noise.result import SelfNoise
     from estimator.spectra.multiresolution import Band
     from estimator.spectra.welch import WelchSettings
 
@@ -42,7 +43,8 @@ if TYPE_CHECKING:
 FILTER_SEGMENTS = 240
 """Segments of each recording, from its start, that filters are found from."""
 ROUNDS = 3
-_METHOD = "three-sensor"  # whose noise the leakage is compared with: it takes little time
+METHOD = "three-sensor"
+"""Whose noise the leakage is compared with: it takes little time."""
 _ASSUMED_SNR = 1e6  # of known responses that differ
 _PREDICTION = 0.2  # above 0.14, the noise of a prediction under Hann (`ChannelResponses.leakage`)
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
@@ -56,6 +58,7 @@ _FINE = 4  # points of known responses for each of a spectrum
 class _Leaks:
     """What leaks in the averages of one spectrum, in the digitised channels' own units."""
 
+    noise: tuple[SelfNoise, ...]
     noise_psd: FloatArray
     motion_psd: FloatArray
     left: FloatArray
@@ -211,6 +214,17 @@ class Equalisation:
                 sources=self.sources,
             )
 
+    def noise(self, bands: Sequence[Band]) -> tuple[SelfNoise, ...] | None:
+        """Return the noise of each band by `METHOD`, if `revise` has estimated it.
+
+        Parameters
+        ----------
+        bands : sequence of Band
+            As `revise` takes them.
+        """
+        key, found = self._found
+        return found.noise if found is not None and bands and key == _key(bands) else None
+
     def _leaks_as_filtered(self, bands: Sequence[Band]) -> _Leaks | None:
         """Return what leaks; the averages of the last round are often those of the result."""
         key = _key(bands)
@@ -227,15 +241,16 @@ class Equalisation:
         for band in bands:
             try:
                 with np.errstate(invalid="ignore", divide="ignore"):
-                    noise = self_noise(
-                        _METHOD,
+                    result = self_noise(
+                        METHOD,
                         band.csm,
                         dims=self._dims,
                         n_effective=band.n_effective,
                         real=band.settings.real(band.frequencies),
-                    ).noise_psd
+                    )
             except InsufficientDataError:
                 return None
+            noise = result.noise_psd
             motion = np.einsum("fpp->fp", band.csm).real - noise
             csm = band.csm
             if filters is not None:
@@ -251,12 +266,13 @@ class Equalisation:
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
             share = share - _noise_of_prediction(band, factor)
             least = significant_minimum(share, deviation, band.frequencies)
-            parts.append(_Leaks(noise, motion, left, least))
+            parts.append(_Leaks((result,), noise, motion, left, least))
         return _Leaks(
+            tuple(each for part in parts for each in part.noise),
             *(
                 np.concatenate([getattr(part, name) for part in parts])
                 for name in ("noise_psd", "motion_psd", "left", "share")
-            )
+            ),
         )
 
 

@@ -187,6 +187,7 @@ def noise_estimates(
     gains: FloatArray,
     dimensions: Dimensions | None = None,
     positions: FloatArray | None = None,
+    known: Mapping[str, Sequence[SelfNoise]] | None = None,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -201,7 +202,10 @@ def noise_estimates(
         Those of an earlier estimate, to be kept; default: chosen by the motion.
     positions : float64, shape (n_sensors, 3), optional
         Of the sensors, in metres.
+    known : mapping of str to sequence of SelfNoise, optional
+        What some methods give for each band, where that is estimated already.
     """
+    known = known or {}
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
     wanted = ALL_METHODS if "all" in settings.methods else settings.methods
@@ -214,7 +218,7 @@ def noise_estimates(
                 elif method == "maximum-likelihood" and settings.dimension is not None:
                     dimensions = dimensions or _dimensions(bands, settings, dims, positions)
                     options = [{"n_factors": q} for q in dimensions.n_factors]
-                parts = [
+                parts = list(known.get(method, ())) or [
                     self_noise(
                         method,
                         band.csm,

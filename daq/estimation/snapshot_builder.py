@@ -11,6 +11,7 @@ import numpy as np
 
 from daq.alignment.sensor_reader import main_columns
 from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
+from daq.estimation.equalisation import METHOD
 from daq.estimation.noise_estimates import (
     Dimensions,
     Estimates,
@@ -130,7 +131,7 @@ class SnapshotBuilder:
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments = sum(each.n_segments for each in passes)
         n_effective = bands[-1].n_effective if bands else 0.0
-        estimates = self._estimates(bands, recordings[0], first, n_segments, final=final)
+        estimates = self._estimates(bands, raw, recordings[0], first, n_segments, final=final)
         latest = recordings[-1]
         events = latest.events
         diagnostics = SnapshotDiagnostics(
@@ -219,6 +220,7 @@ class SnapshotBuilder:
     def _estimates(
         self,
         bands: tuple[Band, ...],
+        raw: tuple[Band, ...],
         recording: ReadableRecording,
         first: Pass,
         n_segments: int,
@@ -236,10 +238,19 @@ class SnapshotBuilder:
             gains=self._gains,
             dimensions=self._dimensions if keep and self._fits(bands) else None,
             positions=known_positions(recording, first.aligned.channels),
+            known=self._known(bands, raw),
         )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments
         return estimates
+
+    def _known(
+        self, bands: tuple[Band, ...], raw: tuple[Band, ...]
+    ) -> dict[str, tuple[SelfNoise, ...]]:
+        """Return the noise that was estimated to find filters; averages are often unchanged."""
+        is_same = all(band is before for band, before in zip(bands, raw, strict=True))
+        noise = self._equalisation.noise(raw) if is_same and self._settings.correct else None
+        return {} if noise is None else {METHOD: noise}
 
     def _fits(self, bands: tuple[Band, ...]) -> bool:
         """Whether the dimensions chosen before are for the same frequencies."""

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from daq.bench.model import PolesZeros
+from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from estimator.diagnostics.advice import UnequalResponses
+from estimator.methods import self_noise
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.result import SelfNoise
 
     FloatArray = NDArray[np.float64]
 
@@ -142,20 +145,43 @@ def test_equalised_by_the_bench_file_the_noise_is_the_true_one(tmp_path: Path) -
     assert stability.inflation < 1.5  # the filters are taken out of single segments, too
 
 
-@pytest.mark.parametrize("window", ["hann", "rectangular"])
-def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
-    sensors = recorded()
-    sensors["b"] = sensors["a"]
+def equal_sensors() -> dict[str, Sensor]:
     rng = np.random.default_rng(5)
-    sensors = {
-        name: replace(sensors["a"], counts=samples()["a"] + 100 * rng.standard_normal((N, 3)))
+    one = recorded()["a"]
+    return {
+        name: replace(one, counts=samples()["a"] + 100 * rng.standard_normal((N, 3)))
         for name in "abc"
     }
-    path = write(tmp_path / "r.h5", sensors)
+
+
+@pytest.mark.parametrize("window", ["hann", "rectangular"])
+def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
+    path = write(tmp_path / "r.h5", equal_sensors())
     plain, automatic = (
         estimate([path], replace(OFF, window=window, equalise=mode)) for mode in ("off", "auto")
     )
     np.testing.assert_array_equal(plain.csm, automatic.csm)
+
+
+@pytest.mark.parametrize(("correct", "n_estimates"), [(True, 1), (False, 2)])
+def test_noise_by_which_no_filter_was_needed_is_not_estimated_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, correct: bool, n_estimates: int
+) -> None:
+    path = write(tmp_path / "r.h5", equal_sensors())
+    settings = replace(OFF, correct=correct)
+    again = estimate([path], settings).results["three-sensor"]
+    estimated: list[str] = []
+
+    def counted(method: str, *given: Any, **options: Any) -> SelfNoise:  # noqa: ANN401
+        estimated.append(method)
+        return self_noise(method, *given, **options)
+
+    for module in (equalisation, noise_estimates):
+        monkeypatch.setattr(module, "self_noise", counted)
+    found = estimate([path], replace(settings, equalise="auto")).results["three-sensor"]
+    assert estimated == ["three-sensor"] * n_estimates
+    for field in ("noise_psd", "cov", "low", "high", "flags"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(again, field))
 
 
 def test_segments_around_a_gap_are_left_out_as_far_as_filters_reach(tmp_path: Path) -> None:
