@@ -217,7 +217,7 @@ class BlockWriter:
     def _end(self, now: HostTime, reason: str) -> None:
         for name, sensor in self._sensors.items():
             if sensor.state.is_lost or sensor.state is SensorState.WAITING:
-                gap = sensor.indexer.lost_until(now, "lost at the end")
+                gap = sensor.indexer.lost_until(now)
                 if gap is not None:
                     self._write_gap(name, sensor, gap)
             if not sensor.state.is_lost:

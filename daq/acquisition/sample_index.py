@@ -108,13 +108,15 @@ class SampleIndexer:
         reason, self._reason = self._reason or block.reason or "lost", ""
         return self._placed(block, reason, estimated=estimated)
 
-    def lost_until(self, now: HostTime, reason: str) -> Gap | None:
+    def lost_until(self, now: HostTime) -> Gap | None:
         """Return the gap at the end of a recording that ends while the device is lost."""
         if self._last is None:
             return None
         elapsed = now.monotonic_ns - self._last.received.monotonic_ns
         missing = round(elapsed / _NS * self._rate)
-        return Gap(self.next_sample, missing, reason, estimated=True) if missing > 0 else None
+        if missing <= 0:
+            return None
+        return Gap(self.next_sample, missing, "lost at the end", estimated=True)
 
     def _placed(self, block: Block, reason: str, *, estimated: bool) -> PlacedBlock:
         first = block.first_sample + (self._offset or 0)

@@ -63,6 +63,12 @@ def decibels(psd: float) -> float:
     return 10 * math.log10(psd) if psd > 0 else math.nan
 
 
+def levels_db(psd: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return 10 log10 of every PSD, of the same shape; NaN where it is not positive."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(10 * np.log10(np.where(psd > 0, psd, np.nan)))
+
+
 def in_acceleration(unit: str) -> float | None:
     """Return how many m/s² one of a unit is; None if it is no unit of acceleration."""
     derivatives, si = _MOTION.get(canonical(unit), (0, 1.0))

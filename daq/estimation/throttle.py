@@ -21,17 +21,10 @@ class Throttle:
         Of the time, at most, that the work may cost.
     now : callable
         Seconds of a clock that never goes back.
-    used : callable
-        Seconds of processor time so far.
     """
 
-    def __init__(
-        self,
-        share: float,
-        now: Callable[[], float] = time.monotonic,
-        used: Callable[[], float] = time.process_time,
-    ) -> None:
-        self._share, self._now, self._used = share, now, used
+    def __init__(self, share: float, now: Callable[[], float] = time.monotonic) -> None:
+        self._share, self._now = share, now
         self._began = self._next = now()
         self._used_before = 0.0
 
@@ -46,9 +39,9 @@ class Throttle:
         return self._now() >= self._next
 
     def __enter__(self) -> Self:
-        self._began, self._used_before = self._now(), self._used()
+        self._began, self._used_before = self._now(), time.process_time()
         return self
 
     def __exit__(self, *_: object) -> None:
-        cost = max(self._now() - self._began, self._used() - self._used_before)
+        cost = max(self._now() - self._began, time.process_time() - self._used_before)
         self._next = self._began + cost / self._share

@@ -85,7 +85,6 @@ def maximise_known(
     *,
     kind: IntArray,
     n_effective: float,
-    spread: float = NOISE_SPREAD,
 ) -> KnownLoadings:
     """Maximum likelihood noise PSD of every channel, at all frequencies at once.
 
@@ -95,7 +94,7 @@ def maximise_known(
         Cross-spectral matrices, positive definite.
     loadings : complex128, shape (n_freqs, n_channels, n_factors)
         U, of full rank, fewer factors than channels.
-    expected, kind, n_effective, spread
+    expected, kind, n_effective
         The prior, as `estimator.likelihood.prior.maximise_expecting` takes it.
 
     Returns
@@ -105,7 +104,7 @@ def maximise_known(
     p = csm.shape[1]
     root = np.sqrt(expected)
     csm, loadings = csm / (root[:, :, None] * root[:, None, :]), loadings / root[:, :, None]
-    penalty = alike(kind) / (spread**2 * n_effective)
+    penalty = alike(kind) / (NOISE_SPREAD**2 * n_effective)
     partial = 1 / np.einsum("fii->fi", np.linalg.inv(csm)).real
     lowest, x = np.log(partial * _LOWEST), np.log(partial)
     at = _evaluate(csm, loadings, x, penalty)

@@ -121,7 +121,7 @@ def fig13(*, alpha: float = 30.0, theta: float = 60.0) -> Scenario:
     return biaxial(theta=theta, channel_angles=(alpha, alpha, alpha), snr=100.0)
 
 
-def hexagon(spacing: float = SPACING) -> dict[str, tuple[float, float, float]]:
+def hexagon() -> dict[str, tuple[float, float, float]]:
     """Return the positions of Fig. 6 in m: E in the middle, A to D around it, 60° apart.
 
     C-D-E, B-C-E and A-B-E are equilateral triangles. A and C are √3 spacings apart, A and D two
@@ -129,8 +129,8 @@ def hexagon(spacing: float = SPACING) -> dict[str, tuple[float, float, float]]:
     """
     around = {
         name: (
-            float(spacing * np.cos(np.pi / 3 * step)),
-            float(spacing * np.sin(np.pi / 3 * step)),
+            float(SPACING * np.cos(np.pi / 3 * step)),
+            float(SPACING * np.sin(np.pi / 3 * step)),
             0.0,
         )
         for step, name in enumerate("ABCD")

@@ -19,7 +19,6 @@ from tui.output.formatting import clock_time, roughly, several
 from tui.simulation.host_time import host_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from daq.acquisition.recorder import RecorderStatus
@@ -75,27 +74,20 @@ def record_bench(
 
 
 class GapLog:
-    """Logs the number of missing samples when it has grown, once a minute at most.
+    """Logs the number of missing samples when it has grown, once a minute at most."""
 
-    Parameters
-    ----------
-    now : callable
-        Seconds on a clock that is never stepped.
-    """
-
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self._now = now
+    def __init__(self) -> None:
         self._next = -math.inf
         self._known: dict[str, int] = {}
 
     def look(self, status: RecorderStatus) -> None:
         """Log new gaps of a recorder's status."""
-        if self._now() < self._next and not status.closed:
+        if time.monotonic() < self._next and not status.closed:
             return
         for name, sensor in status.sensors.items():
             if sensor.gaps > self._known.get(name, 0):
                 self._known[name] = sensor.gaps
-                self._next = self._now() + GAP_INTERVAL
+                self._next = time.monotonic() + GAP_INTERVAL
                 _LOGGER.warning(
                     "%s: %s so far, %d samples missing",
                     *(name, several(sensor.gaps, "gap"), sensor.missing),

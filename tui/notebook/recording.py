@@ -15,7 +15,6 @@ from tui.output.formatting import several, utc
 
 if TYPE_CHECKING:
     from datetime import datetime
-    from types import TracebackType
 
     from daq.bench.model import Bench
     from daq.protocols.block import Event
@@ -105,12 +104,7 @@ class RecordingFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         pass
 
     def __repr__(self) -> str:

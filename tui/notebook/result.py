@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.bench.units import levels_db
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means
 from estimator.self_noise.band_means import band_edges
@@ -80,8 +81,7 @@ class BandNoise:
     @property
     def noise_db(self) -> FloatArray:
         """`noise_psd` in dB re 1 unit**2/Hz; NaN where it is not positive."""
-        known = np.where(self.noise_psd > 0, self.noise_psd, np.nan)
-        return np.asarray(10 * np.log10(known))
+        return levels_db(self.noise_psd)
 
     def __repr__(self) -> str:
         return text.band(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.units import decibels
 from daq.protocols.block import EventKind
 from daq.results.band_summary import band_of
 from daq.results.clock_effect import effect_by_sensor, grade, reference, residuals
@@ -107,7 +108,7 @@ def model_test_section(snapshot: Snapshot, settings: Settings) -> Section:
                 plain_number(band.coherence, ".4f"),
                 scientific(band.condition, 2),
                 plain_number(band.dimension, ".0f"),
-                f"{_decibels(snr.min())} … {_decibels(snr.max())}" if snr.size else NOTHING,
+                f"{_snr(snr.min())} … {_snr(snr.max())}" if snr.size else NOTHING,
                 plain_number(_ratio(band), ".3f"),
                 "fails" if fails(band) else "holds",
                 probability(band.test.p_value),
@@ -288,8 +289,8 @@ def _run_in_words(run: Sequence[BandDiagnosis]) -> str:
     return f"{where} (statistic {_ratio(worst):.3g} times its expectation{at})"
 
 
-def _decibels(ratio: float) -> str:
-    return plain_number(10 * math.log10(ratio), ".0f") if ratio > 0 else "< 0"
+def _snr(ratio: float) -> str:
+    return plain_number(decibels(ratio), ".0f") if ratio > 0 else "< 0"
 
 
 def _reversed(snapshot: Snapshot, response: RelativeResponse) -> str:

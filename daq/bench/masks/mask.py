@@ -90,16 +90,19 @@ class Mask:
         return np.unique(np.concatenate([self.frequency, frequency[inside]]))
 
 
-def _peterson(name: str, rows: Iterable[tuple[float, float, float]], longest: float) -> Mask:
+_LONGEST_PERIOD = 1e5  # s, of Peterson's models
+
+
+def _peterson(name: str, rows: Iterable[tuple[float, float, float]]) -> Mask:
     """Return a model of lines ``A + B log10(T)`` in dB, each from its period T on.
 
     At their ends the lines differ by up to 0.1 dB, so each has both of its ends.
     """
-    ends = [*rows, (longest, 0.0, 0.0)]
+    ends = [*rows, (_LONGEST_PERIOD, 0.0, 0.0)]
     points = [
         (1 / at, 10 ** ((a + b * math.log10(at)) / 10))
         for (period, a, b), (end, _, _) in pairwise(ends)
-        for at in (period, end * (1 - 1e-9) if end < longest else end)
+        for at in (period, end * (1 - 1e-9) if end < _LONGEST_PERIOD else end)
     ]
     return _rising(name, points)
 
@@ -136,8 +139,8 @@ _AHNM = (
 _ALNM = ((0.01, -135.0), (1.0, -135.0), (10.0, -130.0), (150.0, -118.25))
 
 NOISE_MODELS: Mapping[str, Mask] = {
-    "nlnm": _peterson("NLNM", _NLNM, 1e5),
-    "nhnm": _peterson("NHNM", _NHNM, 1e5),
+    "nlnm": _peterson("NLNM", _NLNM),
+    "nhnm": _peterson("NHNM", _NHNM),
     "alnm": _straight("ALNM", _ALNM),
     "ahnm": _straight("AHNM", _AHNM),
 }

@@ -70,9 +70,9 @@ def is_whole(frame: bytes) -> bool:
     return len(frame) >= 4 and crc(frame[:-2]) == int.from_bytes(frame[-2:], "little")
 
 
-def read_request(unit: int, address: int, n_registers: int, *, function: int = READ_INPUT) -> bytes:
-    """Encode a request to read registers."""
-    return encode(unit, struct.pack(">BHH", function, address, n_registers))
+def read_request(unit: int, address: int, n_registers: int) -> bytes:
+    """Encode a request to read input registers."""
+    return encode(unit, struct.pack(">BHH", READ_INPUT, address, n_registers))
 
 
 def write_request(unit: int, address: int, value: int) -> bytes:

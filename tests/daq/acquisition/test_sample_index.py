@@ -133,10 +133,10 @@ def test_a_session_that_was_lost_without_a_sample_changes_nothing() -> None:
 
 def test_samples_missing_at_the_end_are_a_gap() -> None:
     continuity = SampleIndexer(RATE)
-    assert continuity.lost_until(at(5.0), "lost") is None
+    assert continuity.lost_until(at(5.0)) is None
     continuity.place(block(0, 10, 0.1))
-    assert continuity.lost_until(at(2.1), "lost") == Gap(10, 200, "lost", estimated=True)
-    assert continuity.lost_until(at(0.1), "lost") is None
+    assert continuity.lost_until(at(2.1)) == Gap(10, 200, "lost at the end", estimated=True)
+    assert continuity.lost_until(at(0.1)) is None
 
 
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(1, 30)), max_size=30))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.units import levels_db
 from estimator.self_noise.band_means import band_means, log_edges
 
 if TYPE_CHECKING:
@@ -60,12 +61,6 @@ class Line:
     y: FloatArray
 
 
-def decibels(psd: FloatArray) -> FloatArray:
-    """Return 10 log10 of positive values, NaN elsewhere."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(psd > 0, 10 * np.log10(psd), np.nan)
-
-
 def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: str) -> Curve:
     """Return the spectrum of a channel's samples as a curve without an interval."""
     edges = log_edges(frequency, n_points)
@@ -78,7 +73,7 @@ def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: 
         band_style=style,
         marker="",
         log_frequency=_centres(frequency, edges),
-        level_db=decibels(mean),
+        level_db=levels_db(mean),
         low_db=nothing,
         high_db=nothing,
         negative=np.zeros(mean.size, dtype=bool),
@@ -107,9 +102,9 @@ def noise_curve(
         band_style=band_style,
         marker=marker,
         log_frequency=_centres(frequency, edges),
-        level_db=decibels(means.mean),
-        low_db=decibels(means.low),
-        high_db=decibels(means.high),
+        level_db=levels_db(means.mean),
+        low_db=levels_db(means.low),
+        high_db=levels_db(means.high),
         negative=means.mean <= 0,
     )
 
@@ -130,7 +125,7 @@ def mask_curve(
     """
     edges = log_edges(frequency, n_points)
     centre = _centres(frequency, edges)
-    level = np.interp(centre, np.log10(frequency[1:]), decibels(psd))
+    level = np.interp(centre, np.log10(frequency[1:]), levels_db(psd))
     inside = (centre >= np.log10(span[0]) - 1e-9) & (centre <= np.log10(span[1]) + 1e-9)
     nothing = np.full(centre.size, np.nan)
     return Curve(
@@ -151,12 +146,12 @@ def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
     return np.asarray(np.log10(frequency[edges[:-1]] * frequency[edges[1:] - 1]) / 2)
 
 
-def level_limits(curves: Sequence[Curve], step: float = 10.0) -> tuple[float, float]:
-    """Return limits in dB, multiples of ``step``, that hold all curves but for lone outliers."""
+def level_limits(curves: Sequence[Curve]) -> tuple[float, float]:
+    """Return limits in dB, multiples of ten, that hold all curves but for lone outliers."""
     levels = np.concatenate([curve.level_db for curve in curves] or [np.array([])])
     levels = levels[np.isfinite(levels)]
     if levels.size == 0:
         return -150.0, -50.0
     low, high = np.quantile(levels, [0.01, 1.0])
-    low, high = step * np.floor(low / step - 0.3), step * np.ceil(high / step + 0.1)
-    return float(low), float(max(high, low + 2 * step))
+    low, high = 10 * np.floor(low / 10 - 0.3), 10 * np.ceil(high / 10 + 0.1)
+    return float(low), float(max(high, low + 20))

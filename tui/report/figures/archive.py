@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from daq.archive.answers import DAY_NS
 from daq.archive.changes import DAYS_PER_YEAR
 from daq.archive.density import HIGHEST_DB, LOWEST_DB
+from daq.bench.units import levels_db
 from tui.output.archive.tables import day_text
 from tui.output.console import write_whole
 from tui.output.formatting import span
@@ -94,7 +95,7 @@ def density_figure(answer: Answer, models: Sequence[Mask] = ()) -> Figure:
             psd = noise.noise_psd[1:, column]
             axes.plot(
                 pooled.frequency[1:],
-                _decibels(psd),
+                levels_db(psd),
                 color=drawing.INK,
                 lw=0.5,
                 label="all together",
@@ -103,7 +104,7 @@ def density_figure(answer: Answer, models: Sequence[Mask] = ()) -> Figure:
             points = mask.points(density.frequency)
             points = points[(points >= edges[0]) & (points <= edges[-1])]
             axes.plot(
-                points, _decibels(mask.at(points, pooled.unit)), color=drawing.DATA, lw=0.8,
+                points, levels_db(mask.at(points, pooled.unit)), color=drawing.DATA, lw=0.8,
                 dashes=dash, label=mask.name,
             )  # fmt: skip
         axes.set_xscale("log")
@@ -131,7 +132,7 @@ def days_figure(answer: Answer) -> Figure:
     levels = answer.levels
     for column, axes in enumerate(panels):
         mean, low, high = (
-            _decibels(each[:, 0, column]) for each in (levels.mean, levels.low, levels.high)
+            levels_db(each[:, 0, column]) for each in (levels.mean, levels.low, levels.high)
         )
         floor = np.where(np.isnan(low) & ~np.isnan(mean), mean, low)
         axes.errorbar(
@@ -206,8 +207,3 @@ def _labels(figure: Figure, panels: Sequence[Axes], x: str, y: str) -> None:
 def _decibel_axis(axes: Axes) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}".replace("-", "−")))
-
-
-def _decibels(psd: FloatArray) -> FloatArray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(10 * np.log10(np.where(psd > 0, psd, np.nan)))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
+from daq.bench.units import levels_db
 from daq.results.band_summary import correlation_of
 from daq.results.decision.limits import concerns, mask_psd
 from estimator.self_noise.band_means import band_means, log_edges
@@ -77,13 +78,13 @@ class _NoisePanel:
         frequency = curve.frequency
         axes.set_title(self.name)
         logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
-        axes.plot(frequency, _decibels(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
+        axes.plot(frequency, levels_db(curve.data), color=drawing.DATA, lw=0.8, label="recorded")
         floor = 10 ** (scale[0] / 10)
         high = np.where(curve.noise.high > 0, curve.noise.high, np.nan)
         axes.fill_between(
             frequency,
-            _decibels(np.where(curve.noise.low > floor, curve.noise.low, floor)),
-            _decibels(high),
+            levels_db(np.where(curve.noise.low > floor, curve.noise.low, floor)),
+            levels_db(high),
             color=drawing.NOISE,
             alpha=0.25,
             lw=0,
@@ -91,7 +92,7 @@ class _NoisePanel:
         )
         axes.plot(
             frequency,
-            _decibels(curve.noise.mean),
+            levels_db(curve.noise.mean),
             color=drawing.NOISE,
             lw=0.9,
             label=self.noise_label,
@@ -100,12 +101,12 @@ class _NoisePanel:
             curve.others.items(), drawing.LINES[1:], drawing.DASHES, strict=False
         ):
             axes.plot(
-                frequency, _decibels(psd), color=colour, lw=0.8, dashes=dashes, label=_shown(label)
+                frequency, levels_db(psd), color=colour, lw=0.8, dashes=dashes, label=_shown(label)
             )
         if (curve.quantisation > floor).any():
             axes.plot(
                 frequency,
-                _decibels(curve.quantisation),
+                levels_db(curve.quantisation),
                 color=drawing.QUANTISATION,
                 lw=0.8,
                 dashes=(1, 1.5),
@@ -113,13 +114,13 @@ class _NoisePanel:
             )
         for at, mask in curve.limits:
             axes.plot(
-                at, _decibels(mask), color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit"
+                at, levels_db(mask), color=drawing.LIMIT, lw=1.0, dashes=(5, 2), label="limit"
             )
         for (label, (at, psd)), dashes in zip(
             curve.models.items(), cycle(drawing.MODEL_DASHES), strict=False
         ):
             axes.plot(
-                at, _decibels(psd), color=drawing.MODEL, lw=0.7, dashes=dashes, label=_shown(label)
+                at, levels_db(psd), color=drawing.MODEL, lw=0.7, dashes=dashes, label=_shown(label)
             )
         for edge in self.band or ():
             axes.axvline(edge, color=drawing.INK, lw=0.5, dashes=(1, 2))
@@ -301,7 +302,7 @@ def _scale(curves: list[_Curves]) -> tuple[float, float]:
     for curve in curves:
         values += [curve.data, curve.noise.mean, *curve.others.values()]
         values += [mask for _, mask in curve.limits]
-    level = _decibels(np.concatenate(values))
+    level = levels_db(np.concatenate(values))
     level = level[np.isfinite(level)]
     if not level.size:
         return -10.0, 10.0
@@ -309,15 +310,10 @@ def _scale(curves: list[_Curves]) -> tuple[float, float]:
     if curves[0].models:
         span = curves[0].frequency[[0, -1]]
         psd = [psd[(at >= span[0]) & (at <= span[1])] for at, psd in curves[0].models.values()]
-        shown = _decibels(np.concatenate(psd))
+        shown = levels_db(np.concatenate(psd))
         low = min(low, max(shown.min(initial=math.inf), low - MODEL_RANGE_DB))
         high = max(high, min(shown.max(initial=-math.inf), high + MODEL_RANGE_DB))
     return 10 * math.floor(low / 10 - 0.3), 10 * math.ceil(high / 10 + 0.1)
-
-
-def _decibels(psd: FloatArray) -> FloatArray:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(psd > 0, 10 * np.log10(np.where(psd > 0, psd, 1)), np.nan))
 
 
 def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
