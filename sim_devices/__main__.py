@@ -19,13 +19,13 @@ def main(arguments: list[str]) -> int:
         spec = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
         with start(spec) as running:
             for device in running:
-                said = {
+                entry = {
                     "sensors": device.sensors,
                     "driver": device.driver,
                     "port": device.port,
                     "settings": device.settings,
                 }
-                print(json.dumps(said), flush=True)
+                print(json.dumps(entry), flush=True)
             sys.stdin.read()
     except KeyboardInterrupt:
         return 130

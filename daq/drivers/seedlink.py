@@ -94,7 +94,7 @@ class SeedLinkSession:
         decoder: SeedLinkDecoder,
         *,
         information: tuple[DeviceInformation, ...],
-        heard: list[Block | Event],
+        buffered: list[Block | Event],
         patience: float,
         resumed: bool,
     ) -> None:
@@ -106,12 +106,12 @@ class SeedLinkSession:
         """See :class:`daq.drivers.interface.PatientSession`."""
         self.hint = "the server sends no records; check its digitizer"
         self._stream = stream
-        self._heard = heard
+        self._buffered = buffered
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        heard, self._heard = self._heard, []
-        for item in heard:
+        buffered, self._buffered = self._buffered, []
+        for item in buffered:
             yield item
         while True:
             received, at = await self._stream.read()
@@ -186,15 +186,15 @@ async def _opened(
             decoder = SeedLinkDecoder(selections, dtypes, hold=settings.late)
         await server.choose(selections, decoder.last)
         decoder.begin(server.version)
-        heard: list[Block | Event] = []
+        buffered: list[Block | Event] = []
         if server.rest is not None:
-            heard += decoder.receive(*server.rest)
-        await _listen(stream, decoder, settings.patience / clock.speed, heard)
+            buffered += decoder.receive(*server.rest)
+        await _listen(stream, decoder, settings.patience / clock.speed, buffered)
         yield SeedLinkSession(
             stream,
             decoder,
             information=_information(sensors, decoder, server, label, settings.patience),
-            heard=heard,
+            buffered=buffered,
             patience=settings.patience,
             resumed=before is not None,
         )
@@ -282,14 +282,14 @@ class _Server:
 
 
 async def _listen(
-    stream: ByteStream, decoder: SeedLinkDecoder, seconds: float, heard: list[Block | Event]
+    stream: ByteStream, decoder: SeedLinkDecoder, seconds: float, buffered: list[Block | Event]
 ) -> None:
     """Listen until the streams of every sensor are decided, for at most ``seconds``."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             while decoder.silent:
                 received, at = await stream.read()
-                heard += decoder.receive(received, at)
+                buffered += decoder.receive(received, at)
 
 
 def _information(

@@ -282,7 +282,7 @@ class _RemoteRecorder:
     def __init__(self, recording: Recording, cancelled: threading.Event, silence: float) -> None:
         self._recording, self._silence = recording, silence
         self._wait: Callable[[float], bool] = cancelled.wait
-        self._n_samples, self._heard = -1, time.monotonic()
+        self._n_samples, self._grew_at = -1, time.monotonic()
 
     @property
     def ended(self) -> bool:
@@ -291,9 +291,9 @@ class _RemoteRecorder:
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()
         if n_samples != self._n_samples:
-            self._n_samples, self._heard = n_samples, now
-        elif now - self._heard >= self._silence:
-            self._heard = now
+            self._n_samples, self._grew_at = n_samples, now
+        elif now - self._grew_at >= self._silence:
+            self._grew_at = now
             try:
                 ask(self._recording.path, "status")
             except NotConnectedError:

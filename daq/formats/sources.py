@@ -155,8 +155,8 @@ def _nothing(index: _Index, n_files: int, selection: Selection) -> str:
     if not n_files:
         return "no files found for these codes and times; check the folder, --start and --end"
     aside = "; ".join(f"{name} ({reason})" for name, reason in index.left_aside.items())
-    asked = ", ".join(selection.channels)
-    chosen = f" of --channels {asked}" if asked else ""
+    wanted = ", ".join(selection.channels)
+    chosen = f" of --channels {wanted}" if wanted else ""
     return f"no samples{chosen} in {n_files} files; they hold {aside or 'nothing'}"
 
 
@@ -241,8 +241,8 @@ class _Index:
         code = trace.channel
         if self._selection.channels:
             full = f"{trace.sensor}.{code}"
-            asked = self._selection.channels
-            if any(fnmatchcase(each, pattern) for each in (code, full) for pattern in asked):
+            patterns = self._selection.channels
+            if any(fnmatchcase(each, pattern) for each in (code, full) for pattern in patterns):
                 return ""
             return "not in --channels"
         if not trace.fdsn or len(code) != _CODE_LENGTH:

@@ -27,10 +27,10 @@ def store_results(path: str | Path, snapshot: Snapshot, verdict: TestVerdict | N
     RecordingError
         If a recorder is writing the file, or it cannot be written; it stays as it was.
     """
-    said = {} if verdict is None else {"verdict": verdict.verdict.value}
+    stored = {} if verdict is None else {"verdict": verdict.verdict.value}
     results = {method: result_arrays(snapshot, method) for method in snapshot.results}
     write_results(
-        path, {method: (arrays, about | said) for method, (arrays, about) in results.items()}
+        path, {method: (arrays, about | stored) for method, (arrays, about) in results.items()}
     )
 
 
@@ -40,8 +40,8 @@ def stored_verdict(recording: Recording) -> tuple[bool, Verdict | None]:
     The verdict is None where the bench had no limits, or an earlier version wrote the result.
     """
     attributes = recording.result_attributes()
-    said = {str(each["verdict"]) for each in attributes.values() if "verdict" in each}
-    known = [Verdict(word) for word in said if word in set(Verdict)]
+    words = {str(each["verdict"]) for each in attributes.values() if "verdict" in each}
+    known = [Verdict(word) for word in words if word in set(Verdict)]
     return bool(attributes), known[0] if len(known) == 1 else None
 
 

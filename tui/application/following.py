@@ -256,8 +256,8 @@ class FollowingApp(App[None]):
         if not snapshot.closed:
             self._end_if_reached(snapshot, message.settings)
         elif before is not None and not before.closed:
-            said = "" if self.state.verdict is None else WORDS[self.state.verdict.verdict]
-            self.announce("ended", said)
+            word = "" if self.state.verdict is None else WORDS[self.state.verdict.verdict]
+            self.announce("ended", word)
             await self._show_result()
 
     def _end_if_reached(self, snapshot: Snapshot, settings: Settings) -> None:
@@ -335,9 +335,9 @@ class FollowingApp(App[None]):
     @on(PinRequested)
     @work(thread=True, group="control")
     def _on_pin(self, message: PinRequested) -> None:
-        said = self._try(partial(self._controls.pin, message.path))
-        if said is not None:
-            self.call_from_thread(self.notify, said, timeout=8, markup=False)
+        answer = self._try(partial(self._controls.pin, message.path))
+        if answer is not None:
+            self.call_from_thread(self.notify, answer, timeout=8, markup=False)
 
     @on(BenchEdited)
     @work(thread=True, group="control")

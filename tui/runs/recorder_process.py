@@ -142,8 +142,8 @@ class RecorderProcess:
         code = self._process.poll()
         if code in {None, 0}:
             return
-        said = "\n".join(self._log.errors()) or self._how_it_ended(code)
-        raise RecorderFailedError(said, is_usage_error=code == ExitCode.USAGE)
+        message = "\n".join(self._log.errors()) or self._how_it_ended(code)
+        raise RecorderFailedError(message, is_usage_error=code == ExitCode.USAGE)
 
     def _how_it_ended(self, code: int) -> str:
         if code > 0:

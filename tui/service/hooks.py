@@ -127,7 +127,7 @@ async def run_hook(command: Sequence[str], document: bytes, timeout: float) -> s
         return f"{command[0]}: cannot be started: {error}"
     try:
         async with asyncio.timeout(timeout):
-            _, said = await process.communicate(document)
+            _, errors = await process.communicate(document)
     except TimeoutError:
         return f"{command[0]}: took longer than {timeout:g} s and was ended"
     finally:
@@ -136,7 +136,7 @@ async def run_hook(command: Sequence[str], document: bytes, timeout: float) -> s
             await process.wait()
     if process.returncode == 0:
         return ""
-    text = " ".join(said.decode(errors="replace").split())[-_MOST_OUTPUT:]
+    text = " ".join(errors.decode(errors="replace").split())[-_MOST_OUTPUT:]
     return f"{command[0]}: exit code {process.returncode}" + (f": {text}" if text else "")
 
 

@@ -80,7 +80,7 @@ class Window:
         self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
         self._folder, self._min_free, self._shortest = folder, min_free, shortest
         self.status: dict[str, Any] | None = None
-        """What the recorder last said of itself and its sensors."""
+        """What the recorder last is_logged of itself and its sensors."""
         self.progressed_at: float | None = None
         """Time of the event loop at which the recorder last made progress; None before."""
 
@@ -164,16 +164,16 @@ class Window:
 
     async def _pause(self, run: Run, seconds: float) -> Run:
         """Wait before the rest is recorded, as long as the disk is full."""
-        said = False
+        is_logged = False
         while True:
             await self._clock.sleep(min(seconds, max(0.0, self._rest(run))), self._stop)
             free = free_space(self._folder)
             is_full = free is not None and free < self._min_free
             if not is_full or self._stop.is_set() or self._rest(run) <= self._shortest:
                 return run
-            if not said:
+            if not is_logged:
                 _LOGGER.warning("%s of free space; the recording waits for more", _size(free or 0))
-                said = True
+                is_logged = True
 
     def _existing(self, run: Run) -> tuple[str, ...]:
         return tuple(part for part in run.parts if (self._folder / part).exists())

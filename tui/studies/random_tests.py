@@ -177,7 +177,7 @@ def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
     """
     n_tests = max(12, round(N_TESTS * length))
     covered: dict[tuple[str, int], list[float]] = {}
-    said: dict[type[Advice], list[bool]] = {kind: [] for kind in FALSE}
+    reported: dict[type[Advice], list[bool]] = {kind: [] for kind in FALSE}
     for number in range(n_tests):
         progress("random tests", number / n_tests)
         rng = np.random.default_rng([SEED, number])
@@ -192,7 +192,7 @@ def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
         kinds = {type(each) for each in snapshot.diagnostics.advice}
         for kind, would_be_wrong in FALSE.items():
             if would_be_wrong(scene):
-                said[kind].append(kind in kinds)
+                reported[kind].append(kind in kinds)
     coverage = []
     for method in METHODS:
         groups = sorted(group for each, group in covered if each == method)
@@ -205,7 +205,7 @@ def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
             "share",
             (_accused(number, found),),
         )
-        for number, (kind, found) in enumerate(said.items())
+        for number, (kind, found) in enumerate(reported.items())
         if found
     )
     return Study(

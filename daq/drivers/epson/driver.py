@@ -113,7 +113,7 @@ class EpsonSession:
             except TimeoutError:
                 for item in self.decoder.receive(*await self._rest(at)):
                     yield item
-                received, at = await self._asked()
+                received, at = await self._ask_device()
             for item in self.decoder.receive(received, at):
                 yield item
 
@@ -145,7 +145,7 @@ class EpsonSession:
         passed_ns = round(len(received) / burst.size / rate * 1e9)
         return received, HostTime(last.monotonic_ns + passed_ns, last.utc_ns + passed_ns)
 
-    async def _asked(self) -> tuple[bytes, HostTime]:
+    async def _ask_device(self) -> tuple[bytes, HostTime]:
         """Request the ID of a silent device, and return the next frames.
 
         Raises

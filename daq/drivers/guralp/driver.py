@@ -52,7 +52,7 @@ class GuralpSession:
         *,
         patience: float,
         information: tuple[DeviceInformation, ...],
-        heard: list[Block | Event],
+        buffered: list[Block | Event],
         identify: Callable[[str], DeviceInformation],
     ) -> None:
         self.information = information
@@ -60,14 +60,14 @@ class GuralpSession:
         """See :class:`daq.drivers.interface.PatientSession`."""
         self.hint = "check the digitizer's terminal, cable and power"
         self._link = link
-        self._heard = heard
+        self._buffered = buffered
         self._identify = identify
         self._absent = {one.sensor for one in information if one.trouble}
         self._refused: set[str] = set()
 
     async def read(self) -> AsyncIterator[Block | Event]:
         """Yield blocks and events."""
-        found, self._heard = self._heard, []
+        found, self._buffered = self._buffered, []
         while True:
             for item in found:
                 if isinstance(item, Block):
@@ -115,15 +115,15 @@ class GuralpDriver:
         label = port_label(sensors)
         ids = _configured(sensors)
         async with open_link(first.port, settings, clock, ids, label=label) as link:
-            heard: list[Block | Event] = []
+            buffered: list[Block | Event] = []
             if not ids[first.name]:
-                await _discover(link, first, settings, label, heard)
+                await _discover(link, first, settings, label, buffered)
             by_name = {sensor.name: sensor for sensor in sensors}
             yield GuralpSession(
                 link,
                 patience=settings.patience,
-                information=await _listen(link, sensors, settings, label, heard),
-                heard=heard,
+                information=await _listen(link, sensors, settings, label, buffered),
+                buffered=buffered,
                 identify=lambda name: _identity(link.streams, by_name[name], label),
             )
 
@@ -161,7 +161,7 @@ async def _discover(
     sensor: Sensor,
     settings: GuralpSettings,
     label: str,
-    heard: list[Block | Event],
+    buffered: list[Block | Event],
 ) -> None:
     """Listen until one digitizer has sent as many streams as the sensor has channels."""
     n_channels = len(sensor.channels)
@@ -169,7 +169,7 @@ async def _discover(
         async with asyncio.timeout(settings.patience):
             while True:
                 found = await link.receive()
-                heard += [
+                buffered += [
                     replace(item, sensor=sensor.name) for item in found if isinstance(item, Event)
                 ]
                 if not link.streams.repeated:
@@ -179,11 +179,13 @@ async def _discover(
                     by_serial.setdefault(serial_number(stream), []).append(stream)
                 for streams in by_serial.values():
                     if len(streams) == n_channels:
-                        heard += link.streams.assign(sensor.name, sorted(streams, key=_component))
+                        buffered += link.streams.assign(
+                            sensor.name, sorted(streams, key=_component)
+                        )
                         return
-    streams_heard = ", ".join(sorted(link.streams.unknown)) or "nothing"
+    received = ", ".join(sorted(link.streams.unknown)) or "nothing"
     raise NoAnswerError(
-        f"{label}: expected {n_channels} streams of one digitizer, received {streams_heard} in"
+        f"{label}: expected {n_channels} streams of one digitizer, received {received} in"
         f" {settings.patience:g} s; set settings.streams"
     )
 
@@ -197,7 +199,7 @@ async def _listen(
     sensors: Sequence[Sensor],
     settings: GuralpSettings,
     label: str,
-    heard: list[Block | Event],
+    buffered: list[Block | Event],
 ) -> tuple[DeviceInformation, ...]:
     """Listen until every stream has been received; return the information of each sensor.
 
@@ -206,7 +208,7 @@ async def _listen(
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(settings.patience):
             while link.streams.silent:
-                heard += await link.receive()
+                buffered += await link.receive()
     information = []
     for sensor in sensors:
         silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)

@@ -158,14 +158,14 @@ class _TcpLink:
     def __init__(self, client: AsyncModbusTcpClient, clock: HostClock) -> None:
         self._client = client
         self._clock = clock
-        self._heard = b""
+        self._received = b""
         client.ctx.trace_packet = self._trace  # otherwise pymodbus logs the packets
 
     async def ask(
         self, device_id: int, function: int, address: int, value: int, patience: float
     ) -> _Answer:
         client = self._client
-        self._heard = b""
+        self._received = b""
         client.ctx.comm_params.timeout_connect = patience
         task = asyncio.current_task()
         n_cancelled = task.cancelling() if task else 0
@@ -198,14 +198,14 @@ class _TcpLink:
 
     def _trace(self, sending: bool, packet: bytes) -> bytes:
         if not sending:
-            whole = packet if packet.startswith(self._heard) else self._heard + packet
-            self._heard = whole[: rtu.MAX_FRAME]
+            whole = packet if packet.startswith(self._received) else self._received + packet
+            self._received = whole[: rtu.MAX_FRAME]
         return packet
 
     def _unexpected(self, device_id: int) -> str:
-        if len(self._heard) > _UNIT and self._heard[_UNIT] != device_id:
-            return f"received a reply of unit {self._heard[_UNIT]}, expected unit {device_id}"
-        return f"received {len(self._heard)} bytes that are no reply" if self._heard else ""
+        if len(self._received) > _UNIT and self._received[_UNIT] != device_id:
+            return f"received a reply of unit {self._received[_UNIT]}, expected unit {device_id}"
+        return f"received {len(self._received)} bytes that are no reply" if self._received else ""
 
 
 @dataclass(slots=True)
@@ -265,7 +265,7 @@ class ModbusBus:
             If the port is closed.
         """
         sent = self._clock.now()
-        answer = await self._asked(
+        answer = await self._exchange(
             device_id,
             function,
             address,
@@ -281,7 +281,7 @@ class ModbusBus:
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raise the errors of :meth:`read`."""
-        await self._asked(
+        await self._exchange(
             device_id,
             rtu.WRITE_SINGLE,
             address,
@@ -289,8 +289,8 @@ class ModbusBus:
             f"device {device_id}, function 6, register {address} ← {value}",
         )
 
-    async def _asked(
-        self, device_id: int, function: int, address: int, value: int, asked: str
+    async def _exchange(
+        self, device_id: int, function: int, address: int, value: int, request: str
     ) -> _Answer:
         self._patience = self._timeout_for(device_id)
         try:
@@ -298,18 +298,20 @@ class ModbusBus:
         except NotConnectedError as error:
             raise NotConnectedError(f"{self.label}: the port closed") from error
         except DamagedReplyError as error:
-            raise DamagedReplyError(f"{self.label}: a damaged reply to {asked}; {error}") from error
+            raise DamagedReplyError(
+                f"{self.label}: a damaged reply to {request}; {error}"
+            ) from error
         except NoAnswerError as error:
             if device_id in self._reply_times:  # it may have become slower
                 self._reply_times[device_id].longest *= 2
             detail = f"; {error}" if str(error) else ""
             raise NoAnswerError(
-                f"{self.label}: no answer in {self._patience:.2g} s to {asked}{detail}"
+                f"{self.label}: no answer in {self._patience:.2g} s to {request}{detail}"
             ) from error
         if answer.exception is not None:
             why = EXCEPTIONS.get(answer.exception, "unknown")
             raise RefusedError(
-                f"{self.label}: Modbus exception {answer.exception} ({why}) to {asked}",
+                f"{self.label}: Modbus exception {answer.exception} ({why}) to {request}",
                 answer.exception,
             )
         return answer

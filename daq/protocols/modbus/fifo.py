@@ -85,7 +85,7 @@ class FifoDecoder:
         self._unit = unit
         self._capacity = capacity
         self._finder = ReplyFinder()
-        self._asked = 0  # words requested
+        self._n_requested = 0  # words requested
         self._doubtful = 0  # words that an unanswered read may have removed
         self._n_unanswered = self._n_refused = 0
         self._started = False
@@ -118,10 +118,10 @@ class FifoDecoder:
     def request(self) -> bytes:
         """Return the next request: for the level and the samples known to be in the FIFO."""
         most = MAX_WORDS // self._n_channels * self._n_channels
-        self._asked = min(self.level // self._n_channels * self._n_channels, most)
+        self._n_requested = min(self.level // self._n_channels * self._n_channels, most)
         if self._doubtful:  # the level alone decides whether these words were removed
-            self._asked = 0
-        request = rtu.read_request(self._unit, FIFO_REGISTER, 1 + self._asked)
+            self._n_requested = 0
+        request = rtu.read_request(self._unit, FIFO_REGISTER, 1 + self._n_requested)
         self._finder.expect(request)
         return request
 
@@ -129,7 +129,7 @@ class FifoDecoder:
         """End the wait for a reply."""
         other = self._finder.unexpected
         self._finder.cancel()
-        self._doubtful += self._asked
+        self._doubtful += self._n_requested
         self._n_unanswered += 1
         text = f"no reply to a read: {other or 'nothing received'} ({self._n_unanswered} so far)"
         return [
@@ -148,7 +148,7 @@ class FifoDecoder:
             text = f"the device refused a read: {why} ({self._n_refused} so far)"
             return [Event(self._sensor, EventKind.REFUSED, text, at)]
         registers = reply.registers
-        level = int(registers[0]) + (self._asked if self._header == "left" else 0)
+        level = int(registers[0]) + (self._n_requested if self._header == "left" else 0)
         found = self._resolve_doubt(level, at)
         if self._capacity is not None and level >= self._capacity and self._started:
             if not self._full:
@@ -158,10 +158,10 @@ class FifoDecoder:
             index += round((at.monotonic_ns - since) * 1e-9 * self._rate)
             self._full.append((level, index))
         words = registers[1:].view(np.int16)
-        if level < self._asked and not words[level:].any():  # zeros behind the words
+        if level < self._n_requested and not words[level:].any():  # zeros behind the words
             words = words[: level // self._n_channels * self._n_channels]
             found += self._emptied(level, at)
-        self.level = max(0, level - self._asked)
+        self.level = max(0, level - self._n_requested)
         self._last = at
         found += self._take(words, at)
         return found
@@ -170,7 +170,7 @@ class FifoDecoder:
         """Handle a restart of the device: fewer words in the FIFO than known."""
         if not self._started:
             return []
-        text = f"{level} words in the FIFO, expected {self._asked}: the device was restarted"
+        text = f"{level} words in the FIFO, expected {self._n_requested}: the device was restarted"
         found = [*self._hand_over(at), Event(self._sensor, EventKind.RESET, text, at)]
         index, since = self._caught_up
         index += round((at.monotonic_ns - since) * 1e-9 * self._rate)

@@ -172,8 +172,12 @@ def _notes(state: State, snapshot: Snapshot, settings: Settings) -> Iterator[Tex
         differences = _differences(state)
         if differences:
             n_certain = sum(each.is_certain for each in differences.values())
-            said = f"{n_certain} of {len(differences)} channels differ by more than their interval"
-            yield Text(f"against {_reference(state)}: 95 % interval of each channel; {said}", MUTED)
+            summary = (
+                f"{n_certain} of {len(differences)} channels differ by more than their interval"
+            )
+            yield Text(
+                f"against {_reference(state)}: 95 % interval of each channel; {summary}", MUTED
+            )
         else:
             why = (
                 f"units differ: {snapshot.unit} and {reference.snapshot.unit}"

@@ -67,14 +67,14 @@ def _verdict(snapshot: Snapshot, settings: Settings) -> tuple[str, str]:
         return "effect not known yet", MUTED
     worst = max(shares)
     if worst < NO_EFFECT:
-        said = f"no effect on noise ({percent(worst)})"
+        words = f"no effect on noise ({percent(worst)})"
     elif worst < NEGLIGIBLE_EFFECT:
-        said = f"negligible, {percent(worst)} of the noise"
+        words = f"negligible, {percent(worst)} of the noise"
     elif worst < SMALL_EFFECT:
-        said = f"small, {percent(worst)} of the noise"
+        words = f"small, {percent(worst)} of the noise"
     else:
-        said = f"they matter here, {percent(worst)} of the noise"
-    return said, STYLES[grade(worst)]
+        words = f"they matter here, {percent(worst)} of the noise"
+    return words, STYLES[grade(worst)]
 
 
 def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: int) -> Table:

@@ -184,8 +184,8 @@ def _channel_noise(
 ) -> Text:
     name = snapshot.channels[column].channel
     value, style = "…", ""
-    if said := _flagged(snapshot, column):
-        value, style = said, "bold #ff6b6b"
+    if flag := _flagged(snapshot, column):
+        value, style = flag, "bold #ff6b6b"
     elif column in alone:
         value, style = PARTNER_WORDS[alone[column]], "bold #ff6b6b"
     elif means:

@@ -193,8 +193,8 @@ async def _outcome(process: Process) -> Outcome:
         return Outcome.of(out.decode(errors="replace"))
     code = process.returncode or 0
     how = f"was killed (signal {-code})" if code < 0 else f"ended with exit code {code}"
-    said = f": {log.errors[-1]}" if log.errors else ""
-    raise FinishFailedError(f"the estimate {how}{said}")
+    detail = f": {log.errors[-1]}" if log.errors else ""
+    raise FinishFailedError(f"the estimate {how}{detail}")
 
 
 class _OwnRecorder:

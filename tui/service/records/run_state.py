@@ -166,9 +166,9 @@ class Run:
         return replace(self, state=state, **changes)
 
     def because(self, reason: str) -> Run:
-        """Return the run with further reasons, separated by semicolons; each is said once."""
-        said = [*(self.reason.split("; ") if self.reason else []), *reason.split("; ")]
-        return replace(self, reason="; ".join(dict.fromkeys(said)))
+        """Return the run with further reasons, separated by semicolons; each is reasons once."""
+        reasons = [*(self.reason.split("; ") if self.reason else []), *reason.split("; ")]
+        return replace(self, reason="; ".join(dict.fromkeys(reasons)))
 
     def document(self) -> dict[str, Any]:
         """Return the run as JSON (docs/service.md)."""
