@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -28,7 +29,7 @@ from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 from daq.timing.clock_model import ClockSource, ClockState
-from estimator.diagnostics.diagnose import diagnose
+from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
@@ -109,6 +110,21 @@ def made_snapshot(
     )
 
 
+@functools.cache
+def _diagnosis(
+    csm: bytes, shape: tuple[int, ...], n_effective: float, n_factors: int | None
+) -> Diagnostics:
+    """Diagnose the averages of three sensors, once for all tests that show the same."""
+    return diagnose(
+        np.frombuffer(csm, dtype=np.complex128).reshape(shape),
+        np.arange(shape[0]) * np.float64(0.5),
+        dims=(shape[1] // 3,) * 3,
+        n_effective=n_effective,
+        n_factors=n_factors,
+        vertical=2,
+    )
+
+
 def diagnosed(
     change: FloatArray | None = None,
     *,
@@ -120,14 +136,7 @@ def diagnosed(
     """Return a finished snapshot with the diagnosis of its averages, changed before."""
     snapshot = made_snapshot(n_effective=n_effective, closed=True)
     csm = snapshot.csm if change is None else change @ snapshot.csm @ change.T
-    found = diagnose(
-        csm,
-        snapshot.frequency,
-        dims=snapshot.dims,
-        n_effective=n_effective,
-        n_factors=n_factors,
-        vertical=2,
-    )
+    found = _diagnosis(csm.tobytes(), csm.shape, n_effective, n_factors)
     diagnosis = Diagnosis(
         n_factors=found.n_factors,
         pairs=found.pairs,

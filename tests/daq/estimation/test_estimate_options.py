@@ -70,7 +70,7 @@ def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snap
     with Estimation([path], settings) as live:
         for number, block in enumerate(arriving):
             writer.append(block)
-            if number % 120 == 119:
+            if number % 240 == 239:
                 writer.commit()
                 live.update()
                 growing = live.snapshot()
@@ -163,8 +163,8 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
 
 
 def test_channels_that_are_cut_off_without_saying_so_are_named(tmp_path: Path) -> None:
-    sensors = bench(n_samples=20_000)
-    n = np.arange(20_000)
+    sensors = bench()
+    n = np.arange(N_SAMPLES)
     sensors["a"].counts[:, 0] = np.rint(3000 * np.sin(2 * np.pi * n / 77.7))  # a shaker is no fault
     sensors["a"].counts[:, 2] = np.rint(sensors["a"].counts[:, 2] / 1e4)  # nor are few values
     sensors["b"].counts[:, 1] = np.clip(sensors["b"].counts[:, 1], -30_000, 20_000)
