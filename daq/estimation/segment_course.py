@@ -59,7 +59,8 @@ def segment_course(
     if filters is not None:
         response = response * filters
     return SegmentCourse(
-        spectra=np.concatenate(spectra) / response.astype(np.complex64),
+        spectra=(spectra[0] if len(spectra) == 1 else np.concatenate(spectra))
+        / response.astype(np.complex64),
         bins=bins,
         times=np.concatenate(times),
         runs=np.concatenate(runs),

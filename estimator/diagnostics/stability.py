@@ -23,7 +23,7 @@ from estimator.likelihood.score_test import usable
 from estimator.median import median
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,6 +40,8 @@ DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
+PAIR_BYTES = 1 << 26
+"""Bytes of products of pairs of channels with all others that exist together: 64 MB."""
 SIGNIFICANCE = 2.0
 """Standard errors by which scatter must exceed its expectation to be significant."""
 
@@ -175,32 +177,32 @@ def stability(
     if n_parts < 3 or len(bins) < FREQUENCIES:
         return None
     at = maximum.take(bins)
-    vectors = at.eigenvectors
-    free = vectors[:, :, at.n_factors :]
-    fitted = np.einsum("fpm,fm,fpm->fp", vectors, at.eigenvalues, vectors.conj()).real
-    residual = np.empty((n_segments, len(bins), fitted.shape[1]), np.complex128)
-    for number, column in enumerate(there):  # all at once would take four times the memory
-        x = course.spectra[:, column].astype(np.complex128)
-        x *= np.sqrt(fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
-        residual[:, number] = x @ free[number].conj() @ free[number].T
     groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
-    out = _disturbed(residual, groups)
+    residuals = _Residuals(course, there, at, groups)
+    out = _disturbed(residuals)
     lags = np.abs(bins[:, None] - bins)
     correlation = np.concatenate([[1.0], neighbours, [0.0]])[np.minimum(lags, len(neighbours) + 1)]
-    projector = free @ free.conj().swapaxes(1, 2)
-    of_parts = _Parts(np.array_split(residual, n_parts), projector, n_effective, correlation)
     numbers, lengths = np.unique(course.runs, return_counts=True)
     several = len(numbers) > 1 and min(lengths) >= MIN_SEGMENTS
-    runs = [residual[course.runs == run] for run in numbers] if several else []
-    without = _Parts([residual[~out]], projector, n_effective, correlation)
-    excess = without.lack(groups) if out.any() else np.zeros((1, residual.shape[2]))
+    divisions = [
+        np.array_split(np.arange(n_segments), n_parts),
+        [np.flatnonzero(~out)] if out.any() else [],
+        [np.flatnonzero(course.runs == run) for run in numbers] if several else [],
+    ]
+    covariances = residuals.covariances(divisions)
+
+    def parts(which: int) -> _Parts:
+        return _Parts(
+            divisions[which], covariances[which], residuals.projector, n_effective, correlation
+        )
+
+    of_parts = parts(0)
+    excess = parts(1).lack(groups) if out.any() else np.zeros((1, residuals.n_channels))
     return Stability(
         low=frequency[bins[[group[0] for group in groups]]],
         high=frequency[bins[[group[-1] for group in groups]]],
         parts=of_parts.scatter(groups),
-        runs=(
-            _Parts(runs, projector, n_effective, correlation).scatter(groups) if several else None
-        ),
+        runs=parts(2).scatter(groups) if several else None,
         inflation=max(of_parts.inflation(), of_parts.inflation_by_level(groups)),
         n_segments=n_segments,
         disturbed=np.flatnonzero(out),
@@ -209,11 +211,70 @@ def stability(
     )
 
 
-def _disturbed(residual: ComplexArray, groups: list[IntArray]) -> BoolArray:
+class _Residuals:
+    """Residuals of the segments: projected on the directions without motion.
+
+    Those of one group of frequencies at a time, since all take several times the memory of the
+    segments' spectra.
+
+    Parameters
+    ----------
+    course : SegmentCourse
+    columns : int64, shape (n_bins,)
+        Its frequencies that are used.
+    at : Maximum
+        Maximum of the likelihood at these.
+    groups : list of int64
+        Indices of each group among them.
+    """
+
+    def __init__(
+        self, course: SegmentCourse, columns: IntArray, at: Maximum, groups: list[IntArray]
+    ) -> None:
+        self._spectra, self._columns, self._groups = course.spectra, columns, groups
+        vectors = at.eigenvectors
+        self._free = vectors[:, :, at.n_factors :]
+        self._fitted = np.einsum("fpm,fm,fpm->fp", vectors, at.eigenvalues, vectors.conj()).real
+        self.projector = self._free @ self._free.conj().swapaxes(1, 2)
+        self.n_channels = vectors.shape[1]
+
+    def __iter__(self) -> Iterator[ComplexArray]:
+        """Yield the residuals of each group, shape (n_segments, n_freqs, n_channels)."""
+        for group in self._groups:
+            shape = (len(self._spectra), len(group), self.n_channels)
+            residual = np.empty(shape, np.complex128)
+            for place, number in enumerate(group.tolist()):
+                x = self._spectra[:, self._columns[number]].astype(np.complex128)
+                x *= np.sqrt(self._fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
+                residual[:, place] = x @ self._free[number].conj() @ self._free[number].T
+            yield residual
+
+    def covariances(self, divisions: Sequence[Sequence[IntArray]]) -> list[ComplexArray]:
+        """Return the mean products of channels over each part of several divisions.
+
+        Parameters
+        ----------
+        divisions : sequence of sequence of int64
+            Segments of each part.
+
+        Returns
+        -------
+        list of complex128, shape (n_parts, n_bins, n_channels, n_channels)
+        """
+        shape = (len(self._columns), self.n_channels, self.n_channels)
+        found = [np.empty((len(parts), *shape), np.complex128) for parts in divisions]
+        for group, residual in zip(self._groups, self, strict=True):
+            for parts, covariance in zip(divisions, found, strict=True):
+                for number, some in enumerate(parts):
+                    part = residual[some]
+                    products = np.matmul(part.transpose(1, 2, 0), part.swapaxes(0, 1).conj())
+                    covariance[number, group] = products / len(part)
+        return found
+
+
+def _disturbed(residuals: Iterable[ComplexArray]) -> BoolArray:
     """Return whether each segment has outlying residuals; none if too many have."""
-    power = np.stack(
-        [(np.abs(residual[:, group]) ** 2).sum(axis=(1, 2)) for group in groups], axis=1
-    )
+    power = np.stack([(np.abs(each) ** 2).sum(axis=(1, 2)) for each in residuals], axis=1)
     middle = median(power)
     scatter = 1.4826 * median(np.abs(power - middle))
     out = np.asarray(((power - middle) > DISTURBED * scatter).any(axis=1))
@@ -221,11 +282,23 @@ def _disturbed(residual: ComplexArray, groups: list[IntArray]) -> BoolArray:
 
 
 class _Parts:
-    """Parts of the residuals, each shape (n_segments, n_freqs, n_channels), and their noise."""
+    """Parts of the segments, and the noise in them.
+
+    Parameters
+    ----------
+    parts : sequence of int64
+        Segments of each.
+    covariance : complex128, shape (n_parts, n_freqs, n_channels, n_channels)
+        Of the residuals.
+    projector : complex128, shape (n_freqs, n_channels, n_channels)
+    n_effective : float
+    correlation : float64, shape (n_freqs, n_freqs)
+    """
 
     def __init__(
         self,
-        parts: list[ComplexArray],
+        parts: Sequence[IntArray],
+        covariance: ComplexArray,
         projector: ComplexArray,
         n_effective: float,
         correlation: FloatArray,
@@ -234,12 +307,7 @@ class _Parts:
         self._n_parts, self._projector, self._correlation = len(parts), projector, correlation
         # Independent averages per part, from the mean of the variances.
         self._averages = n_effective * len(parts) / sum(total / len(part) for part in parts)
-        self._covariance = np.stack(
-            [
-                np.matmul(part.transpose(1, 2, 0), part.swapaxes(0, 1).conj()) / len(part)
-                for part in parts
-            ]
-        )
+        self._covariance = covariance
         self._inverse = fisher.covariance(np.abs(projector) ** 2)
         diagonal = np.einsum("bfpp->bfp", self._covariance - projector).real
         self._noise = np.einsum("fpq,bfq->bfp", self._inverse, diagonal)
@@ -287,8 +355,25 @@ class _Parts:
 
         Valid for any rate of change of the noise; 1 unless significantly more.
         """
+        n_freqs, n_channels, _ = self._projector.shape
+        pairs = np.array(list(combinations(range(n_channels), 2)))
+        at_once = max(1, PAIR_BYTES // (16 * n_freqs * n_channels))
+        parts = [
+            self._pair_scatter(*pairs[low : low + at_once].T)
+            for low in range(0, len(pairs), at_once)
+        ]
+        found, theory, own = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+        known = own.sum(axis=0) > 0.1 * own.sum(axis=0).max()
+        if not known.any():
+            return 1.0
+        ratio = float(np.mean(found[known] / theory[known]))
+        # The number of independent scores is about the number of channels.
+        error = float(np.sqrt(2 / ((self._n_parts - 1) * n_channels)))
+        return ratio if ratio > 1 + SIGNIFICANCE * error else 1.0
+
+    def _pair_scatter(self, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the variance of pairs' scores, that for steady noise, and the information."""
         projector = self._projector
-        i, j = np.array(list(combinations(range(projector.shape[1]), 2))).T
         with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
         score = 2 * self._covariance[:, :, i, j].real
         score -= np.einsum("bfp,fpa->bfa", self._noise, with_noise)
@@ -296,11 +381,4 @@ class _Parts:
         own -= np.einsum("fpa,fpq,fqa->fa", with_noise, self._inverse, with_noise)
         root = np.sqrt(np.clip(own, 0.0, None))
         theory = np.einsum("fa,fg,ga->a", root, self._correlation, root) / self._averages
-        found = score.sum(axis=1).var(axis=0, ddof=1)
-        known = own.sum(axis=0) > 0.1 * own.sum(axis=0).max()
-        if not known.any():
-            return 1.0
-        ratio = float(np.mean(found[known] / theory[known]))
-        # The number of independent scores is about the number of channels.
-        error = float(np.sqrt(2 / ((self._n_parts - 1) * projector.shape[1])))
-        return ratio if ratio > 1 + SIGNIFICANCE * error else 1.0
+        return score.sum(axis=1).var(axis=0, ddof=1), theory, own

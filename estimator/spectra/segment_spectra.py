@@ -59,7 +59,7 @@ class SegmentSpectra:
         self.most = max(1, min(MAX_SEGMENTS, MAX_VALUES // max(1, len(bins) * n_channels)))
         self._n_channels = n_channels
         self._n_seen = 0
-        self._parts: list[NDArray[np.complex64]] = []
+        self._kept = np.empty((0, len(bins), n_channels), np.complex64)
         self._n_kept = 0
 
     def add(self, spectra: ComplexArray) -> None:
@@ -71,11 +71,19 @@ class SegmentSpectra:
         """
         number = self._n_seen + np.arange(len(spectra))
         self._n_seen += len(spectra)
-        some = spectra[number % self.every == 0].astype(np.complex64)
-        self._parts.append(some)
-        self._n_kept += len(some)
-        while self._n_kept > self.most:
+        kept = number % self.every == 0
+        while self._n_kept + np.count_nonzero(kept) > self.most:
             self.thin(2 * self.every)
+            kept = number % self.every == 0
+        end = self._n_kept + int(np.count_nonzero(kept))
+        if end > len(self._kept):
+            # One array that grows: small ones would lie between others that are freed.
+            n_rows = max(end, min(2 * len(self._kept), self.most))
+            room = np.empty((n_rows, *self._kept.shape[1:]), np.complex64)
+            room[: self._n_kept] = self.values()
+            self._kept = room
+        self._kept[self._n_kept : end] = spectra[kept]
+        self._n_kept = end
 
     def __len__(self) -> int:
         """Return the number of kept segments."""
@@ -84,14 +92,13 @@ class SegmentSpectra:
     def thin(self, every: int) -> None:
         """Keep every `every`-th segment from now on, a multiple of the current value."""
         if every != self.every:
-            self._parts = [self.values()[:: every // self.every].copy()]
-            self._n_kept = len(self._parts[0])
+            self._kept = self.values()[:: every // self.every].copy()
+            self._n_kept = len(self._kept)
             self.every = every
 
     def values(self) -> NDArray[np.complex64]:
-        """Return the kept spectra, (n_segments, n_kept, n_channels), not scaled to a density."""
-        if not self._parts:
-            return np.empty((0, len(self.bins), self._n_channels), np.complex64)
-        if len(self._parts) > 1:
-            self._parts = [np.concatenate(self._parts)]
-        return self._parts[0]
+        """Return the kept spectra, (n_segments, n_kept, n_channels), not scaled to a density.
+
+        Later segments do not change them.
+        """
+        return self._kept[: self._n_kept]

@@ -1,0 +1,99 @@
+"""Memory of following for days: what is kept, and what steps take for a moment."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tracemalloc
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.timing.kalman import Observations, smooth
+from estimator.diagnostics.stability import SegmentCourse, stability
+from estimator.likelihood.factor_analysis import maximise
+from estimator.likelihood.goodness_of_fit import HANN_HALF
+from estimator.spectra.segment_spectra import SegmentSpectra
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_AFTER_MANY_ARRAYS = """
+import numpy as np
+from daq.estimation.segments.freed_memory import FreedMemory
+
+def resident() -> float:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096e-6
+
+memory = FreedMemory()
+before = resident()
+largest = np.ones(30_000_000 // 8)
+del largest
+arrays, between = [], []
+for _ in range(100):
+    arrays.append(np.ones(1_000_000 // 8))
+    between.append(np.ones(100))
+del arrays
+print(resident() - before)
+"""
+
+
+def _peak(action: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        action()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads its memory from /proc")
+def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", _AFTER_MANY_ARRAYS], capture_output=True, text=True, check=True
+    )
+    assert float(ended.stdout) < 20.0
+
+
+def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
+    rng = np.random.default_rng(0)
+    n_segments, n_kept, p = 2000, 48, 9
+    motion = 30 * rng.standard_normal((n_segments, n_kept, 1))
+    noise = rng.standard_normal((n_segments, n_kept, p, 2)) @ np.array([1, 1j])
+    spectra = (motion + noise).astype(np.complex64)
+    exact = spectra.astype(np.complex128)
+    maximum = maximise(np.einsum("sfp,sfq->fpq", exact, exact.conj(), optimize=True), 1)
+    course = SegmentCourse(spectra, np.arange(n_kept), np.arange(2000.0), np.zeros(2000, np.int64))
+    frequency = np.arange(1.0, n_kept + 1)
+
+    def divide() -> None:
+        found = stability(course, maximum, frequency, n_effective=1000.0, neighbours=HANN_HALF)
+        assert found is not None
+
+    assert _peak(divide) < 2 * spectra.nbytes
+
+
+def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
+    n = 2048
+    seconds = np.linspace(0.0, 10.0 * (n - 1), n)
+    lateness = 1e-5 * np.random.default_rng(0).standard_normal(n)
+    from_samples = np.arange(n) % 2 == 0
+    observed = Observations(
+        seconds, lateness, 1e-12 * from_samples, from_samples, np.zeros(n, np.bool_)
+    )
+    n_pairs = 2  # of walk and noise that are likely here, with the steady one
+    assert _peak(lambda: smooth(observed)) < 2.2 * n * n_pairs * 24 * 8
+
+
+def test_kept_segments_are_one_array() -> None:
+    kept = SegmentSpectra(np.arange(40), 9)
+    one = np.ones((1, 40, 9), np.complex128)
+
+    def add() -> None:
+        for _ in range(5000):
+            kept.add(one)
+
+    assert _peak(add) < 0.8 * kept.most * one.nbytes  # of numbers half as large
+    assert kept.values().shape == (len(kept), 40, 9)
