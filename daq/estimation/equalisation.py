@@ -157,7 +157,7 @@ class Equalisation:
         if found is None or not found.share.max(initial=0.0) > leakage_threshold(n_effective):
             return False
         frequency = np.concatenate([band.frequencies for band in bands])
-        csm = np.concatenate([band.csm for band in bands])
+        csm = bands[0].csm if len(bands) == 1 else np.concatenate([b.csm for b in bands])
         wanted, self._reference = correction(
             channel_responses(csm, frequency, dims=self._dims),
             self._welch.frequencies,

@@ -76,9 +76,11 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
         highest = octaves.bands()[-1]
         wanted = max(MIN_AVERAGES, first.n_channels + 2)
         return octaves.bands(min(wanted, highest.n_effective))
-    spectra = CrossSpectra(first.welch, first.n_channels)
-    for each in passes:
-        spectra.merge(each.spectra)
+    spectra = first.spectra
+    if len(passes) > 1:
+        spectra = CrossSpectra(first.welch, first.n_channels)
+        for each in passes:
+            spectra.merge(each.spectra)
     window = get_window(first.welch.window, first.welch.segment_length)
     n_effective = sum(
         effective_averages(window, each.welch.hop, count)

@@ -124,7 +124,7 @@ class SnapshotBuilder:
         )
         if bands:
             frequency = np.concatenate([band.frequencies for band in bands])
-            csm = np.concatenate([band.csm for band in bands])
+            csm = bands[0].csm if len(bands) == 1 else np.concatenate([b.csm for b in bands])
         else:
             frequency = first.welch.frequencies
             shape = (len(frequency), first.n_channels, first.n_channels)

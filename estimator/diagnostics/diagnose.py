@@ -6,6 +6,7 @@ orientation of the sensors, and the recommendations of section 5 of the paper.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -54,6 +55,7 @@ from estimator.self_noise.live_channels import Presence, presence
 if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
     from estimator.diagnostics.stability import SegmentCourse
+    from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray
 
 LOST = 0.5
@@ -165,7 +167,7 @@ def diagnose(
     """
     check_dims(dims)
     check_averages(n_effective)
-    csm = np.asarray(csm, dtype=np.complex128)
+    csm = np.asarray(csm, np.complex128)
     given = coherency(csm, dims)
     frequency = check_frequency(frequency, len(csm))
     pairs = tuple(combinations(range(len(dims)), 2))
@@ -190,7 +192,8 @@ def diagnose(
         snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
         lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
     canonical = CanonicalCoherence(matrix)
-    dimension = _dimension(canonical, matrix, there.dims, n_effective)
+    del matrix  # as large as all averages
+    dimension = _dimension(canonical, there.dims, n_effective)
     number = bands(frequency)
     insides = [number == band for band in sorted(set(number.tolist()))]
     found = tuple(
@@ -233,8 +236,7 @@ def diagnose(
             inflation=1.0 if steady is None else steady.inflation,
         )
         shared = None if shared is None else shared.among(there.channels, sum(dims))
-    alive = np.ix_(range(len(csm)), there.channels, there.channels)
-    responses = _responses(csm[alive], frequency, there, vertical, canonical)
+    responses = _responses(csm, given, frequency, there, vertical=vertical, coherence=canonical)
     return Diagnostics(
         frequency=frequency,
         pairs=pairs,
@@ -337,14 +339,12 @@ def _test(
     if len(set(there.dims)) == 1 and fit.n_factors <= there.dims[0]:
         return test, untested
     information = fisher.information(fit.eigenvectors[:, :, fit.n_factors :])
-    idle = (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
-    degrees = test.degrees + idle
-    p_value = p_values(degrees, test.statistic)
-    return ModelTest(test.statistic, degrees, p_value), untested
+    degrees = test.degrees + (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
+    return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
 
 
 def _dimension(
-    canonical: CanonicalCoherence, matrix: ComplexArray, dims: tuple[int, ...], n_effective: float
+    canonical: CanonicalCoherence, dims: tuple[int, ...], n_effective: float
 ) -> FloatArray:
     """Return the number of significant canonical coherences between sensors, shape (n_freqs,).
 
@@ -352,10 +352,9 @@ def _dimension(
     ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
     """
     pairs = list(combinations(range(len(dims)), 2))
-    found = np.zeros(len(matrix))
-    usable = np.isfinite(matrix).all(axis=(1, 2))
+    found = np.zeros(len(canonical.usable))
     if not pairs or n_effective <= 2 * max(dims):
-        return np.full(len(matrix), np.nan)
+        return np.full(len(found), np.nan)
     for j, k in pairs:
         coherence = np.minimum(
             canonical.between(own_channels(dims, j), own_channels(dims, k)), 1 - 1e-15
@@ -366,23 +365,27 @@ def _dimension(
         degrees = 2 * (dims[j] - r) * (dims[k] - r)
         limit = [critical_value(n, DIMENSION_LEVEL / len(pairs)) for n in degrees.tolist()]
         found = np.maximum(found, (statistic > limit).sum(axis=1))
-    return np.where(usable, found, np.nan)
+    return np.where(canonical.usable, found, np.nan)
 
 
 def _responses(
     csm: ComplexArray,
+    checked: Coherency,
     frequency: FloatArray,
     there: Presence,
+    *,
     vertical: int | None,
     coherence: CanonicalCoherence,
 ) -> tuple[RelativeResponse, ...]:
     found = []
-    checked = coherency(csm, there.dims) if len(there.whole) > 1 else None
+    if len(there.channels) < csm.shape[1] and len(there.whole) > 1:
+        csm = csm[np.ix_(range(len(csm)), there.channels, there.channels)]
+        checked = coherency(csm, there.dims)
     for first, second in combinations(range(len(there.sensors)), 2):
         pair = there.sensors[first], there.sensors[second]
         if not set(pair) <= set(there.whole):  # motion along a missing channel is unknown
             continue
-        try:
+        with suppress(InsufficientDataError):  # not comparable
             response = relative_response(
                 csm,
                 frequency,
@@ -393,7 +396,5 @@ def _responses(
                 coherence=coherence,
                 checked=checked,
             )
-        except InsufficientDataError:  # not comparable
-            continue
-        found.append(replace(response, first=pair[0], second=pair[1]))
+            found.append(replace(response, first=pair[0], second=pair[1]))
     return tuple(found)

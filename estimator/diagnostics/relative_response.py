@@ -25,10 +25,11 @@ from estimator.self_noise.coherency import (
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_COHERENCE = 0.5
 """Frequencies with a lower coherence are not used: their phase could bias the delay."""
+_CERTAINLY = 1 + 1e-6  # rounding, and directions without power, change a coherence by less
 _STEPS = 4  # steps of least squares from the coarse delay
 _PARTS = 8  # parts of the band, for the scatter of the angles
 _MIN_PARTS = 4
@@ -181,9 +182,9 @@ def relative_response(
             f"sensors {first} and {second}: the others have {len(rest)} channels; expected {d}"
         )
     g = coherence.between(*own)[:, -1]
-    seen = coherence.between(own[0], rest)[:, -1]
     weight = g / np.maximum(1 - g, 1e-9)
-    weight[~usable | (np.minimum(g, seen) < MIN_COHERENCE)] = 0.0
+    weight[~usable | (g < MIN_COHERENCE)] = 0.0
+    weight[~seen_by_others(coherence, dims, (first, second), weight > 0)] = 0.0
     if not weight.any():
         raise InsufficientDataError(
             f"sensors {first} and {second}: at no frequency from {low:g} to {high:g} Hz are they "
@@ -192,8 +193,8 @@ def relative_response(
         )
     inside = np.flatnonzero(weight)
     f, weight = frequency[inside], weight[inside]
-    csm = csm[inside] / _power(csm[inside], dims, first)[:, None, None]
-    S_ik, S_jk = (csm[:, channels[:, None], rest] for channels in own)
+    power = _power(csm, dims, first)[inside]
+    S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
     delay, delay_error = _delay(f, weight, S_ik, S_jk)
     S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
     matrix = _transfer(weight, S_ik, S_jk)
@@ -225,6 +226,39 @@ def relative_response(
         delay_error=delay_error,
         coherence=float(g[inside].mean()),
     )
+
+
+def seen_by_others(
+    coherence: CanonicalCoherence, dims: tuple[int, ...], pair: tuple[int, int], wanted: BoolArray
+) -> BoolArray:
+    """Return where all motion of the first of a pair is coherent with the sensors beside the pair.
+
+    Shape (n_freqs,), of the frequencies that are `wanted`. One sensor alone sees no more of the
+    motion than all together. All are taken together only where no single one sees it, since that
+    costs the root of a large matrix for each pair.
+    """
+    own = own_channels(dims, pair[0])
+    others = [sensor for sensor in range(len(dims)) if sensor not in pair]
+    seen = np.zeros(len(wanted), np.bool_)
+    for sensor in others:
+        if not (wanted & ~seen).any():
+            return seen
+        if dims[sensor] >= len(own):
+            alone = coherence.between(own, own_channels(dims, sensor))[:, -1]
+            seen |= alone >= MIN_COHERENCE * _CERTAINLY
+    doubtful = wanted & ~seen
+    if doubtful.any():
+        rest = np.concatenate([own_channels(dims, sensor) for sensor in others])
+        together = coherence.between(own, rest, where=doubtful)[:, -1]
+        seen |= doubtful & (together >= MIN_COHERENCE)
+    return seen
+
+
+def _part(csm: ComplexArray, inside: IntArray, rows: IntArray, columns: IntArray) -> ComplexArray:
+    """Return rows and columns at some frequencies, which are the fastest axis in memory."""
+    part = np.empty((len(rows), len(columns), len(inside)), np.complex128).transpose(2, 0, 1)
+    part[...] = csm[inside[:, None, None], rows[:, None], columns]
+    return part
 
 
 def _power(csm: ComplexArray, dims: tuple[int, ...], sensor: int) -> FloatArray:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimator.median import median
-from estimator.self_noise.coherency import own_channels
+from estimator.self_noise.coherency import blocks, own_channels
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -48,52 +48,92 @@ NOISE_INCREASE = 4.0
 class CanonicalCoherence:
     """Magnitude squared canonical coherence of groups of channels.
 
-    Pairs are cached, and matrix roots up to `ROOT_BYTES`: that of all channels but those of two
-    sensors is another one for each pair, as large as the matrix.
+    Pairs are cached, and matrix roots up to `ROOT_BYTES`.
 
     Parameters
     ----------
     csm : complex128, shape (n_freqs, n_channels, n_channels)
         Coherency or cross-spectral matrix.
+
+    Attributes
+    ----------
+    usable : bool, shape (n_freqs,)
+        Whether the matrix is finite.
     """
 
     def __init__(self, csm: ComplexArray) -> None:
         self._n_freqs = len(csm)
-        self._usable = np.isfinite(csm).all(axis=(1, 2))
-        self._csm = csm[self._usable]
+        self.usable: BoolArray = np.asarray(np.isfinite(csm).all(axis=(1, 2)))
+        self._csm = csm[self.usable]
         self._roots: dict[tuple[int, ...], ComplexArray] = {}
         self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
 
-    def between(self, first: range | IntArray, second: range | IntArray) -> FloatArray:
+    def between(
+        self,
+        first: range | IntArray,
+        second: range | IntArray,
+        *,
+        where: BoolArray | None = None,
+    ) -> FloatArray:
         """Return the coherence of two groups of channels.
+
+        Parameters
+        ----------
+        first, second : sequence of int
+        where : bool, shape (n_freqs,), optional
+            Frequencies that are wanted; the result of these alone is not cached. Default: all.
 
         Returns
         -------
         float64, shape (n_freqs, min(len(first), len(second)))
             Descending; the squared singular values of ``S_jj^(-1/2) S_jk S_kk^(-1/2)``, independent
-            of the sensors' orientations. Zero if the matrix is not finite.
+            of the sensors' orientations. Zero if the matrix is not finite, or not wanted.
         """
         one, two = sorted((tuple(first), tuple(second)), key=len)
+        if where is not None:
+            found = np.zeros((self._n_freqs, len(one)))
+            rows = np.flatnonzero(where[self.usable])
+            at = np.flatnonzero(where & self.usable)
+            for some in blocks(len(rows), self._csm.shape[1]):
+                csm = self._csm[rows[some]]
+                roots = _inverse_root(csm, one), _inverse_root(csm, two)
+                found[at[some]] = _squares(csm, one, two, *roots)
+            return np.clip(found, 0.0, 1.0)
         pair = frozenset((one, two))
         if pair not in self._found:
-            # Eigenvalues of the product are the squares, at half the cost of singular values.
-            whitened = self._root(one) @ self._csm[:, np.array(one)[:, None], two] @ self._root(two)
-            squares = np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))
             found = np.zeros((self._n_freqs, len(one)))
-            found[self._usable] = squares[:, ::-1]
+            found[self.usable] = _squares(self._csm, one, two, self._root(one), self._root(two))
             self._found[pair] = np.clip(found, 0.0, 1.0)
         return self._found[pair]
 
     def _root(self, channels: tuple[int, ...]) -> ComplexArray:
-        """Return the inverse root of a group's matrix, zero in directions without power."""
+        """Return the inverse root of a group's matrix, cached."""
         if channels not in self._roots:
             while sum(each.nbytes for each in self._roots.values()) > ROOT_BYTES:
                 del self._roots[max(self._roots, key=len)]
-            w, u = np.linalg.eigh(self._csm[:, np.array(channels)[:, None], channels])
-            alive = w > 1e-12 * w[:, -1:]
-            root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
-            self._roots[channels] = (u * root[:, None, :]) @ u.conj().swapaxes(1, 2)
+            self._roots[channels] = _inverse_root(self._csm, channels)
         return self._roots[channels]
+
+
+def _inverse_root(csm: ComplexArray, channels: tuple[int, ...]) -> ComplexArray:
+    """Return the inverse root of a group's matrix, zero in directions without power."""
+    w, u = np.linalg.eigh(csm[:, np.array(channels)[:, None], channels])
+    alive = w > 1e-12 * w[:, -1:]
+    root = np.where(alive, 1 / np.sqrt(np.where(alive, w, 1.0)), 0.0)
+    return np.asarray((u * root[:, None, :]) @ u.conj().swapaxes(1, 2))
+
+
+def _squares(
+    csm: ComplexArray,
+    one: tuple[int, ...],
+    two: tuple[int, ...],
+    root_one: ComplexArray,
+    root_two: ComplexArray,
+) -> FloatArray:
+    """Return the squared singular values of the coherence of two groups, descending."""
+    # Eigenvalues of the product are the squares, at half the cost of singular values.
+    whitened = root_one @ csm[:, np.array(one)[:, None], two] @ root_two
+    return np.asarray(np.linalg.eigvalsh(whitened @ whitened.conj().swapaxes(1, 2))[:, ::-1])
 
 
 def matched_coherence(

@@ -43,6 +43,9 @@ A_PARAMETER = 8.0
 """Required decrease of the statistic for each further pair of a group."""
 MAX_STEPS = 4
 """Maximum number of reported pairs or groups."""
+MAX_CHANNELS = 96
+"""Maximum number of channels: of 192 there are 18336 pairs, and the information on them takes
+2.7 GB in every band."""
 MAX_BINS = 16
 """Maximum number of frequencies for the effect on the estimates."""
 MAX_SHIFT = 5.0
@@ -126,8 +129,11 @@ def shared_noise(
     Returns
     -------
     SharedPairs or None
-        None if no pair shares noise, or a few pairs do not explain the averages.
+        None if no pair shares noise, if a few pairs do not explain the averages, and with more
+        than `MAX_CHANNELS` channels.
     """
+    if sum(dims) > MAX_CHANNELS:
+        return None
     found = [
         pair_scores(maximum, band, n_effective=n_effective, neighbours=neighbours) for band in bands
     ]

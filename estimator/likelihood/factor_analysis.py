@@ -22,7 +22,7 @@ import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.newton import MAX_STEP, Point, left_over, newton
-from estimator.self_noise.coherency import TOLERANCE
+from estimator.self_noise.coherency import TOLERANCE, blocks
 
 if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -161,7 +161,6 @@ def maximise(
         )
     p = csm.shape[-1]
     check_factors(n_factors, p)
-    usable, precision, rounding = _precision(csm)
     n_freqs = len(csm)
     found = Maximum(
         psi=np.full((n_freqs, p), np.nan),
@@ -173,22 +172,26 @@ def maximise(
         gradient_norm=np.full(n_freqs, np.nan),
         converged=np.zeros(n_freqs, np.bool_),
         boundary=np.zeros((n_freqs, p), np.bool_),
-        singular=~usable,
+        singular=np.ones(n_freqs, np.bool_),
         penalty=np.zeros((p, p)) if penalty is None else penalty,
     )
-    if usable.any():
+    for some in blocks(n_freqs, p):
+        usable, precision, rounding = _precision(csm[some])
+        found.singular[some] = ~usable
+        if not usable.any():
+            continue
         partial = 1 / np.real(np.einsum("fii->fi", precision[usable]))
         lowest = np.log(partial * BOUNDARY)
         start = partial
         if n_factors == 0 and penalty is None:  # the diagonal is the maximum
-            start = np.real(np.einsum("fii->fi", csm[usable]))
+            start = np.real(np.einsum("fii->fi", csm[some][usable]))
         _search(
             precision[usable],
             np.log(start),
             lowest=lowest,
             rounding=rounding[usable],
             found=found,
-            where=np.flatnonzero(usable),
+            where=some.start + np.flatnonzero(usable),
         )
     return found
 

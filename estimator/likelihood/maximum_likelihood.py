@@ -11,7 +11,7 @@ from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum, check_factors, max_factors, maximise
 from estimator.likelihood.factor_selection import alone, resolved
 from estimator.likelihood.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
-from estimator.self_noise.coherency import check_averages, check_dims, coherency
+from estimator.self_noise.coherency import blocks, check_averages, check_dims, coherency
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
@@ -224,7 +224,9 @@ def small_sample_correction(maximum: Maximum, *, n_effective: float) -> FloatArr
 
 def standard_error(maximum: Maximum, *, n_effective: float) -> FloatArray:
     """Return the standard error of psi, unit**2/Hz, shape (n_freqs, n_channels), by `fisher`."""
-    free = maximum.eigenvectors[:, :, maximum.n_factors :]
-    known = fisher.information(free) + maximum.penalty
-    variance = np.einsum("fii->fi", fisher.covariance(known))
+    variance = np.empty(maximum.psi.shape)
+    for some in blocks(*maximum.psi.shape):
+        free = maximum.eigenvectors[some, :, maximum.n_factors :]
+        known = fisher.information(free) + maximum.penalty
+        variance[some] = np.einsum("fii->fi", fisher.covariance(known))
     return np.asarray(maximum.psi * np.sqrt(variance / (n_effective - maximum.n_factors)))

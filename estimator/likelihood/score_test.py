@@ -203,10 +203,11 @@ def shift(maximum: Maximum, rows: IntArray, scores: Scores, amounts: FloatArray)
 
 def _information(projector: ComplexArray, i: IntArray, j: IntArray) -> FloatArray:
     """Return the information on coherencies of pairs (i, j), (n_freqs, n_pairs, n_pairs)."""
-    ji, ij = projector[:, j[:, None], i], projector[:, i[:, None], j]
-    jj, ii = projector[:, j[:, None], j], projector[:, i[:, None], i]
-    own = 2 * (ji * ij.conj() + jj * ii.conj()).real
     with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
     left = fisher.covariance(np.abs(projector) ** 2)
-    information = own - with_noise.swapaxes(1, 2) @ left @ with_noise
+    information = np.asarray(with_noise.swapaxes(1, 2) @ left @ with_noise)
+    for at, lost in zip(projector, information, strict=True):  # one by one, to bound memory
+        own = at[j[:, None], i] * at[i[:, None], j].conj()
+        own += at[j[:, None], j] * at[i[:, None], i].conj()
+        np.subtract(2 * own.real, lost, out=lost)
     return np.asarray(information[np.isfinite(information).all(axis=(1, 2))])

@@ -111,16 +111,19 @@ class ChannelResponses:
             own = (1 / self.coherence[1:-1] - 1) / max(n_effective, 1.0)
         own[self.coherence[1:-1] < MIN_COHERENCE] = np.inf
         variance[1:-1] = _TWO_FREQUENCIES * own / width**2
-        pairs = list(combinations(range(slopes.shape[2]), 2))
-        products = np.array([(slopes[:, :, j] * slopes[:, :, k].conj()).real for j, k in pairs])
-        with np.errstate(invalid="ignore"):
-            spread = np.array([np.sqrt(variance[:, :, j] * variance[:, :, k]) for j, k in pairs])
-        known = np.isfinite(products) & np.isfinite(spread)
-        count = np.maximum(known.sum(axis=0), 1)
+        count = np.zeros(slopes.shape[:2], np.int64)
+        total, deviation = np.zeros((2, *slopes.shape[:2]))
+        for j, k in combinations(range(slopes.shape[2]), 2):  # one by one, to bound memory
+            product = (slopes[:, :, j] * slopes[:, :, k].conj()).real
+            with np.errstate(invalid="ignore"):
+                spread = np.sqrt(variance[:, :, j] * variance[:, :, k])
+            known = np.isfinite(product) & np.isfinite(spread)
+            count += known
+            total += np.where(known, product, 0.0)
+            deviation += np.where(known, spread, 0.0)
+        count = np.maximum(count, 1)
         power = np.where(np.isfinite(motion_psd), np.maximum(motion_psd, 0.0), 0.0) * factor
-        total = np.where(known, products, 0.0).sum(axis=0) / count
-        deviation = np.where(known, spread, 0.0).sum(axis=0) / count
-        return np.asarray(power * total), np.asarray(power * deviation)
+        return np.asarray(power * (total / count)), np.asarray(power * (deviation / count))
 
 
 def band_shares(

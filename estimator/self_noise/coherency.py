@@ -15,12 +15,16 @@ from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.self_noise.result import Flag, SelfNoise
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 TOLERANCE = 1e-8  # of Hermitian symmetry, and of coherence above 1
 DEAD = 1e-28  # fraction of a channel's largest PSD that is rounding of a constant
 DUPLICATE = 1e-13  # one minus the coherence of a channel and its copy
 SINGULAR = 1e12  # magnitude from which elements of an inverse coherency are only rounding
+BLOCK_BYTES = 1 << 23
+"""Bytes of matrices that are worked on together: several times as much exists for a moment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +66,9 @@ class Coherency:
         return Coherency(self.matrix[some], self.psd[some], self.flags[some], self.duplicates[some])
 
     def part(self, channels: list[int]) -> Coherency:
-        """Return a copy with only some channels."""
+        """Return the same with only some channels: itself with all."""
+        if channels == list(range(self.psd.shape[1])):
+            return self
         square = np.ix_(range(len(self.psd)), channels, channels)
         return Coherency(
             self.matrix[square],
@@ -70,6 +76,13 @@ class Coherency:
             self.flags[:, channels],
             self.duplicates[square],
         )
+
+
+def blocks(n_freqs: int, n_channels: int) -> Iterator[slice]:
+    """Yield blocks of frequencies whose matrices take `BLOCK_BYTES`; one in most tests."""
+    step = max(1, BLOCK_BYTES // (16 * n_channels**2))
+    for low in range(0, n_freqs, step):
+        yield slice(low, min(low + step, n_freqs))
 
 
 def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:
@@ -149,15 +162,21 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
     dead &= usable[:, None]
     psd = np.where(dead | ~usable[:, None], 1.0, psd)
     scale = np.where(dead, 0.0, 1 / np.sqrt(psd))
-    with np.errstate(over="ignore", invalid="ignore"):  # invalid results are flagged below
-        matrix: ComplexArray = csm * scale[:, :, None]
-        matrix *= scale[:, None, :]
-        matrix[~usable] = np.eye(n_channels)
-        p, q = np.tril_indices(n_channels)
-        deviation = np.abs(matrix[:, p, q] - matrix[:, q, p].conj()).max(axis=1)
-        coherence = matrix.real**2 + matrix.imag**2
+    matrix = np.empty_like(csm)
+    deviation, above = np.empty(len(csm)), np.empty(len(csm), np.bool_)
+    duplicates = np.empty(csm.shape, np.bool_)
+    p, q = np.tril_indices(n_channels)
+    for some in blocks(len(csm), n_channels):
+        with np.errstate(over="ignore", invalid="ignore"):  # invalid results are flagged below
+            part = np.multiply(csm[some], scale[some, :, None], out=matrix[some])
+            part *= scale[some, None, :]
+            part[~usable[some]] = np.eye(n_channels)
+            deviation[some] = np.abs(part[:, p, q] - part[:, q, p].conj()).max(axis=1)
+            coherence = part.real**2 + part.imag**2
+        above[some] = (coherence > 1 + TOLERANCE).any(axis=(1, 2))
+        duplicates[some] = coherence >= 1 - DUPLICATE
     skew: BoolArray = ~(deviation <= TOLERANCE)  # NaN included
-    impossible: BoolArray = ~skew & (coherence > 1 + TOLERANCE).any(axis=(1, 2))
+    impossible: BoolArray = ~skew & above
     invalid = negative | skew | impossible
     if not (finite & ~invalid).any():
         faults = {
@@ -172,7 +191,6 @@ def coherency(csm: ComplexArray, dims: tuple[int, ...]) -> Coherency:
             f"({', '.join(counts)}); expected csm[f, p, q] = E[X_p conj(X_q)]"
         )
     matrix[invalid] = np.eye(n_channels)
-    duplicates = coherence >= 1 - DUPLICATE
     duplicates[:, np.arange(n_channels), np.arange(n_channels)] = False
     duplicates[invalid] = False
     flags = np.zeros(psd.shape, dtype=np.int64)

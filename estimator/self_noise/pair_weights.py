@@ -19,12 +19,14 @@ spite of scatter.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -131,14 +133,16 @@ class PairWeights:
         self, n_freqs: int, variances: Callable[[IntArray], FloatArray], *, chunk: int
     ) -> None:
         self._bins = sampled(n_freqs)
-        parts = [
-            variances(self._bins[low : low + chunk]) for low in range(0, len(self._bins), chunk)
-        ]
-        log = np.concatenate(parts)
-        known = np.isfinite(log)
-        zero = np.zeros((1, *log.shape[1:]))
-        self._sums = np.concatenate([zero, np.where(known, log, 0.0).cumsum(axis=0)])
-        self._counts = np.concatenate([zero, known.cumsum(axis=0)])
+        self._sums, self._counts = np.empty((0, 0, 0)), np.empty((0, 0, 0), np.int32)
+        for low in range(0, len(self._bins), chunk):
+            log = variances(self._bins[low : low + chunk])
+            if low == 0:
+                shape = (len(self._bins) + 1, *log.shape[1:])
+                self._sums, self._counts = np.zeros(shape), np.zeros(shape, np.int32)
+            known = np.isfinite(log)
+            for row, (values, there) in enumerate(zip(log, known, strict=True), start=low):
+                np.add(self._sums[row], np.where(there, values, 0.0), out=self._sums[row + 1])
+                np.add(self._counts[row], there, out=self._counts[row + 1])
 
     def at(self, first: int, usable: BoolArray) -> FloatArray | None:
         """Return weights of consecutive frequencies, zero for unusable pairs.
@@ -163,8 +167,8 @@ class PairWeights:
         low = np.maximum(near[0] - NEIGHBOURS, 0)
         high = np.minimum(near[1] + NEIGHBOURS, len(self._bins))
 
-        def total(sums: FloatArray) -> FloatArray:
-            return sums[high] - sums[near[1]] + sums[near[0]] - sums[low]
+        def total(sums: NDArray[Any]) -> NDArray[Any]:
+            return np.asarray(sums[high] - sums[near[1]] + sums[near[0]] - sums[low])
 
         count = total(self._counts)
         mean = np.where(usable, total(self._sums) / np.maximum(count, 1), np.inf)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**21  # maximum number of values per group: 16 MB
 FREQUENCIES_PER_BLOCK = 512
+PRODUCT_VALUES = 2**22  # maximum number of values of products of channels at a time: 32 MB
 THREADS = 2
 
 
@@ -153,17 +154,17 @@ class CrossSpectra:
             return
         workers = min(self._threads, -(-len(starts) // self._block))
         if workers == 1:
-            self._take(*self._total(samples, starts))
+            self._keep(self._add_to(self._sum, samples, starts))
         else:
             with ThreadPoolExecutor(workers) as pool:
                 for total, single in pool.map(
                     functools.partial(self._total, samples), np.array_split(starts, workers)
                 ):
-                    self._take(total, single)
+                    self._sum += total
+                    self._keep(single)
         self.n_segments += len(starts)
 
-    def _take(self, total: ComplexArray, single: list[ComplexArray]) -> None:
-        self._sum += total
+    def _keep(self, single: list[ComplexArray]) -> None:
         if self._single is not None:
             for spectra in single:
                 self._single.add(spectra)
@@ -185,9 +186,16 @@ class CrossSpectra:
     def _total(
         self, samples: FloatArray, starts: IntArray
     ) -> tuple[ComplexArray, list[ComplexArray]]:
-        """Return the sum of ``X conj(X).T`` over the segments, (n_freqs, n_channels, n_channels).
+        """Return the sum of ``X conj(X).T`` over the segments, and what `_add_to` returns."""
+        total = np.zeros_like(self._sum)
+        return total, self._add_to(total, samples, starts)
 
-        Also return the spectra of the segments at the kept frequencies, if there are any.
+    def _add_to(
+        self, total: ComplexArray, samples: FloatArray, starts: IntArray
+    ) -> list[ComplexArray]:
+        """Add ``X conj(X).T`` of the segments to `total`, (n_freqs, n_channels, n_channels).
+
+        Return the spectra of the segments at the kept frequencies, if there are any.
         """
         length, (n_freqs, n_channels, _) = self.settings.segment_length, self._sum.shape
         block = min(self._block, len(starts))
@@ -195,8 +203,12 @@ class CrossSpectra:
         spectra = np.empty((block, n_freqs, n_channels), dtype=np.complex128)
         trend = np.empty((block, len(self._fit), n_channels))
         # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
-        # so that BLAS does half the work.
-        gram = np.zeros((n_freqs, 2 * n_channels, 2 * n_channels))
+        # so that BLAS does half the work. It takes twice the memory of `total`, and is kept only
+        # where several groups of segments add up.
+        several = len(starts) > block
+        gram = np.zeros((n_freqs if several else 0, 2 * n_channels, 2 * n_channels))
+        step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // (2 * n_channels) ** 2))
+        pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
         single: list[ComplexArray] = []
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
@@ -209,18 +221,22 @@ class CrossSpectra:
             spectra[:n, self._trend_bins] -= self._trend_spectra @ trend[:n]
             if self._single is not None:
                 single.append(spectra[:n, self._single.bins])
-            if len(starts) == 1:  # cheaper than the sum over real and imaginary parts
-                return spectra[0, :, :, None] * spectra[0, :, None, :].conj(), single
             parts = spectra[:n].view(np.float64)
-            for low in range(0, n_freqs, FREQUENCIES_PER_BLOCK):
-                some = slice(low, low + FREQUENCIES_PER_BLOCK)
-                gram[some] += np.matmul(
+            for some in pieces:
+                if len(starts) == 1:  # cheaper than the sum over real and imaginary parts
+                    total[some] += spectra[0, some, :, None] * spectra[0, some, None, :].conj()
+                    continue
+                products = np.matmul(
                     parts[:, some].transpose(1, 2, 0), parts[:, some].swapaxes(0, 1)
                 )
-        total = np.empty_like(self._sum)
-        total.real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
-        total.imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
-        return total, single
+                if several:
+                    gram[some] += products
+                else:
+                    _add_gram(total[some], products)
+        if several:
+            for some in pieces:
+                _add_gram(total[some], gram[some])
+        return single
 
     @property
     def n_effective(self) -> float:
@@ -302,6 +318,12 @@ class CrossSpectra:
         spectra._sum = total.astype(np.complex128)
         spectra.n_segments = n_segments
         return spectra
+
+
+def _add_gram(total: ComplexArray, gram: FloatArray) -> None:
+    """Add products of complex numbers, given those of their real and imaginary parts."""
+    total.real += gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
+    total.imag += gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
 
 
 def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
