@@ -1,7 +1,8 @@
 """How much memory an estimate takes, and how many sensors a live one may have.
 
 Most of it are matrices of all channels at all frequencies, and what methods and diagnosis make of
-them. The number of such matrices was measured: docs/validation/torture.md.
+them; and the information on all pairs of channels in each band, by which shared noise is found. The
+number of both was measured: docs/validation/torture.md.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from daq.alignment.sensor_reader import main_columns
+from estimator.diagnostics.shared_noise import MAX_CHANNELS
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
 
 _LOGGER = logging.getLogger(__name__)
-MATRICES = 27
+MATRICES = 9
 """Matrices that exist at the same time, at most: in the diagnosis."""
+PAIR_TABLES = 27
+"""Tables of all pairs of channels by all pairs that exist at the same time: some 20 bands."""
 LARGE = 1e9
 """Bytes from which on an estimate is announced, and is not live with all sensors."""
 PART_BYTES = 250e6
@@ -40,7 +44,9 @@ def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
     segment : float
         In seconds.
     """
-    return MATRICES * 16.0 * (segment * sampling_rate / 2 + 1) * n_channels**2
+    matrices = MATRICES * 16.0 * (segment * sampling_rate / 2 + 1) * n_channels**2
+    n_pairs = n_channels * (n_channels - 1) / 2 if n_channels <= MAX_CHANNELS else 0.0
+    return matrices + PAIR_TABLES * 8.0 * n_pairs**2
 
 
 def live_sensors(recording: ReadableRecording, settings: Settings) -> tuple[str, ...] | None:

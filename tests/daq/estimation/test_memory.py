@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.estimation.segments.memory import bytes_of
 from daq.timing.kalman import Observations, smooth
 from estimator.diagnostics.stability import SegmentCourse, stability
 from estimator.likelihood.factor_analysis import maximise
@@ -85,6 +86,18 @@ def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
     )
     n_pairs = 2  # of walk and noise that are likely here, with the steady one
     assert _peak(lambda: smooth(observed)) < 2.2 * n * n_pairs * 24 * 8
+
+
+@pytest.mark.parametrize(
+    ("n_channels", "measured"),
+    [(48, 596e6), (72, 522e6)],  # of docs/validation/torture.md, without the program
+)
+def test_the_memory_of_a_result_is_predicted(n_channels: int, measured: float) -> None:
+    assert 0.9 * measured < bytes_of(n_channels, 200.0, 10.0) < 5 * measured
+
+
+def test_more_channels_than_have_tables_of_pairs_take_matrices_alone() -> None:
+    assert bytes_of(192, 200.0, 10.0) < 10 * 590e6
 
 
 def test_kept_segments_are_one_array() -> None:
