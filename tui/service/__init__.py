@@ -1,1 +1,1 @@
-"""The service behind ``huddle serve``: runs by schedule, kept in a database, told about."""
+"""The service behind ``huddle serve``: runs by schedule, a database of them, and hooks."""

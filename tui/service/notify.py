@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, stopping (``sd_notify``, in a few lines)."""
+"""States sent to systemd: ready, alive, stopping (``sd_notify``, in a few lines)."""
 
 from __future__ import annotations
 

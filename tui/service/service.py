@@ -118,7 +118,7 @@ class Service:
         return self._windows.qsize(), self._estimates.qsize() + len(self._repeats)
 
     def free(self) -> int | None:
-        """Return the bytes of free space for recordings; None if that cannot be told."""
+        """Return the bytes of free space for recordings; None if unknown."""
         return free_space(self.bench.recording_directory)
 
     async def run(self) -> None:

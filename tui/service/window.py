@@ -205,7 +205,7 @@ def _size(n_bytes: int) -> str:
 
 
 def free_space(folder: Path) -> int | None:
-    """Return the bytes of free space in a folder; None if that cannot be told."""
+    """Return the bytes of free space in a folder; None if unknown."""
     try:
         return shutil.disk_usage(folder).free
     except OSError:
