@@ -200,12 +200,12 @@ class MotionAcross(Advice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissingDimension(Advice):
-    """The motion has fewer dimensions than the sensors sense.
+    """Motion is found in fewer dimensions than the sensors sense; in the others it is weaker.
 
     Attributes
     ----------
     n_dimensions : float
-        Dimensions of the motion: median over the frequencies of a band, smallest of all bands.
+        Dimensions in which motion is significant: median over the frequencies of a band, smallest of all bands.
     n_channels : int
         Dimensions that the sensors sense.
     condition : float

@@ -42,7 +42,7 @@ class AdviceKind(enum.StrEnum):
     MOTION_ACROSS = "motion-across"
     """Sensors of fewer than three channels do not measure motion across their planes or axes."""
     MISSING_DIMENSION = "missing-dimension"
-    """The motion has fewer dimensions than the sensors sense."""
+    """Motion is found in fewer dimensions than the sensors sense."""
     NEARLY_SINGULAR = "nearly-singular"
     """The cross-spectral matrix between two sensors is nearly singular."""
     WEAK_MOTION = "weak-motion"
