@@ -17,8 +17,8 @@ polled, a stretch is as long as :mod:`daq.timing.usb_polling` says. Delays measu
 
 A stretch between restarts of the device's clock is an :class:`daq.timing.clock_model.Epoch`; within
 one, the sample index counts without error. A block that says ``CLOCK_RESTART`` or
-``MISSING_ESTIMATED`` begins a new one, and so does a block far earlier than possible: then the
-host's clock has been asleep.
+``MISSING_ESTIMATED`` begins a new one, and so does a block far earlier than possible
+(:mod:`daq.timing.host_sleep`).
 
 Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
@@ -38,6 +38,7 @@ import numpy as np
 
 from daq.protocols.block import BlockFlag
 from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
+from daq.timing.host_sleep import HostSleep
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
 from daq.timing.quantiles import median
@@ -57,9 +58,6 @@ _NODE = 10.0  # seconds of arrival times that make one observation
 _MOST_NODES = 3000
 _FLOOR = 1e-7  # seconds; no delay is known better than the curve between nodes is
 _WELL_KNOWN = 0.02  # samples to which delays must be known to be of use
-_ASLEEP = 0.05  # seconds that a block may come too early before the host must have slept
-_RATE_OFF = 0.02  # share by which a rate may be off
-_RECENT = 120.0  # seconds that a host may be held up, all its blocks late, and not have slept
 _UTC_JUMP = 0.01  # samples
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
@@ -98,12 +96,14 @@ class ArrivalTimes:
     _end_sample: int = 0
     _device_utc: bool = False
     _polls: Polls = field(default_factory=Polls)
-    _stretch: int = -1
-    _lowest: tuple[float, float] = (np.inf, np.inf)
+    _sleep: HostSleep = field(init=False)
     _leapt: float = 0.0
     _latency: FloatArray = field(default_factory=lambda: np.empty(0))  # least of each epoch
     _line: tuple[float, list[float]] | None = None  # what `_lines` found, until more arrives
     _unmeasured: Clock | None = None  # what `solve` found, until more arrives
+
+    def __post_init__(self) -> None:
+        self._sleep = HostSleep(self.sampling_rate)
 
     def add(self, blocks: NDArray[Any]) -> None:
         """Take further rows of a recording's ``blocks``.
@@ -143,7 +143,7 @@ class ArrivalTimes:
             drift = _DRIFT * np.maximum(length, np.append(length[:1], length[:-1]))
             breaks = np.abs(step) > (_UTC_JUMP + drift) / self.sampling_rate
         else:
-            breaks = ((flags & int(_BREAKS)) != 0) | self._too_early(index, late)
+            breaks = self._sleep.breaks(index, late, (flags & int(_BREAKS)) != 0)
         breaks[0] |= begins
         epoch = len(self._epoch_starts) - 1 + np.cumsum(breaks)
         self._epoch_starts += [int(start) for start in first[breaks]]
@@ -273,23 +273,15 @@ class ArrivalTimes:
         self._line = slope, [float(late[mine].min()) for mine in every]
         return self._line
 
-    def _too_early(self, index: IntArray, late: FloatArray) -> BoolArray:
-        """Whether blocks come far below the lateness before: then the host's clock stood still.
+    def _without_segment(self, at: FloatArray, epoch: IntArray) -> BoolArray:
+        """Return which epochs are shorter than a segment, so that nothing depends on their times.
 
-        Even if the rate is off; so only this stretch of `_RECENT` and the one before it are looked
-        at, and all blocks of one must have been delayed to be taken for the rule.
+        Given the samples and epochs at which delays of segments were measured.
         """
-        raised = late + _RATE_OFF * index / self.sampling_rate
-        stretch = index // round(_RECENT * self.sampling_rate)
-        early = np.zeros(len(index), dtype=bool)
-        for rows in np.split(np.arange(len(index)), np.flatnonzero(np.diff(stretch)) + 1):
-            before, lowest = self._lowest
-            if stretch[rows[0]] != self._stretch:
-                self._stretch, before, lowest = int(stretch[rows[0]]), lowest, np.inf
-            so_far = np.minimum.accumulate(np.append(lowest, raised[rows]))
-            early[rows] = raised[rows] < np.minimum(before, so_far[:-1]) - _ASLEEP
-            self._lowest = before, float(so_far[-1])
-        return early
+        lengths = np.diff([*self._epoch_starts, self._end_sample])
+        measured = np.bincount(epoch, minlength=len(lengths)) > 0
+        apart = np.diff(at).min() if len(at) > 1 else 0.0  # at most the length of a segment
+        return np.asarray(~measured & (lengths < apart))
 
     def _stretches(self, length: float) -> IntArray:
         """Return which stretch of `length` samples of its epoch each arrival lies in.
@@ -332,6 +324,9 @@ class ArrivalTimes:
             known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
             at = measured.index[known]
             which = np.searchsorted(self._epoch_starts, at, side="right") - 1
+            used = ~self._without_segment(at, which)[epoch]
+            index, late, epoch = index[used], late[used], epoch[used]
+            variance = variance[used]
             lateness = measured.seconds[known] - at / self.sampling_rate
             lateness -= slope * at + np.array(anchors)[which]
             index, late = np.concatenate([index, at]), np.concatenate([late, lateness])
@@ -359,22 +354,13 @@ class ArrivalTimes:
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs = []
         every = zip(self._rows(epoch), self._bounds(), anchors, strict=True)
-        for mine, (first, end), anchor in every:
-            nodes, late = index[mine], curve[mine]
-            # Straight on at both ends, at the rate the filter has there.
-            low, high = min(float(first), nodes[0]) - 1.0, max(float(end), nodes[-1]) + 1.0
-            nodes = np.concatenate([[low], nodes, [high]])
-            ends = smoothed.rate[mine][[0, -1]] / self.sampling_rate
-            late = np.concatenate(
-                [
-                    [late[0] - ends[0] * (nodes[1] - low)],
-                    late,
-                    [late[-1] + ends[1] * (high - nodes[-2])],
-                ]
-            )
-            seconds = nodes / self.sampling_rate + late + slope * nodes + anchor
-            increasing = np.concatenate([[True], np.diff(nodes) > 0])
-            epochs.append(Epoch(first, end, nodes[increasing], seconds[increasing]))
+        for mine, bounds, anchor in every:
+            if mine.start < mine.stop:
+                nodes, late, rate = index[mine], curve[mine], smoothed.rate[mine]
+            else:  # without a segment
+                nodes, late, rate = (np.full(1, each) for each in (bounds[0], smoothed.constant, 0))
+            late = late + slope * nodes + anchor
+            epochs.append(self._laid(bounds, nodes, late, rate + slope * self.sampling_rate))
         drift = slope * self.sampling_rate + float(smoothed.rate.mean())
         state = ClockState(
             sensor=sensor,
@@ -388,3 +374,17 @@ class ArrivalTimes:
             refined=refined,
         )
         return Clock(tuple(epochs), state)
+
+    def _laid(
+        self, bounds: tuple[int, int], index: FloatArray, late: FloatArray, rate: FloatArray
+    ) -> Epoch:
+        """Return the epoch of this lateness, straight on at both ends at the rate there."""
+        low, high = min(float(bounds[0]), index[0]) - 1.0, max(float(bounds[1]), index[-1]) + 1.0
+        first, last = rate[[0, -1]] / self.sampling_rate
+        late = np.concatenate(
+            [[late[0] - first * (index[0] - low)], late, [late[-1] + last * (high - index[-1])]]
+        )
+        index = np.concatenate([[low], index, [high]])
+        increasing = np.concatenate([[True], np.diff(index) > 0])
+        seconds = index / self.sampling_rate + late
+        return Epoch(*bounds, index[increasing], seconds[increasing])

@@ -162,6 +162,20 @@ def test_a_short_suspension_is_distinguished_from_a_minute_of_delay(pieces: int)
     assert [epoch.first_sample for epoch in clock.epochs] == [0, 200_000]
 
 
+@pytest.mark.parametrize("pieces", [1, 17])
+@pytest.mark.parametrize("restart", [0, 3000])
+@pytest.mark.parametrize("n_late", [1, 50])
+def test_late_blocks_at_the_start_are_no_sleep(n_late: int, restart: int, pieces: int) -> None:
+    rng = np.random.default_rng(6)
+    arrivals = last_samples(6000, -12.0) + rng.exponential(5e-4, 6000)
+    arrivals[restart : restart + n_late] += 0.2
+    flags = np.zeros(6000, int)
+    flags[restart] = BlockFlag.CLOCK_RESTART
+    clock = solved(block_rows(arrivals, flags), pieces=pieces)
+    assert [epoch.first_sample for epoch in clock.epochs] == sorted({0, BLOCK * restart})
+    assert clock.state.residual < 4e-6
+
+
 def test_utc_stepped_by_ntp_or_a_leap_second_changes_nothing() -> None:
     rng = np.random.default_rng(7)
     rows = block_rows(last_samples(3000, 5.0) + rng.exponential(1e-3, 3000))
@@ -218,6 +232,25 @@ def test_delays_from_the_samples_outweigh_arrivals_up_to_their_constant() -> Non
     assert np.std(alone) > 1e-5
     assert abs(np.mean(error)) < 1e-6  # the constant is that of the samples
     assert refined.state.residual < 1e-6
+
+
+def test_an_epoch_shorter_than_a_segment_does_not_spoil_the_others() -> None:
+    rng = np.random.default_rng(8)
+    flags = np.zeros(6000, int)
+    flags[[3000, 3005]] = BlockFlag.CLOCK_RESTART
+    arrivals = ArrivalTimes(RATE, 0, 0)
+    taken = last_samples(6000, 15.0)
+    arrivals.add(block_rows(np.ceil(taken / 16e-3) * 16e-3, flags))
+    index = np.concatenate([np.arange(1000.0, 59_000, 1000), np.arange(61_000.0, 119_000, 1000)])
+    seconds = index / (RATE * (1 + 15e-6))
+    noise = 1e-6 * rng.standard_normal(len(index))
+    clock = arrivals.solve("a", MeasuredDelays(index, seconds + noise, np.full(len(index), 1e-6)))
+    assert [epoch.first_sample for epoch in clock.epochs] == [0, 60_000, 60_100]
+    assert clock.state.refined
+    assert clock.state.residual < 1e-6
+    assert np.std(clock.at(index) - seconds) < 1e-6
+    between = np.arange(60_000.0, 60_100)
+    assert np.abs(clock.at(between) - between / (RATE * (1 + 15e-6))).max() < 20e-3
 
 
 def test_the_smoother_states_its_own_error() -> None:
