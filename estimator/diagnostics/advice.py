@@ -205,7 +205,8 @@ class MissingDimension(Advice):
     Attributes
     ----------
     n_dimensions : float
-        Dimensions in which motion is significant: median over the frequencies of a band, smallest of all bands.
+        Dimensions in which motion is significant: median over the frequencies of a band, smallest
+        of all bands.
     n_channels : int
         Dimensions that the sensors sense.
     condition : float
