@@ -33,8 +33,8 @@ before = resident()
 largest = np.ones(30_000_000 // 8)
 del largest
 arrays, between = [], []
-for _ in range(100):
-    arrays.append(np.ones(1_000_000 // 8))
+for _ in range(40):
+    arrays.append(np.ones(3_000_000 // 8))
     between.append(np.ones(100))
 del arrays
 print(resident() - before)
