@@ -62,9 +62,11 @@ class Estimates:
 def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
     """Return cross-spectra of all recordings together, in the channels' own units.
 
-    One band, or one an octave; none before the first segment.
+    One band, or one an octave; none before the first segment. Nothing is known where
+    interpolation attenuates.
     """
     first = passes[0]
+    usable = min(each.aligned.usable for each in passes)
     n_segments = sum(each.n_segments for each in passes)
     if n_segments == 0:
         return ()
@@ -75,7 +77,8 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
                 octaves.merge(each.octaves)
         highest = octaves.bands()[-1]
         wanted = max(MIN_AVERAGES, first.n_channels + 2)
-        return octaves.bands(min(wanted, highest.n_effective))
+        bands = octaves.bands(min(wanted, highest.n_effective))
+        return tuple(up_to(band, usable) for band in bands)
     spectra = first.spectra
     if len(passes) > 1:
         spectra = CrossSpectra(first.welch, first.n_channels)
@@ -87,7 +90,8 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
         for each in passes
         if (count := each.n_segments)
     )
-    return (Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective),)
+    band = Band(first.welch, first.welch.frequencies, spectra.csm(), n_segments, n_effective)
+    return (up_to(band, usable),)
 
 
 def up_to(band: Band, usable: float) -> Band:

@@ -21,7 +21,6 @@ from daq.estimation.noise_estimates import (
     known_positions,
     noise_estimates,
     quantisation_psd,
-    up_to,
 )
 from daq.estimation.recording_set import is_complete
 from daq.estimation.segment_course import segment_course
@@ -111,15 +110,9 @@ class SnapshotBuilder:
         """
         first, last = passes[0], passes[-1]
         dims, channels = first.aligned.dims, first.aligned.channels
-        usable = min(each.aligned.usable for each in passes)
         raw = averages(passes)
         bands = tuple(
-            in_units(
-                up_to(band, usable),
-                channels,
-                self._unit,
-                self._equalisation.response(band.frequencies),
-            )
+            in_units(band, channels, self._unit, self._equalisation.response(band.frequencies))
             for band in raw
         )
         if bands:

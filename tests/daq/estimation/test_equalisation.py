@@ -15,7 +15,9 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from estimator.diagnostics.advice import UnequalResponses
 from estimator.methods import self_noise
+from sim_devices.world.scenario import Scenario
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
+from tui.studies.clocks import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,6 +163,24 @@ def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
         estimate([path], replace(OFF, window=window, equalise=mode)) for mode in ("off", "auto")
     )
     np.testing.assert_array_equal(plain.csm, automatic.csm)
+
+
+@pytest.mark.parametrize("rates", [(50.0, 50.0, 50.0), (100.0, 200.0, 200.0)])
+def test_resampling_is_not_taken_for_responses_of_sensors(
+    tmp_path: Path, rates: tuple[float, float, float]
+) -> None:
+    """From 0.45 of the lowest rate on interpolation attenuates: nothing is estimated there."""
+    white = {"shape": "white", "level": 1e-14}
+    sensors = {
+        name: {"sampling_rate": rate, "noise": white, "clock": {"ppm": ppm}}
+        for name, rate, ppm in zip("abc", rates, (0, 10, -20), strict=True)
+    }
+    motion = {"spectra": [{"shape": "white", "level": 1e-8}]}
+    scenario = Scenario.from_dict({"motion": motion, "sensors": sensors, "seed": 4})
+    path = synthesise(tmp_path / "r.h5", scenario, duration=240.0, block=1.0)
+    plain, automatic = (estimate([path], replace(OFF, equalise=mode)) for mode in ("off", "auto"))
+    np.testing.assert_array_equal(plain.csm, automatic.csm)
+    assert not any(isinstance(each, UnequalResponses) for each in plain.diagnostics.advice)
 
 
 @pytest.mark.parametrize(("correct", "n_estimates"), [(True, 1), (False, 2)])
