@@ -14,6 +14,7 @@ from daq.results.band_summary import band_of, channel_means, data_means, highest
 from daq.results.partners import without_partners
 from daq.timing.clock_model import ClockSource
 from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
+from estimator.diagnostics.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tui.output.formatting import (
@@ -124,7 +125,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
         lines.append(f"clocks {rates}, aligned to about {within} µs")
     if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
         lines.append(f"no estimate above {limit:.4g} Hz, where resampling attenuates")
-    lines += faulty_channels(snapshot)
+    lines += [*faulty_channels(snapshot), *_not_searched(snapshot)]
     if "two-channel" in snapshot.results:
         lines.append(
             "two-channel: assumes that like channels are parallel and have equal gains, or those "
@@ -141,6 +142,14 @@ def remarks(snapshot: Snapshot) -> list[str]:
             lines.append(f"{method}: {of} {'is' if negative == 1 else 'are'} at or below zero")
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines
+
+
+def _not_searched(snapshot: Snapshot) -> list[str]:
+    n = len(snapshot.channels)
+    if n <= MAX_CHANNELS:
+        return []
+    text = f"noise that two channels share is not searched for among more than {MAX_CHANNELS}"
+    return [f"{text} channels, to limit the memory; these are {n}"]
 
 
 def faulty_channels(snapshot: Snapshot) -> list[str]:

@@ -19,6 +19,7 @@ from daq.estimation.snapshot_diagnostics import (
 )
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level, Untested
+from estimator.diagnostics.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot, rotation
@@ -147,6 +148,13 @@ def test_where_averages_are_too_few_for_weak_motion_is_said_with_what_may_be_lef
     assert "at 21 of 199 frequencies (10 to 20 Hz)" in line
     assert "up to about 13 %" in line
     assert not any("too few averages" in x for x in remarks(snapshot))
+
+
+def test_what_is_not_searched_for_among_many_channels_is_said() -> None:
+    snapshot = diagnosed()
+    assert not any("two channels share" in x for x in remarks(snapshot))
+    many = replace(snapshot, channels=snapshot.channels[:1] * (MAX_CHANNELS + 1))
+    assert any("not searched for among more than 96 channels" in x for x in remarks(many))
 
 
 def test_clipped_channels_are_named() -> None:
