@@ -38,7 +38,8 @@ from daq.recording.reader import Recording
 from sim_devices.world.world import World
 from tests.acceptance.true_instants import Truth, truth_of, write_oracle
 from tui.simulation.devices import scenario_of
-from tui.studies.clocks import BANDS, SENSITIVITY, free_running
+from tui.studies.clocks import BANDS, free_running
+from tui.studies.synthesis import SENSITIVITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

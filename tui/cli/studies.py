@@ -22,8 +22,8 @@ def reproduce(
             metavar="STUDY",
             help="fig4, fig5, fig9, fig12, fig13, setup1, setup2, fig14, waves, clocks, "
             "verdicts, coverage, small-samples, many-sensors, quiet, unequal, shared-noise, "
-            "noise-terms, calibration, edges, gradients, clock-coverage, random-tests "
-            "(default: all).",
+            "noise-terms, calibration, edges, gradients, clock-coverage, random-tests, "
+            "random-recordings (default: all).",
         ),
     ] = None,
     *,

@@ -16,11 +16,12 @@ from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
 from tui.studies.clocks import clock_coverage, clocks
+from tui.studies.drawn.arrays import RANDOM_TESTS, random_tests
+from tui.studies.drawn.recordings import RANDOM_RECORDINGS, random_recordings
 from tui.studies.estimates import ESTIMATES
 from tui.studies.gradients import gradients
 from tui.studies.paper.laboratory import LABORATORY, Laboratory
 from tui.studies.paper.numerical import NUMERICAL, Ingredients
-from tui.studies.random_tests import RANDOM, random_tests
 from tui.studies.responses import calibration, edges
 from tui.studies.shared_noise import SHARED_NOISE, shared
 from tui.studies.study import TOLERANCE
@@ -39,7 +40,8 @@ RESPONSES = {
     "edges": edges,
     "gradients": gradients,
     "clock-coverage": clock_coverage,
-    RANDOM: random_tests,
+    RANDOM_TESTS: random_tests,
+    RANDOM_RECORDINGS: random_recordings,
 }
 STUDIES = (*NUMERICAL, *LABORATORY, CLOCKS, VERDICTS, *ESTIMATES, SHARED_NOISE, *RESPONSES)
 ALL = "all"

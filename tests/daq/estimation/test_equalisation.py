@@ -17,7 +17,7 @@ from estimator.diagnostics.advice import UnequalResponses
 from estimator.methods import self_noise
 from sim_devices.world.scenario import Scenario
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
-from tui.studies.clocks import synthesise
+from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

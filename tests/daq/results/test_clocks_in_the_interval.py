@@ -17,7 +17,8 @@ from daq.results.clock_effect import added_in_bands
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.formatting import level_with_error
 from tui.output.results import result_table
-from tui.studies.clocks import Latency, free_running, synthesise
+from tui.studies.clocks import free_running
+from tui.studies.synthesis import Latency, synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,7 +16,8 @@ from daq.timing.clock_model import ClockSource, ClockState
 from sim_devices.world.scenario import Scenario
 from tui.cli.main import app
 from tui.output.results import remarks
-from tui.studies.clocks import Latency, free_running, residuals, study, synthesise
+from tui.studies.clocks import free_running, residuals, study
+from tui.studies.synthesis import Latency, synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import channel_means
 from estimator.diagnostics.advice import (
     Advice,
     Delay,
@@ -28,29 +27,23 @@ from estimator.diagnostics.advice import (
     UnequalResponses,
 )
 from estimator.diagnostics.misfit import SharedNoise
-from estimator.self_noise.band_means import band_edges
-from tui.studies.study import Panel, Point, Series, Study
+from tui.studies.drawn.judged import METHODS, Judged
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daq.estimation.snapshot import Snapshot
     from estimator.types import FloatArray
-    from tui.studies.study import ProgressCallback
+    from tui.studies.study import ProgressCallback, Study
 
-RANDOM = "random-tests"
+RANDOM_TESTS = "random-tests"
 N_TESTS = 400
 SEED = 27
 RATE = 100.0
 BANDS = ((1.0, 10.0), (10.0, 40.0))
-METHODS = ("three-sensor", "maximum-likelihood")
-DECADES = (-2, -1, 0, 1, 2, 4, 6)
-"""Limits of the groups of SNR, log10."""
 LOW_PASS, LAGS = 0.2, 0.15
 """Shares of tests in which sensor B has a low-pass, and in which sensor C lags by one sample."""
 SETTLING = 2000
 """Samples before a filter has forgotten its start."""
-_NOMINAL, _ALLOWED, _FALSE, _FALSE_ALLOWED = 0.95, 0.02, 0.01, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +169,7 @@ def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
         Share of `N_TESTS` to simulate.
     """
     n_tests = max(12, round(N_TESTS * length))
-    covered: dict[tuple[str, int], list[float]] = {}
-    reported: dict[type[Advice], list[bool]] = {kind: [] for kind in FALSE}
+    judged = Judged()
     for number in range(n_tests):
         progress("random tests", number / n_tests)
         rng = np.random.default_rng([SEED, number])
@@ -185,62 +177,12 @@ def random_tests(progress: ProgressCallback, *, length: float = 1.0) -> Study:
         samples, deviations = simulate(scene, rng)
         settings = Settings(segment=scene.segment, methods=METHODS)
         snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
-        group = int(np.searchsorted(DECADES, np.log10(scene.snr), side="right")) - 1
-        for method in METHODS:
-            share = _coverage(snapshot, settings, method, scene, deviations)
-            covered.setdefault((method, group), []).append(share)
-        kinds = {type(each) for each in snapshot.diagnostics.advice}
-        for kind, would_be_wrong in FALSE.items():
-            if would_be_wrong(scene):
-                reported[kind].append(kind in kinds)
-    coverage = []
-    for method in METHODS:
-        groups = sorted(group for each, group in covered if each == method)
-        points = [_covering(group, covered[method, group]) for group in groups]
-        coverage.append(Series("95 % intervals of band means", method, "share", tuple(points)))
-    wrong = tuple(
-        Series(
-            f"{kind.__name__} ({sum(found)} of {len(found)})",
-            "advice",
-            "share",
-            (_accused(number, found),),
+        judged.add(
+            snapshot,
+            settings,
+            noise_psd=noise_psd(scene, deviations, snapshot.frequency),
+            bands=BANDS,
+            snr=scene.snr,
+            is_wrong={kind: wrong(scene) for kind, wrong in FALSE.items()},
         )
-        for number, (kind, found) in enumerate(reported.items())
-        if found
-    )
-    return Study(
-        RANDOM,
-        f"{n_tests} tests drawn at random",
-        (
-            Panel("(a) coverage", "SNR, at least", "share (1)", tuple(coverage), log="x"),
-            Panel("(b) advice that is wrong", "kind", "share of tests (1)", wrong),
-        ),
-    )
-
-
-def _covering(group: int, shares: list[float]) -> Point:
-    """Return a mean share of covered means; the channels of one test depend on each other."""
-    error = max(float(np.std(shares)), 0.05) / np.sqrt(len(shares))
-    return Point(10.0 ** DECADES[group], float(np.mean(shares)), _NOMINAL, error, _ALLOWED)
-
-
-def _accused(number: int, found: list[bool]) -> Point:
-    error = float(np.sqrt(_FALSE * (1 - _FALSE) / len(found)))
-    return Point(number, float(np.mean(found)), _FALSE, error, _FALSE_ALLOWED)
-
-
-def _coverage(
-    snapshot: Snapshot, settings: Settings, method: str, scene: Scene, deviations: FloatArray
-) -> float:
-    """Return the share of channels and bands whose interval holds the true mean."""
-    true = noise_psd(scene, deviations, snapshot.frequency)
-    width = np.gradient(snapshot.frequency)
-    inside = []
-    for band in BANDS:
-        means = channel_means(snapshot.results[method], snapshot, settings, band)
-        here = slice(*band_edges(snapshot.frequency, band))
-        truth = np.average(true[here], axis=0, weights=width[here])
-        inside += [
-            mean.low[0] <= each <= mean.high[0] for mean, each in zip(means, truth, strict=True)
-        ]
-    return float(np.mean(inside))
+    return judged.study(RANDOM_TESTS, f"{n_tests} tests drawn at random")
