@@ -13,7 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.shared_motion import CanonicalCoherence
+from estimator.diagnostics.shared_motion import (
+    MIN_COHERENCE,
+    CanonicalCoherence,
+    is_coherent,
+    seen_by_others,
+)
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.self_noise.coherency import (
     check_dims,
@@ -27,9 +32,6 @@ if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-MIN_COHERENCE = 0.5
-"""Frequencies with a lower coherence are not used: their phase could bias the delay."""
-_CERTAINLY = 1 + 1e-6  # rounding, and directions without power, change a coherence by less
 _STEPS = 4  # steps of least squares from the coarse delay
 _PARTS = 8  # parts of the band, for the scatter of the angles
 _MIN_PARTS = 4
@@ -183,7 +185,7 @@ def relative_response(
         )
     g = coherence.between(*own)[:, -1]
     weight = g / np.maximum(1 - g, 1e-9)
-    weight[~usable | (g < MIN_COHERENCE)] = 0.0
+    weight[~(usable & is_coherent(g, usable))] = 0.0
     weight[~seen_by_others(coherence, dims, (first, second), weight > 0)] = 0.0
     if not weight.any():
         raise InsufficientDataError(
@@ -226,32 +228,6 @@ def relative_response(
         delay_error=delay_error,
         coherence=float(g[inside].mean()),
     )
-
-
-def seen_by_others(
-    coherence: CanonicalCoherence, dims: tuple[int, ...], pair: tuple[int, int], wanted: BoolArray
-) -> BoolArray:
-    """Return where all motion of the first of a pair is coherent with the sensors beside the pair.
-
-    Shape (n_freqs,), of the frequencies that are `wanted`. One sensor alone sees no more of the
-    motion than all together. All are taken together only where no single one sees it, since that
-    costs the root of a large matrix for each pair.
-    """
-    own = own_channels(dims, pair[0])
-    others = [sensor for sensor in range(len(dims)) if sensor not in pair]
-    seen = np.zeros(len(wanted), np.bool_)
-    for sensor in others:
-        if not (wanted & ~seen).any():
-            return seen
-        if dims[sensor] >= len(own):
-            alone = coherence.between(own, own_channels(dims, sensor))[:, -1]
-            seen |= alone >= MIN_COHERENCE * _CERTAINLY
-    doubtful = wanted & ~seen
-    if doubtful.any():
-        rest = np.concatenate([own_channels(dims, sensor) for sensor in others])
-        together = coherence.between(own, rest, where=doubtful)[:, -1]
-        seen |= doubtful & (together >= MIN_COHERENCE)
-    return seen
 
 
 def _part(csm: ComplexArray, inside: IntArray, rows: IntArray, columns: IntArray) -> ComplexArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -168,6 +169,23 @@ def test_equal_sensors_in_weak_motion_are_not_said_to_differ(
         )
     ]
     assert len(kinds) <= 1
+
+
+@pytest.mark.parametrize(
+    "snr", [(0.85, 9.0, 9.0), (1.3, 9.0, 9.0), (9.0, 9.0, 0.85), (9.0, 9.0, 1.3)]
+)
+def test_frequencies_are_not_chosen_by_their_own_noise(snr: tuple[float, ...]) -> None:
+    """The coherence with a noisy sensor is 0.4 or 0.5: noise alone decides where it is higher."""
+    frequency = np.linspace(0.1, 45, 450)
+    csm = np.ones((450, 3, 3), np.complex128) + np.diag(1 / np.array(snr))
+    gains = []
+    for draw in wishart(csm, 84, np.random.default_rng(1), n_draws=30):
+        with suppress(InsufficientDataError):
+            found = relative_response(draw, frequency, dims=(1, 1, 1), first=0, second=1)
+            gains.append(found.gains[0])
+    assert len(gains) == (0 if 0.85 in snr else 30)
+    assert all(abs(gain - 1) < 0.02 for gain in gains)
+    assert abs(np.mean([1.0, *gains]) - 1) < 0.01
 
 
 def test_more_sensors_and_one_channel() -> None:
