@@ -26,9 +26,9 @@ PAIR_TABLES = 27
 """Tables of all pairs of channels by all pairs that exist at the same time: some 20 bands."""
 LARGE = 1e9
 """Bytes from which on an estimate is announced, and is not live with all sensors."""
-PART_BYTES = 250e6
-"""That an estimate of a part of the sensors may take. It is not diagnosed, and takes two fifths
-of this."""
+PART_BYTES = 100e6
+"""That an estimate of a part of the sensors may take, at most; it is not diagnosed, and takes
+less."""
 MIN_SENSORS = 3
 """That it has in any case."""
 
