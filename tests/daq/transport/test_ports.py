@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import fcntl
 import os
 import struct
 import threading
 import tty
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,8 +84,9 @@ async def _tcp() -> AsyncIterator[tuple[str, _Far]]:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writers.append(writer)
         ready.set()
-        while received := await reader.read(4096):
-            far.take(received)
+        with suppress(ConnectionError):
+            while received := await reader.read(4096):
+                far.take(received)
         writer.close()
 
     def send(payload: bytes) -> None:
@@ -184,7 +184,7 @@ async def test_a_read_returns_when_the_expected_bytes_are_available(kind: str) -
         reading = asyncio.create_task(stream.read())
         far.send(bytes(1))
         far.hang_up()  # is seen at once, whatever is expected
-        with contextlib.suppress(NotConnectedError):
+        with suppress(NotConnectedError):
             await reading
 
 
