@@ -44,11 +44,12 @@ def record(path: Path, seconds: int, continues: str = "", *, closed: bool = True
 
 
 def recorded(folder: Path) -> list[str]:
-    """Write a recording, two files that continue it, and another of such a name."""
+    """Write a recording, two files that continue it, and two others of such names."""
     first = record(folder / "r.h5", 12, closed=False)
     second = record(folder / "r-2.h5", 8, first)
     record(folder / "r-3.h5", 1, second, closed=False)
     record(folder / "r-4.h5", 1)
+    record(folder / "r-5.h5", 1, "another run")
     return ["r.h5", "r-2.h5", "r-3.h5"]
 
 
@@ -83,4 +84,4 @@ async def test_files_that_continue_a_recording_belong_to_its_run(
     verified = json.loads((tmp_path / "verified.json").read_text(encoding="utf-8"))
     assert [each["intact"] for each in verified["recordings"]] == [True] * len(names)
     remove(run, folder)
-    assert [path.name for path in folder.glob("r*.[hj]*")] == ["r-4.h5"]
+    assert sorted(path.name for path in folder.glob("r*.[hj]*")) == ["r-4.h5", "r-5.h5"]

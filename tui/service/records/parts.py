@@ -19,15 +19,24 @@ def with_continuations(parts: Iterable[Path]) -> list[Path]:
     """Return these files, each followed by those in which its recorder went on."""
     found: list[Path] = []
     for part in parts:
-        names = takewhile(Path.exists, continuation_names(part))
-        found += [part, *(path for path in names if _is_continuation(path))]
+        found.append(part)
+        before, _ = _run_ids(part) or (None, "")
+        for path in takewhile(Path.exists, continuation_names(part)):
+            ids = _run_ids(path)
+            if ids is None:  # a torn file is taken for a continuation
+                is_next = journal_path(path).exists()
+            else:
+                is_next = bool(ids[1]) and before in {None, ids[1]}
+            if is_next:
+                found.append(path)
+                before = None if ids is None else ids[0]
     return list(dict.fromkeys(found))
 
 
-def _is_continuation(path: Path) -> bool:
-    """Return whether a file of such a name continues another; a torn one is taken for it."""
+def _run_ids(path: Path) -> tuple[str, str] | None:
+    """Return the run_id of a file, and the one that it continues; None if it is torn."""
     try:
         with Recording.open(path) as recording:
-            return bool(recording.continues)
+            return recording.run_id, recording.continues
     except (HuddleError, OSError):
-        return journal_path(path).exists()
+        return None
