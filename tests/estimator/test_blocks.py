@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -16,10 +15,9 @@ from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise import coherency
 from estimator.spectra.welch import CrossSpectra, WelchSettings
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from estimator.types import ComplexArray, FloatArray
 
 N_FREQS, N_AVERAGES = 60, 200
@@ -36,15 +34,6 @@ def _averages(n_sensors: int, *, apart: int = 0) -> ComplexArray:
     parts = [motion[int(k >= n_sensors - apart)] for k in range(n_sensors)]
     x = np.concatenate(parts, axis=1) + white(N_FREQS, 3 * n_sensors, N_AVERAGES)
     return np.asarray(x @ x.conj().swapaxes(1, 2) / N_AVERAGES)
-
-
-def _peak(action: Callable[[], object]) -> int:
-    tracemalloc.start()
-    try:
-        action()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 def _fitted(csm: ComplexArray, n_factors: int) -> tuple[FloatArray | ComplexArray, ...]:
@@ -98,8 +87,8 @@ def test_an_estimate_of_many_channels_keeps_few_matrices(monkeypatch: pytest.Mon
     monkeypatch.setattr(stability, "PAIR_BYTES", 1 << 16)
     monkeypatch.setattr(shared_noise, "MAX_CHANNELS", 0)  # it takes the square of all pairs
     few = 20.0  # averages, with which nothing is fitted
-    assert _peak(lambda: diagnose(csm, frequency, dims=dims, n_effective=few)) < 5 * csm.nbytes
-    most = _peak(lambda: diagnose(csm, frequency, dims=dims, n_effective=N_AVERAGES))
+    assert peak_of(lambda: diagnose(csm, frequency, dims=dims, n_effective=few)) < 5 * csm.nbytes
+    most = peak_of(lambda: diagnose(csm, frequency, dims=dims, n_effective=N_AVERAGES))
     assert most < 6 * csm.nbytes
 
 
@@ -109,4 +98,4 @@ def test_averages_of_many_channels_take_little_beside_their_sum() -> None:
     samples = np.random.default_rng(0).standard_normal((2 * length, n_channels))
     starts = np.arange(3) * length // 2
     one = (length // 2 + 1) * n_channels**2 * 16
-    assert _peak(lambda: spectra.add(samples, starts)) < 6 * one
+    assert peak_of(lambda: spectra.add(samples, starts)) < 6 * one

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tracemalloc
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from estimator.diagnostics.stability import SegmentCourse, stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.spectra.segment_spectra import SegmentSpectra
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from tests.traced_memory import peak_of
 
 _AFTER_MANY_ARRAYS = """
 import numpy as np
@@ -39,15 +35,6 @@ for _ in range(40):
 del arrays
 print(resident() - before)
 """
-
-
-def _peak(action: Callable[[], object]) -> int:
-    tracemalloc.start()
-    try:
-        action()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads its memory from /proc")
@@ -73,7 +60,7 @@ def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
         found = stability(course, maximum, frequency, n_effective=1000.0, neighbours=HANN_HALF)
         assert found is not None
 
-    assert _peak(divide) < 2 * spectra.nbytes
+    assert peak_of(divide) < 2 * spectra.nbytes
 
 
 def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
@@ -85,7 +72,7 @@ def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
         seconds, lateness, 1e-12 * from_samples, from_samples, np.zeros(n, np.bool_)
     )
     n_pairs = 2  # of walk and noise that are likely here, with the steady one
-    assert _peak(lambda: smooth(observed)) < 2.2 * n * n_pairs * 24 * 8
+    assert peak_of(lambda: smooth(observed)) < 2.2 * n * n_pairs * 24 * 8
 
 
 @pytest.mark.parametrize(
@@ -108,5 +95,5 @@ def test_kept_segments_are_one_array() -> None:
         for _ in range(5000):
             kept.add(one)
 
-    assert _peak(add) < 0.8 * kept.most * one.nbytes  # of numbers half as large
+    assert peak_of(add) < 0.8 * kept.most * one.nbytes  # of numbers half as large
     assert kept.values().shape == (len(kept), 40, 9)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -316,14 +316,14 @@ def test_parts_that_were_read_are_dropped_again() -> None:
             return []
 
     large = [Large(str(number)) for number in range(40)]
-    tracemalloc.start()
-    for part in large:
-        cache.traces(part)
-        cache.traces(part)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
+
+    def load_twice() -> None:
+        for part in large:
+            cache.traces(part)
+            cache.traces(part)
+
+    assert peak_of(load_twice) < 10 << 20
     assert loads == [part.source for part in large]
-    assert peak < 10 << 20
 
 
 def test_long_arrays_are_written_in_bounded_memory(tmp_path: Path) -> None:
@@ -333,9 +333,9 @@ def test_long_arrays_are_written_in_bounded_memory(tmp_path: Path) -> None:
     )
     samples = np.zeros((1 << 16, 8), np.int32)
     with ArrayWriter(tmp_path / "a.h5", sensors=[layout], created=HostTime(0, 0)) as writer:
-        tracemalloc.start()
-        for number in range(32):  # 64 MB
-            writer.samples("A", samples, first_sample=number << 16, restart=number == 0)
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-    assert peak < 40 << 20
+
+        def write() -> None:
+            for number in range(32):  # 64 MB
+                writer.samples("A", samples, first_sample=number << 16, restart=number == 0)
+
+        assert peak_of(write) < 40 << 20

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from typing import TYPE_CHECKING
 
 import h5py
@@ -13,6 +12,7 @@ from daq.errors import RecordingError
 from daq.protocols.block import BlockFlag
 from daq.recording.chunks.block_table import BlockTable
 from daq.recording.file_format import BLOCK_DTYPE, BLOCKS_PER_CHUNK
+from tests.traced_memory import peak_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,11 +66,5 @@ def test_clipped_stretches_are_cached(dataset: h5py.Dataset) -> None:
 
 
 def test_memory_does_not_grow_with_the_blocks(dataset: h5py.Dataset) -> None:
-    tracemalloc.start()
-    try:
-        table = BlockTable(dataset)
-        table.extend(N_BLOCKS, LENGTH * N_BLOCKS)
-        _, most = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
+    most = peak_of(lambda: BlockTable(dataset).extend(N_BLOCKS, LENGTH * N_BLOCKS))
     assert most < N_BLOCKS * BLOCK_DTYPE.itemsize / 2
