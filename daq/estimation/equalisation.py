@@ -59,10 +59,14 @@ class _Leaks:
     """What leaks in the averages of one spectrum, in the digitised channels' own units."""
 
     noise: tuple[SelfNoise, ...]
-    noise_psd: FloatArray
     motion_psd: FloatArray
     left: FloatArray
     share: FloatArray
+
+    @property
+    def noise_psd(self) -> FloatArray:
+        """The noise of all bands."""
+        return np.concatenate([each.noise_psd for each in self.noise])
 
 
 class Equalisation:
@@ -266,12 +270,12 @@ class Equalisation:
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
             share = share - _noise_of_prediction(band, factor)
             least = significant_minimum(share, deviation, band.frequencies)
-            parts.append(_Leaks((result,), noise, motion, left, least))
+            parts.append(_Leaks((result,), motion, left, least))
         return _Leaks(
             tuple(each for part in parts for each in part.noise),
             *(
                 np.concatenate([getattr(part, name) for part in parts])
-                for name in ("noise_psd", "motion_psd", "left", "share")
+                for name in ("motion_psd", "left", "share")
             ),
         )
 
