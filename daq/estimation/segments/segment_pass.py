@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_VALUES_AT_ONCE = 1 << 19  # samples times channels read together: 4 MB
+_VALUES_AT_ONCE = 1 << 18  # samples times channels read together: 2 MB
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
 _MOST_PASSES = 4
