@@ -81,7 +81,7 @@ def test_responses_use_the_frequencies_at_which_all_other_sensors_see_the_motion
 
 
 def test_an_estimate_of_many_channels_keeps_few_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
-    csm, dims = _averages(12), (3,) * 12
+    csm, dims = _averages(8), (3,) * 8
     frequency = np.arange(1.0, N_FREQS + 1)
     monkeypatch.setattr(coherency, "BLOCK_BYTES", 2 * csm[0].nbytes)
     monkeypatch.setattr(stability, "PAIR_BYTES", 1 << 16)

@@ -61,7 +61,7 @@ def test_motion_and_noise_have_the_requested_psd_within_statistical_error() -> N
         )
     )
     for model in (moved, noisy):
-        frequency, matrix, n = csm(*World(model).samples("A", 0, 400_000).T)
+        frequency, matrix, n = csm(*World(model).samples("A", 0, 200_000).T)
         for low, high in ((0.3, 1.0), (1.0, 7.0), (7.0, 9.0), (9.0, 60.0), (60.0, 89.0)):
             band = (frequency >= low) & (frequency < high)
             for channel, spectrum in enumerate(noisy.noise_spectra("A")):
@@ -85,7 +85,7 @@ def test_the_motion_ends_below_nyquist_and_noise_does_not() -> None:
 def test_cross_psd_follows_the_mixing_matrix() -> None:
     mixing = [[1.0, 0.0], [0.6, 0.8], [-0.5, 2.0]]
     model = scenario({"A": {}}, spectra=[white(1.0), white(2.0)], mixing=mixing)
-    frequency, matrix, n = csm(*World(model).samples("A", 0, 400_000).T)
+    frequency, matrix, n = csm(*World(model).samples("A", 0, 200_000).T)
     band = (frequency > 1) & (frequency < 85)
     wanted = np.array(mixing) @ np.diag([1.0, 2.0]) @ np.array(mixing).T
     error = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)) * 1.94 / (n * band.sum()))

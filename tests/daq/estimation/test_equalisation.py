@@ -165,7 +165,9 @@ def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
     np.testing.assert_array_equal(plain.csm, automatic.csm)
 
 
-@pytest.mark.parametrize("rates", [(50.0, 50.0, 50.0), (100.0, 200.0, 200.0)])
+@pytest.mark.parametrize(
+    "rates", [(50.0, 50.0, 50.0), pytest.param((100.0, 200.0, 200.0), marks=pytest.mark.long)]
+)
 def test_resampling_is_not_taken_for_responses_of_sensors(
     tmp_path: Path, rates: tuple[float, float, float]
 ) -> None:

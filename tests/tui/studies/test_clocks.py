@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.mark.parametrize(
-    "latency",
-    [Latency(), pytest.param(Latency("batching", 16e-3), marks=pytest.mark.long)],
-    ids=lambda x: x.kind,
-)
+@pytest.mark.long
+@pytest.mark.parametrize("latency", [Latency(), Latency("batching", 16e-3)], ids=lambda x: x.kind)
 def test_refined_clocks_give_what_true_clocks_give(tmp_path: Path, latency: Latency) -> None:
     rows = {
         row.clocks: row for row in study(tmp_path, snr=1e4, duration=120.0, latency=latency, seed=3)
