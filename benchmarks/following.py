@@ -1,4 +1,4 @@
-"""Memory of `huddle watch` over a day: another process plays 24 h of three free sensors in minutes.
+"""Memory of what follows a test for a day: another process plays 24 h of three free sensors.
 
 Live, segments come one by one. Here many come at once, so peaks are higher than in a real test.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.application import WIDE, Terminal
 from benchmarks.row import Row
 from daq.bench.model import Channel
 from daq.protocols.block import Block, BlockFlag, HostTime
@@ -25,6 +26,8 @@ HOURS, PLAYED_IN, RATE = 24, 300.0, 200
 BLOCK, COMMITTED = 50, 4000
 """Samples of a block, and of a commit."""
 LOOK = 1.0
+PATIENCE = 1800.0
+"""Seconds."""
 
 
 def play(path: Path) -> None:
@@ -53,27 +56,38 @@ def play(path: Path) -> None:
 
 
 def run() -> list[Row]:
-    """Return the peak of the process that follows."""
+    """Return the peaks of the command and the application, from the first minute to the result."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "day.h5"
         with subprocess.Popen(python_command("benchmarks.following", str(path))):
             while not path.exists():
                 time.sleep(LOOK)
-            peak = _peak(path)
+            terminal = Terminal(path, WIDE, None)
+            peaks = {"watch": _peak_of_watch(path)}
+            terminal.wait_for("neither passed nor failed", timeout=PATIENCE)
+            peaks["tui"] = _peak(terminal.process.pid)
+            terminal.close()
+    day = f"{HOURS} h × 9 × {RATE} Hz"
     return [
-        Row(f"huddle watch of {HOURS} h × 9 × {RATE} Hz: memory", peak, "MB", 250.0, note="peak")
+        Row(f"huddle {command} of {day}: memory", peak, "MB", at_most=250.0, note="peak")
+        for command, peak in peaks.items()
     ]
 
 
-def _peak(path: Path) -> float:
+def _peak_of_watch(path: Path) -> float:
     command = python_command("tui", "watch", str(path))
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as watch:
-        peak = 0
+        peak = 0.0
         while watch.poll() is None:
-            status = Path(f"/proc/{watch.pid}/status").read_text(encoding="utf-8")
-            peak = max(peak, *map(int, re.findall(r"VmHWM:\s*(\d+)", status)), 0)
+            peak = max(peak, _peak(watch.pid))
             time.sleep(LOOK)
-    return peak / 1024
+    return peak
+
+
+def _peak(pid: int) -> float:
+    """Return the peak of a process so far, in MB; zero if it has just ended."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    return max([0, *map(int, re.findall(r"VmHWM:\s*(\d+)", status))]) / 1024
 
 
 if __name__ == "__main__":
