@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.grid import SNAP, Grid
+from daq.alignment.grid import SNAP, Grid, grid_rate
 from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import SensorSource, main_columns
 from daq.errors import CannotAlignError
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.bench.model import Channel
-    from daq.recording.interface import ReadableRecording, ReadableSensor
+    from daq.recording.interface import ReadableRecording
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
@@ -83,7 +83,7 @@ class AlignedRecording:
             raise CannotAlignError(
                 f"{recording.path}: no sensor with a channel that is not auxiliary"
             )
-        self.sampling_rate = _grid_rate(records, sampling_rate)
+        self.sampling_rate = grid_rate(records, sampling_rate)
         self.channels: tuple[tuple[str, Channel], ...] = tuple(
             (record.name, record.channels[column])
             for record in records
@@ -170,6 +170,19 @@ class AlignedRecording:
         positions = [source.known_clock.position(seconds) for source in self._sources]
         return np.asarray(seconds[:, None] - np.column_stack(positions) / rates)
 
+    def epoch_around(self, at: float) -> tuple[float, float]:
+        """Return begin and end of what no clock restarts in, around a grid position; in samples.
+
+        Both are `at` where a sensor has no samples.
+        """
+        seconds = self._start + at / self.sampling_rate
+        spans = [source.known_clock.span_at(seconds) for source in self._sources]
+        known = [span for span in spans if span is not None]
+        if len(known) < len(spans):
+            return at, at
+        low, high = max(begin for begin, _ in known), min(end for _, end in known)
+        return at + (low - seconds) * self.sampling_rate, at + (high - seconds) * self.sampling_rate
+
     @property
     def measurable(self) -> tuple[int, ...]:
         """Indices of sensors with measurable delays: the best reference, and one per other clock.
@@ -197,7 +210,7 @@ class AlignedRecording:
         Parameters
         ----------
         at : float64, shape (n,)
-            Grid positions in samples, increasing from call to call.
+            Grid positions in samples.
         delays, std : float64, shape (n, n_measurable)
             Delay of each `measurable` sensor against the sensor with standard deviation zero, and
             its standard deviation, in s; an infinite standard deviation means unknown.
@@ -383,17 +396,3 @@ class AlignedRecording:
         if end_utc_ns is not None:
             self._end = (end_utc_ns - self._origin[1]) * 1e-9
         return Grid(self.sampling_rate, start)
-
-
-def _grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:
-    rates = {record.name: record.sampling_rate for record in records}
-    lowest = min(rates.values())
-    if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):
-        return lowest
-    if wanted > lowest or wanted <= 0:
-        listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
-        raise CannotAlignError(
-            f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
-            f" expected at most {lowest:g} Hz"
-        )
-    return wanted

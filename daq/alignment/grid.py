@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.resampling import SPAN, all_present, reach, resample
+from daq.errors import CannotAlignError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.alignment.sensor_reader import SensorSource
+    from daq.recording.interface import ReadableSensor
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
@@ -81,6 +83,8 @@ class Grid:
         valid = np.zeros(len(samples), dtype=bool)
         end = second[0] + (len(samples) + 1) / self.sampling_rate
         for epoch in source.known_clock.between(second[0] - 1 / self.sampling_rate, end):
+            if not epoch.is_placed:
+                continue
             first = round(float(epoch.position(second)[0]))
             low = max(first, epoch.first_sample)
             high = min(first + len(samples), epoch.end_sample)
@@ -97,6 +101,8 @@ class Grid:
         valid = np.zeros(stop - start, dtype=bool)
         ratio = self._ratio(source)
         for epoch in source.known_clock.between(seconds[0], seconds[-1]):
+            if not epoch.is_placed:
+                continue
             positions = epoch.position(seconds)
             margin = reach(ratio)
             low = math.floor(positions[0]) - margin
@@ -114,3 +120,18 @@ class Grid:
 
     def _ratio(self, source: SensorSource) -> float:
         return max(1.0, source.record.sampling_rate / self.sampling_rate)
+
+
+def grid_rate(records: list[ReadableSensor], wanted: float | None) -> float:
+    """Return the rate of the grid: the lowest of the sensors', or a wanted one below it."""
+    rates = {record.name: record.sampling_rate for record in records}
+    lowest = min(rates.values())
+    if wanted is None or math.isclose(wanted, lowest, rel_tol=1e-12):
+        return lowest
+    if wanted > lowest or wanted <= 0:
+        listed = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise CannotAlignError(
+            f"a common sampling rate of {wanted:g} Hz is above that of a sensor ({listed});"
+            f" expected at most {lowest:g} Hz"
+        )
+    return wanted

@@ -175,9 +175,12 @@ class SensorSource:
         """Return the sample times that follow from measured delays against the reference."""
         if not self.learnt:
             return None
-        index, at_reference, delay, std = self.learnt.values.T
+        found = self.learnt.values  # of segments with gaps after those without
+        index, at_reference, delay, std = found[np.argsort(found[:, 0], kind="stable")].T
         seconds = reference.at(at_reference) - delay - self.frame_delay
-        return MeasuredDelays(index, seconds, std)
+        starts = np.array([epoch.start for epoch in reference.epochs[1:]])
+        restarts = np.ceil(self.known_clock.position(starts)).astype(np.int64)
+        return MeasuredDelays(index, seconds, std, restarts)
 
     def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
         """Return the source in `others` that is the same sensor over another connection."""

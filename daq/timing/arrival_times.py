@@ -31,13 +31,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq.protocols.block import BlockFlag
 from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
+from daq.timing.device_utc import from_device_utc
 from daq.timing.host_sleep import HostSleep
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
@@ -62,7 +63,6 @@ _UTC_JUMP = 0.01  # samples
 _DRIFT = 1e-4  # by which a sampling clock may run off its rate
 _LEAP = 1e-3  # seconds; how well a step must agree with a leap second
 _BREAKS = BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-_UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
 
 
 @dataclass(slots=True)
@@ -220,12 +220,30 @@ class ArrivalTimes:
             What the samples say.
         """
         if self._device_utc:
-            return self._stated(sensor)
+            rate = self.sampling_rate
+            return from_device_utc(sensor, self.earliest(), sampling_rate=rate, moved=self.moved)
         if measured is not None:
+            if len(measured.restarts):
+                once = replace(measured, restarts=measured.restarts[:0])
+                clock = self._restarting(measured.restarts).solve(sensor, once)
+                return replace(clock, state=replace(clock.state, n_epochs=len(self._epoch_starts)))
             return self._filtered(sensor, *self._lines(), measured)
         if self._unmeasured is None or self._unmeasured.state.sensor != sensor:
             self._unmeasured = self._filtered(sensor, *self._lines(), None)
         return self._unmeasured
+
+    def _restarting(self, samples: IntArray) -> ArrivalTimes:
+        """Return the same arrivals with epochs that begin at these samples besides.
+
+        None begins where it would leave an epoch without an arrival.
+        """
+        row, which = np.unique(np.searchsorted(self._index, samples), return_index=True)
+        between = (row > 0) & (row < len(self._index))
+        row, which = row[between], which[between]
+        inside = self._epoch[row - 1] == self._epoch[row]
+        every = np.union1d(self._epoch_starts, samples[which[inside]])
+        epoch = np.searchsorted(every, self._index, side="right") - 1
+        return replace(self, _epoch_starts=every.tolist(), _epoch=epoch, _line=None)
 
     def _bounds(self) -> list[tuple[int, int]]:
         """First sample of each epoch, and the one after its last."""
@@ -235,26 +253,6 @@ class ArrivalTimes:
         """Return the rows of every epoch, given each row's, which rise."""
         bounds = np.searchsorted(epoch, np.arange(len(self._epoch_starts) + 1)).tolist()
         return list(itertools.starmap(slice, itertools.pairwise(bounds)))
-
-    def _stated(self, sensor: str) -> Clock:
-        """Follow the device's own statements; at the nominal rate, if they agree with it."""
-        epochs = []
-        for mine, (first, end) in zip(self._rows(self._epoch), self._bounds(), strict=True):
-            index, late = self._index[mine].astype(float), self._late[mine]
-            if np.ptp(late) < _UTC_TOLERANCE:
-                index = np.array([first, max(end, first + 1)], dtype=float)
-                late = np.full(2, late[0])
-            seconds = index / self.sampling_rate + late + self.moved
-            epochs.append(Epoch(first, end, index, seconds))
-        ppm, wander = 0.0, 0.0
-        if any(len(epoch.index) > 2 for epoch in epochs):
-            longest = max(epochs, key=lambda epoch: epoch.end_sample - epoch.first_sample)
-            rates = np.diff(longest.index) / np.diff(longest.seconds) / self.sampling_rate
-            ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
-        state = ClockState(
-            sensor, ClockSource.DEVICE_UTC, epochs[0].start, ppm, 0.0, wander, 0.0, len(epochs)
-        )
-        return Clock(tuple(epochs), state)
 
     def _lines(self) -> tuple[float, list[float]]:
         """One slope (lateness per sample) for all epochs, and the lateness at index 0 of each."""
@@ -274,14 +272,15 @@ class ArrivalTimes:
         return self._line
 
     def _without_segment(self, at: FloatArray, epoch: IntArray) -> BoolArray:
-        """Return which epochs are shorter than a segment, so that nothing depends on their times.
+        """Return which epochs are about as short as a segment, and have no measured delay.
 
-        Given the samples and epochs at which delays of segments were measured.
+        Only arrival times tell when their samples were taken, so these are not used. Given are the
+        samples, increasing, and epochs at which delays of segments were measured.
         """
         lengths = np.diff([*self._epoch_starts, self._end_sample])
         measured = np.bincount(epoch, minlength=len(lengths)) > 0
-        apart = np.diff(at).min() if len(at) > 1 else 0.0  # at most the length of a segment
-        return np.asarray(~measured & (lengths < apart))
+        apart = np.diff(at).min() if len(at) > 1 else 0.0  # half a segment, by default
+        return np.asarray(~measured & (lengths < 2 * apart))
 
     def _stretches(self, length: float) -> IntArray:
         """Return which stretch of `length` samples of its epoch each arrival lies in.
@@ -294,6 +293,32 @@ class ArrivalTimes:
         whole = np.maximum(np.round((last - starts) / length), 1)
         number = (self._index - starts[self._epoch]) // length
         return np.asarray(np.minimum(number, whole[self._epoch] - 1), dtype=np.int64)
+
+    def _with_delays(
+        self,
+        slope: float,
+        anchors: list[float],
+        measured: MeasuredDelays,
+        arrivals: tuple[FloatArray, FloatArray, IntArray],
+    ) -> tuple[BoolArray, tuple[FloatArray, FloatArray, IntArray, FloatArray]]:
+        """Return which epochs are placed, and arrivals and measured delays in order.
+
+        Those are samples, lateness against the lines, epochs, and variances (0: an arrival).
+        """
+        index, late, epoch = arrivals
+        known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
+        at = measured.index[known]
+        which = np.searchsorted(self._epoch_starts, at, side="right") - 1
+        is_placed = ~self._without_segment(at, which)
+        used = is_placed[epoch]
+        lateness = measured.seconds[known] - at / self.sampling_rate
+        lateness -= slope * at + np.array(anchors)[which]
+        index, late = np.concatenate([index[used], at]), np.concatenate([late[used], lateness])
+        epoch = np.concatenate([epoch[used], which])
+        measured_variance = measured.std[known] ** 2 + _FLOOR**2
+        variance = np.concatenate([np.zeros(np.count_nonzero(used)), measured_variance])
+        order = np.lexsort((index, epoch))
+        return is_placed, (index[order], late[order], epoch[order], variance[order])
 
     def _filtered(
         self,
@@ -320,21 +345,10 @@ class ArrivalTimes:
         scatter = scatter_of_least(left, left[kept], begins)
         index, late, epoch = self._index[kept].astype(float), left[kept], self._epoch[kept]
         variance = np.zeros(len(index))
+        is_placed = np.ones(len(anchors), np.bool_)
         if measured is not None:
-            known = np.isfinite(measured.std) & (measured.index >= self._epoch_starts[0])
-            at = measured.index[known]
-            which = np.searchsorted(self._epoch_starts, at, side="right") - 1
-            used = ~self._without_segment(at, which)[epoch]
-            index, late, epoch = index[used], late[used], epoch[used]
-            variance = variance[used]
-            lateness = measured.seconds[known] - at / self.sampling_rate
-            lateness -= slope * at + np.array(anchors)[which]
-            index, late = np.concatenate([index, at]), np.concatenate([late, lateness])
-            epoch = np.concatenate([epoch, which])
-            variance = np.concatenate([variance, measured.std[known] ** 2 + _FLOOR**2])
-            order = np.lexsort((index, epoch))
-            index, late, epoch = index[order], late[order], epoch[order]
-            variance = variance[order]
+            is_placed, rows = self._with_delays(slope, anchors, measured, (index, late, epoch))
+            index, late, epoch, variance = rows
         observations = Observations(
             seconds=index / self.sampling_rate,
             lateness=late,
@@ -353,14 +367,18 @@ class ArrivalTimes:
             return self._filtered(sensor, slope, anchors, None)
         curve = smoothed.lateness + (smoothed.constant if refined else 0.0)
         epochs = []
-        every = zip(self._rows(epoch), self._bounds(), anchors, strict=True)
-        for mine, bounds, anchor in every:
-            if mine.start < mine.stop:
+        every = zip(self._rows(epoch), self._bounds(), anchors, is_placed.tolist(), strict=True)
+        for mine, bounds, anchor, placed in every:
+            if placed:
                 nodes, late, rate = index[mine], curve[mine], smoothed.rate[mine]
-            else:  # without a segment
+            else:
                 nodes, late, rate = (np.full(1, each) for each in (bounds[0], smoothed.constant, 0))
             late = late + slope * nodes + anchor
-            epochs.append(self._laid(bounds, nodes, late, rate + slope * self.sampling_rate))
+            rate = rate + slope * self.sampling_rate
+            nominal = self.sampling_rate
+            epochs.append(
+                Epoch.of(bounds, nodes, late, rate, sampling_rate=nominal, is_placed=placed)
+            )
         drift = slope * self.sampling_rate + float(smoothed.rate.mean())
         state = ClockState(
             sensor=sensor,
@@ -374,17 +392,3 @@ class ArrivalTimes:
             refined=refined,
         )
         return Clock(tuple(epochs), state)
-
-    def _laid(
-        self, bounds: tuple[int, int], index: FloatArray, late: FloatArray, rate: FloatArray
-    ) -> Epoch:
-        """Return the epoch of this lateness, straight on at both ends at the rate there."""
-        low, high = min(float(bounds[0]), index[0]) - 1.0, max(float(bounds[1]), index[-1]) + 1.0
-        first, last = rate[[0, -1]] / self.sampling_rate
-        late = np.concatenate(
-            [[late[0] - first * (index[0] - low)], late, [late[-1] + last * (high - index[-1])]]
-        )
-        index = np.concatenate([[low], index, [high]])
-        increasing = np.concatenate([[True], np.diff(index) > 0])
-        seconds = index / self.sampling_rate + late
-        return Epoch(*bounds, index[increasing], seconds[increasing])

@@ -40,11 +40,14 @@ class MeasuredDelays:
         When they were taken.
     std : float64, shape (n,)
         Standard deviation of `seconds`.
+    restarts : int64, shape (n_restarts,)
+        Samples at which the clock that was measured against restarts.
     """
 
     index: FloatArray
     seconds: FloatArray
     std: FloatArray
+    restarts: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,12 +63,38 @@ class Epoch:
     seconds : float64, shape (n_nodes,)
         Time in seconds from the recording's origin; straight between nodes, and beyond them as in
         the outermost interval.
+    is_placed : bool
+        False where the times are much less certain than those of the other epochs: its samples
+        are not used.
     """
 
     first_sample: int
     end_sample: int
     index: FloatArray
     seconds: FloatArray
+    is_placed: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        bounds: tuple[int, int],
+        index: FloatArray,
+        late: FloatArray,
+        rate: FloatArray,
+        *,
+        sampling_rate: float,
+        is_placed: bool,
+    ) -> Epoch:
+        """Return the epoch of this lateness in s, straight on at both ends at the rate there."""
+        low, high = min(float(bounds[0]), index[0]) - 1, max(float(bounds[1]), index[-1]) + 1
+        first, last = rate[[0, -1]] / sampling_rate
+        late = np.concatenate(
+            [[late[0] - first * (index[0] - low)], late, [late[-1] + last * (high - index[-1])]]
+        )
+        index = np.concatenate([[low], index, [high]])
+        increasing = np.concatenate([[True], np.diff(index) > 0])
+        index, seconds = index[increasing], (index / sampling_rate + late)[increasing]
+        return cls(*bounds, index, seconds, is_placed)
 
     def at(self, index: FloatArray) -> FloatArray:
         """Return the time in seconds of (fractional) sample indices."""
@@ -213,9 +242,19 @@ class Clock:
         starts, ends = self.spans
         return tuple(self.epochs[n] for n in np.flatnonzero((starts <= end) & (ends >= begin)))
 
+    def span_at(self, seconds: float) -> tuple[float, float] | None:
+        """Return begin and end, in seconds, of the epoch at a time; None between epochs."""
+        starts, ends = self.spans
+        number = int(np.searchsorted(starts, seconds, side="right")) - 1
+        if number < 0 or seconds > ends[number]:
+            return None
+        return float(starts[number]), float(ends[number])
+
     def extended(self, end_sample: int) -> Clock:
         """Return the same clock for a recording that has grown to `end_sample`."""
-        last = replace(self.epochs[-1], end_sample=end_sample)
+        last = self.epochs[-1]
+        is_placed = last.is_placed or end_sample > last.end_sample  # it is no longer so short
+        last = replace(last, end_sample=end_sample, is_placed=is_placed)
         return replace(self, epochs=(*self.epochs[:-1], last))
 
     def shared_by(self, sensor: str, *, end_sample: int) -> Clock:
@@ -245,8 +284,8 @@ class Clock:
                 if start >= end:
                     break
                 if max(first, start) < min(end, stop):
-                    index = epoch.index - n
-                    found.append(Epoch(max(first, start), min(end, stop), index, epoch.seconds))
+                    index, bounds = epoch.index - n, (max(first, start), min(end, stop))
+                    found.append(Epoch(*bounds, index, epoch.seconds, epoch.is_placed))
         epochs = tuple(found)
         state = replace(
             self.state.shared_by(sensor),
@@ -263,9 +302,8 @@ class Clock:
         evaluate: Callable[[Epoch, FloatArray], FloatArray],
     ) -> FloatArray:
         out = np.empty(len(values))
-        order = np.argsort(which, kind="stable")
-        numbers, begins = np.unique(which[order], return_index=True)
-        for number, rows in zip(numbers, np.split(order, begins[1:]), strict=True):
+        for number in np.unique(which).tolist():
+            rows = which == number
             out[rows] = evaluate(self.epochs[number], values[rows])
         return out
 

@@ -67,6 +67,7 @@ def synthesise(
     instants: bool = False,
     utc: Mapping[str, float] | None = None,
     lost: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    restarts: bool = False,
 ) -> Path:
     """Write the recording that a bench of this scenario would have given.
 
@@ -88,6 +89,8 @@ def synthesise(
         Sensors that state UTC themselves, and by how many seconds the host's is behind theirs.
     lost : mapping of str to sequence of (float, float), optional
         Begin and end, in seconds of a sensor's own count, of samples whose blocks never arrive.
+    restarts : bool
+        Whether clocks restart after each loss, as where nobody knows how many samples were lost.
     """
     latency = latency or Latency()
     layouts = [
@@ -131,6 +134,7 @@ def synthesise(
                     layout.name,
                     np.round(samples * SENSITIVITY).astype(np.int32),
                     first_sample=first,
+                    restart=number == 0 or (restarts and not arrived[number - 1]),
                     block_rows=length,
                     received_ns=received_ns,
                     utc_ns=None if behind is None else _ns(times[::length] + behind),

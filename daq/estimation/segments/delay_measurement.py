@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.delay_estimation import MIN_SEGMENTS, DelayEstimator
+from estimator.spectra.gap_window import gap_window, without_trend
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
+    BoolArray = NDArray[np.bool_]
 
 _HELD = 6  # segments that are measured together while a recording is followed
 _HELD_VALUES = 1 << 19  # samples times channels that may wait for that: 4 MB
@@ -90,6 +92,34 @@ class DelayMeasurement:
         n_values = sum(each.size for each, _, _ in self._held)
         if sum(len(rows) for _, rows, _ in self._held) >= _HELD or n_values >= _HELD_VALUES:
             self._learn_held()
+
+    def measure_with_gaps(
+        self,
+        samples: FloatArray,
+        usable: BoolArray,
+        starts: IntArray,
+        begin: IntArray,
+        *,
+        most: float,
+        together: bool,
+    ) -> None:
+        """Measure what delays are left in segments with gaps.
+
+        Of each segment this takes what no clock restarts in, around its middle: a delay across a
+        restart would be that of neither side. Segments of which gaps and the rest take more than
+        the share `most` are left out. The other parameters are those of `measure`.
+        """
+        length = self._welch.segment_length
+        segments, taken = [np.empty((0, samples.shape[1]))], []
+        for start, at in zip(starts.tolist(), begin.tolist(), strict=True):
+            low, high = self._aligned.epoch_around(at + length / 2)
+            span, place = slice(start, start + length), at + np.arange(length)
+            weight = gap_window(usable[span] & (place >= low) & (place <= high), length)
+            if np.count_nonzero(weight < 1) <= most * length:
+                segments.append(without_trend(samples[span], weight, self._welch.detrend))
+                taken.append(at)
+        rows = np.arange(len(taken)) * length
+        self.measure(np.concatenate(segments), rows, np.array(taken, np.int64), together=together)
 
     def _learn_held(self) -> None:
         if not self._held:

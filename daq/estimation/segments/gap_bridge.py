@@ -40,16 +40,8 @@ class GapBridge:
         usable: NDArray[np.bool_],
         clipped: NDArray[np.bool_] | None,
         starts: NDArray[np.int64],
-    ) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Take the segments at `starts` that have short gaps and are not clipped.
-
-        Returns
-        -------
-        segments : float64, shape (n_taken * segment_length, n_channels)
-            As they were taken, one after the other.
-        taken : int64, shape (n_taken,)
-            Where they begin in `samples`.
-        """
+    ) -> NDArray[np.int64]:
+        """Take the segments at `starts` that have short gaps and are not clipped; return which."""
         length = self._welch.segment_length
         segments, taken = [np.empty((0, samples.shape[1]))], []
         for start in starts.tolist():
@@ -62,6 +54,5 @@ class GapBridge:
             segment = without_trend(samples[span], weight, self._welch.detrend)
             segments.append(segment / np.sqrt(self.leakage.add(weight)))
             taken.append(start)
-        joined = np.concatenate(segments)
-        self.spectra.add(joined, np.arange(len(taken)) * length)
-        return joined, np.array(taken, dtype=np.int64)
+        self.spectra.add(np.concatenate(segments), np.arange(len(taken)) * length)
+        return np.array(taken, dtype=np.int64)

@@ -246,9 +246,11 @@ class Pass:
             self._delays.measure(samples, starts, first * hop + reach + starts, together=live)
             if self._bridge is not None and not whole.all():
                 touched = np.flatnonzero(~whole) * hop
-                joined, taken = self._bridge.take(samples, usable, clipped, touched)
-                rows = np.arange(len(taken)) * length
-                self._delays.measure(joined, rows, first * hop + reach + taken, together=live)
+                taken = self._bridge.take(samples, usable, clipped, touched)
+                begins = first * hop + reach + taken
+                self._delays.measure_with_gaps(
+                    samples, usable, taken, begins, most=self._settings.bridge, together=live
+                )
             self.n_seen += count
             if progress is not None:
                 progress(count)

@@ -45,6 +45,8 @@ LEVEL = 1e-8
 """PSD of the motion in (m/s²)²/Hz."""
 FREE, WITH_GAPS, STEPS = 0.8, 0.6, 0.2
 """Shares of recordings with free clocks and with gaps, and of clocks with a step of temperature."""
+AGAIN_AND_AGAIN, RESTARTS = 0.4, 0.5
+"""Shares of recordings with gaps that have some every 5 to 60 s, and where clocks restart there."""
 MIDDLE, HIGHEST = 10.0, 0.4
 """Limit in Hz of the two bands, and the end of the second over the lowest sampling rate."""
 ALWAYS_WRONG = (
@@ -75,6 +77,8 @@ class Drawn:
     latency : Latency
     lost : dict
         Begin and end in seconds of samples that never arrived, by sensor.
+    restarts : bool
+        Whether clocks restart after each loss.
     """
 
     scenario: Scenario
@@ -85,6 +89,7 @@ class Drawn:
     parallel: bool
     latency: Latency
     lost: dict[str, list[tuple[float, float]]]
+    restarts: bool
 
 
 def draw(rng: np.random.Generator) -> Drawn:
@@ -112,6 +117,13 @@ def draw(rng: np.random.Generator) -> Drawn:
             begin = float(rng.uniform(5, seconds - 5))
             end = begin + 10 ** rng.uniform(-2, 1.3)
             lost.setdefault(str(rng.choice(list(names))), []).append((begin, end))
+        if rng.random() < AGAIN_AND_AGAIN:
+            apart = 10 ** rng.uniform(0.7, 1.8)
+            for name in rng.choice(
+                list(names), int(rng.integers(1, len(names) + 1)), replace=False
+            ):
+                begins = np.arange(rng.uniform(5, 5 + apart), seconds - 5, apart)
+                lost.setdefault(str(name), []).extend((at, at + 0.2) for at in begins.tolist())
     motion = {"spectra": [{"shape": "white", "level": LEVEL}] * d}
     table = {"motion": motion, "sensors": sensors, "seed": int(rng.integers(2**31))}
     return Drawn(
@@ -123,6 +135,7 @@ def draw(rng: np.random.Generator) -> Drawn:
         turned == "parallel",
         LATENCIES[int(rng.integers(len(LATENCIES)))],
         lost,
+        bool(rng.random() < RESTARTS),
     )
 
 
@@ -177,6 +190,7 @@ def _judge(drawn: Drawn, number: int, judged: Judged) -> None:
             block=drawn.block,
             seed=number,
             lost=drawn.lost,
+            restarts=drawn.restarts,
         )
         settings = Settings(segment=drawn.segment, methods=METHODS)
         snapshot = estimate([path], settings)

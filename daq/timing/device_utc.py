@@ -1,0 +1,54 @@
+"""The clock of a device that states UTC itself."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+_UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
+
+
+def from_device_utc(
+    sensor: str,
+    epochs: Iterable[tuple[int, int, FloatArray, FloatArray]],
+    *,
+    sampling_rate: float,
+    moved: float,
+) -> Clock:
+    """Return the clock that the device states; at the nominal rate, if that agrees with it.
+
+    Parameters
+    ----------
+    sensor : str
+        Its name.
+    epochs : iterable of (int, int, float64, float64)
+        Of each its first sample and the one after its last; samples and their times in s.
+    sampling_rate : float
+        Nominal, in Hz.
+    moved : float
+        Seconds by which the times are shifted.
+    """
+    found = []
+    for first, end, index, stated in epochs:
+        nodes, late = index, stated - index / sampling_rate
+        if np.ptp(late) < _UTC_TOLERANCE:
+            nodes, late = np.array([first, max(end, first + 1)], dtype=float), np.full(2, late[0])
+        found.append(Epoch(first, end, nodes, nodes / sampling_rate + late + moved))
+    ppm, wander = 0.0, 0.0
+    if any(len(epoch.index) > 2 for epoch in found):
+        longest = max(found, key=lambda epoch: epoch.end_sample - epoch.first_sample)
+        rates = np.diff(longest.index) / np.diff(longest.seconds) / sampling_rate
+        ppm, wander = float(rates.mean() - 1) * 1e6, float(rates.std()) * 1e6
+    source = ClockSource.DEVICE_UTC
+    state = ClockState(sensor, source, found[0].start, ppm, 0.0, wander, 0.0, len(found))
+    return Clock(tuple(found), state)
