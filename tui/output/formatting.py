@@ -20,6 +20,7 @@ _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n"}
 _PREFIXED = {"m/s²", "m/s", "m", "g", "Gal", "V", "rad"}
 """Units that take a prefix."""
 _MOST_DECIMALS = 3
+_NO_NUMBER = "?"
 
 
 def utc(ns: int) -> str:
@@ -102,15 +103,16 @@ def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
 
     The unit gets the SI prefix, or the power of ten where it takes none, with which the largest
     reading is between 1 and 1000. All have as many decimals as show three digits of the largest
-    and two of the smallest, but at most three.
+    and two of the smallest, but at most three. Readings that are no finite number are "?".
     """
     own = next((n for n, prefix in _PREFIXES.items() if n and unit.removeprefix(prefix) != unit), 0)
     base = unit.removeprefix(_PREFIXES[own])
     if base not in _PREFIXED:
         base, own = unit, 0
-    exponents = [math.floor(math.log10(abs(value))) for value in values if value]
+    known = [abs(value) for value in values if value and math.isfinite(value)]
+    exponents = [math.floor(math.log10(value)) for value in known]
     if not exponents:
-        return ["0"] * len(values), unit
+        return ["0" if value == 0 else _NO_NUMBER for value in values], unit
     takes_prefix = base in _PREFIXED
     largest = 3 * ((max(exponents) + own) // 3)
     if takes_prefix:
@@ -123,7 +125,9 @@ def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:
     texts = []
     for value in values:
         text = signed(value * 10.0 ** (own - shift), f".{decimals}f")
-        if value and not any(digit in text for digit in "123456789"):
+        if not math.isfinite(value):
+            text = _NO_NUMBER
+        elif value and not any(digit in text for digit in "123456789"):
             text = f"<{least:.{decimals}f}" if value > 0 else f">−{least:.{decimals}f}"
         texts.append(text)
     if takes_prefix:

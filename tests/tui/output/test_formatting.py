@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from tui.output.formatting import readings
@@ -22,6 +24,8 @@ from tui.output.formatting import readings
         ([1e-5, 2e-5], "°", ["10.0", "20.0"], "10⁻⁶ °"),
         ([123456.0, 5.0], "counts", ["123456.0", "5.0"], "counts"),
         ([], "m", [], "m"),
+        ([math.nan, 2e-3, -math.inf], "m/s²", ["?", "2.00", "?"], "mm/s²"),
+        ([math.nan, 0.0], "m/s²", ["?", "0"], "m/s²"),
     ],
 )
 def test_readings_share_a_notation(
