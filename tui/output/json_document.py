@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from daq.bench.estimate_settings import table_keys
 from daq.results.band_summary import band_of, channel_means, data_means
 from estimator.diagnostics.advice import Advice
+from estimator.diagnostics.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from tui.output.advice.sentences import Names, explain
 from tui.output.json_values import plain
@@ -260,6 +261,7 @@ def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
         "bands": found.bands,
         "responses": found.responses,
         "advice": [_advice(each, names) for each in found.advice],
+        "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
         "stability": found.stability,
         "n_factors": found.n_factors,
         "pairs": [(sensors[one], sensors[two]) for one, two in found.pairs],

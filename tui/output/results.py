@@ -125,7 +125,7 @@ def remarks(snapshot: Snapshot) -> list[str]:
         lines.append(f"clocks {rates}, aligned to about {within} µs")
     if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
         lines.append(f"no estimate above {limit:.4g} Hz, where resampling attenuates")
-    lines += [*faulty_channels(snapshot), *_not_searched(snapshot)]
+    lines += [*faulty_channels(snapshot), *not_searched(snapshot)]
     if "two-channel" in snapshot.results:
         lines.append(
             "two-channel: assumes that like channels are parallel and have equal gains, or those "
@@ -144,7 +144,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
     return lines
 
 
-def _not_searched(snapshot: Snapshot) -> list[str]:
+def not_searched(snapshot: Snapshot) -> list[str]:
+    """Return remarks on what the diagnosis left out."""
     n = len(snapshot.channels)
     if n <= MAX_CHANNELS:
         return []

@@ -16,7 +16,7 @@ from estimator.diagnostics.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.output.advice.diagnostics import summary, why_untested
 from tui.output.formatting import several, span, utc
-from tui.output.results import faulty_channels, left_out
+from tui.output.results import faulty_channels, left_out, not_searched
 from tui.output.vocabulary import clock_source
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
@@ -224,7 +224,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
     return Section("Clocks", tuple(parts))
 
 
-def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
+def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     """Return what happened while recording, and which segments were used."""
     text = f"{several(snapshot.n_segments, 'segment')} used"
     text += f" ({snapshot.n_effective:.0f} effective averages)."
@@ -238,11 +238,11 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
             gaps = several(sensor.n_gaps, "gap")
             missing = several(sensor.n_missing, "sample")
             parts.append(Paragraph(f"{sensor.name}: {gaps}, {missing} missing.", "doubtful"))
-    happenings = [each for source in found for each in source.happenings]
-    if not happenings:
+    logged_events = [each for source in found for each in source.logged_events]
+    if not logged_events:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
         return Section("What happened", tuple(parts))
-    together = _together(happenings)
+    together = _together(logged_events)
     rows = [
         (
             _when(each.utc_ns),
@@ -272,7 +272,7 @@ def happenings_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
 
 def advice_section(snapshot: Snapshot) -> Section:
     """Return what to know and to do."""
-    lines = [*faulty_channels(snapshot), *summary(snapshot)]
+    lines = [*faulty_channels(snapshot), *not_searched(snapshot), *summary(snapshot)]
     if not lines:
         return Section("Advice", (Paragraph("Nothing to remark."),))
     return Section("Advice", (Items(tuple(map(Paragraph, lines))),))
@@ -317,9 +317,9 @@ def _clock_row(
     )
 
 
-def _together(happenings: Sequence[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:
+def _together(logged_events: Sequence[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:
     """Return what happened in time order: how often, until when; alike ones together if many."""
-    ordered = sorted(happenings, key=lambda each: each.utc_ns)
+    ordered = sorted(logged_events, key=lambda each: each.utc_ns)
     if len(ordered) <= LISTED:
         return [(each, 1, each.utc_ns) for each in ordered]
     alike: dict[tuple[str, str], tuple[LoggedEvent, int, int]] = {}

@@ -17,7 +17,9 @@ from daq.results.sources import sources
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import Reported, Words, tables, texts_of
 from tui.cli.main import app
+from tui.output.json_document import result_document
 from tui.report.contents import report_of
+from tui.report.evidence import advice_section
 from tui.report.figures.drift import without_line
 
 if TYPE_CHECKING:
@@ -152,3 +154,19 @@ def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> N
     assert "night.h5" in text
     assert "second.h5" in text
     assert f"{2 * reported.snapshot.n_segments} segments used" in text
+
+
+def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
+    reported: Reported, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = estimate([reported.recording])
+    plain, searched = advice_section(snapshot), result_document(snapshot, "three-sensor")
+    for module in ("results", "json_document"):
+        monkeypatch.setattr(f"tui.output.{module}.MAX_CHANNELS", 2)
+    words = "noise that two channels share is not searched for among more than 2 channels"
+    assert words in str(advice_section(snapshot))
+    assert words not in str(plain)
+    assert searched["diagnostics"]["shared_noise_searched"] is True
+    assert (
+        result_document(snapshot, "three-sensor")["diagnostics"]["shared_noise_searched"] is False
+    )
