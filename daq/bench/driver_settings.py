@@ -23,7 +23,7 @@ def settings_of(model: type[BaseModel]) -> list[dict[str, str]]:
     schema = model.model_json_schema()
     required = schema.get("required", ())
     definitions = schema.get("$defs", {})
-    meanings = docstrings(model)
+    meanings = _docstrings(model)
     return [
         {
             "name": name,
@@ -35,7 +35,12 @@ def settings_of(model: type[BaseModel]) -> list[dict[str, str]]:
     ]
 
 
-def docstrings(model: type[BaseModel]) -> dict[str, str]:
+def meaning_of(model: type[BaseModel], name: str) -> str:
+    """Return what a field means, in one line; empty if nothing says so."""
+    return _plain(model.model_fields[name].description or _docstrings(model).get(name, ""))
+
+
+def _docstrings(model: type[BaseModel]) -> dict[str, str]:
     """Return the docstring of each field that has one; none if there is no source."""
     found: dict[str, str] = {}
     for each in reversed(model.__mro__):

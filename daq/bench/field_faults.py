@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import difflib
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from pydantic import BaseModel
 
+from daq.bench.driver_settings import meaning_of
 from daq.bench.estimate_settings import EstimateSettings
 from daq.bench.model import EstimateTable
 from daq.errors import ABSENT, FileFault
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from pydantic import ValidationError
-    from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
 
 _EXPECTED = {
@@ -73,19 +73,20 @@ def field_faults(
             other != location and other[: len(location)] == location for other in places
         ):
             continue
-        expected = _expectation(details, _fields(model, location[:-1]))
+        expected = _expectation(details, _model_at(model, location[:-1]))
         key, owner = _place(table, location, path, sensor)
         # The value of a whole table would repeat the file.
         is_shown = kind != "missing" and not isinstance(value, dict | BaseModel)
         yield FileFault(key, expected, value if is_shown else ABSENT, owner)
 
 
-def _expectation(details: ErrorDetails, known: Mapping[str, FieldInfo]) -> str:
-    """Return the expectation; ``known`` are the fields of the table with the wrong key."""
+def _expectation(details: ErrorDetails, model: type[BaseModel] | None) -> str:
+    """Return the expectation; ``model`` is that of the table with the wrong key."""
     kind, context = details["type"], details.get("ctx", {})
     name = str(details["loc"][-1]) if details["loc"] else ""
+    known = {} if model is None else model.model_fields
     field = known.get(name)
-    description = field.description if field is not None else None
+    description = "" if model is None or field is None else meaning_of(model, name).rstrip(".")
     if kind == "missing":
         return f"is missing; expected {description or 'a value'}"
     if kind == "extra_forbidden":
@@ -100,20 +101,20 @@ def _expectation(details: ErrorDetails, known: Mapping[str, FieldInfo]) -> str:
     return details["msg"] if template is None else template.format(**context)
 
 
-def _fields(model: type[BaseModel], location: Sequence[int | str]) -> dict[str, FieldInfo]:
-    """Return the fields of the table at ``location``; empty for an unknown table."""
-    current: Any = model
+def _model_at(model: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel] | None:
+    """Return the model of the table at ``location``; None for an unknown table."""
+    current = model
     for step in location:
         if isinstance(step, int):
             continue
         field = current.model_fields.get(step)
         if field is None:
-            return {}
+            return None
         found = _model_in(field.annotation)
         if found is None:
-            return {}
+            return None
         current = found
-    return dict(current.model_fields)
+    return current
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:

@@ -53,8 +53,10 @@ class SeedLinkSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    network: Code = Field(description='Code of the network, such as ``"GE"``.')
-    station: Code = Field(description="Code of the station.")
+    network: Code
+    """Code of the network, such as ``"GE"``."""
+    station: Code
+    """Code of the station."""
     location: Annotated[str, Field(pattern=r"^(\*|--|[A-Z0-9?]{2})$")] = "*"
     """Location code, ``"--"`` if blank, ``"*"`` for any; ``?`` matches any character."""
     channels: Annotated[tuple[ChannelPattern, ...], Strict(strict=False)] | None = None

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from daq.bench.driver_settings import settings_of
+from daq.bench.field_faults import field_faults
 from daq.drivers.registry import driver_names, driver_type
 
 
@@ -58,5 +62,26 @@ def test_a_model_without_source_has_settings_without_meaning() -> None:
 @pytest.mark.parametrize("name", driver_names())
 def test_a_recorder_does_not_read_the_source_of_its_driver(name: str) -> None:
     """Pydantic would, when a driver is imported: a thirtieth of the start of a recorder."""
-    assert not driver_type(name).settings.model_config.get("use_attribute_docstrings")
+    code = (
+        "import inspect\n"
+        "def refused(*_): raise AssertionError('read the source')\n"
+        "inspect.getsource = inspect.getsourcelines = inspect.findsource = refused\n"
+        "from daq.drivers.registry import driver_type\n"
+        f"driver_type({name!r}).settings.model_fields"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
     assert any(meanings(driver_type(name).settings).values())
+
+
+def test_a_missing_setting_is_named_with_its_meaning() -> None:
+    class Settings(BaseModel):
+        """Settings with one that has no default."""
+
+        rate: int
+        """Samples a second,
+        in ``Hz``."""
+
+    with pytest.raises(ValidationError) as caught:
+        Settings.model_validate({})
+    (fault,) = field_faults(caught.value, Settings, {})
+    assert fault.expected == "is missing; expected Samples a second, in Hz"
