@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import takewhile
 from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError, RecordingError
 from daq.recording.control import ask
 from daq.recording.reader import Recording
-from daq.recording.storage.names import continuation_names, continued_name
+from daq.recording.storage.names import continuations, continued_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +37,7 @@ def first_part(path: Path) -> Path:
     start = continued_name(path)
     if not continues or start is None:
         return path
-    names = takewhile(lambda name: name != path, continuation_names(start))
-    parts = dict(_part(name) for name in (start, *names))
+    parts = dict(_part(name) for name in (start, *continuations(start)) if name != path)
     first = path
     while continues in parts:
         first, continues = parts.pop(continues)

@@ -28,8 +28,8 @@ PRIVATE = 0o600
 CONTINUES = "continues"
 """Attribute of a recording that continues another after a disk error: the run_id of the other."""
 _STALE_SECONDS = 10.0
-"""Age in s from which a temporary file without a writer is a leftover: a new one has no lock yet,
-for less than a millisecond."""
+"""Age in s from which a temporary file without a lock is a leftover. A writer locks its file within
+a millisecond; ten seconds allow for a computer that is suspended or overloaded in between."""
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
 
 
@@ -78,6 +78,12 @@ def taken(path: Path) -> RecordingError:
 def continuation_names(path: Path) -> Iterator[Path]:
     """Yield the possible names of continuations of a recording, in order."""
     return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+
+
+def continuations(path: Path) -> list[Path]:
+    """Return the files that have names of continuations of a recording, in any order."""
+    named = path.parent.glob(f"{glob.escape(path.stem)}-*{glob.escape(path.suffix)}")
+    return [each for each in named if continued_name(each) == path]
 
 
 def continued_name(path: Path) -> Path | None:
