@@ -101,6 +101,8 @@ class Estimation:
             self._sensors = live_sensors(first, self.settings) if live else None
             self._passes = [self._pass(recording) for recording in self._recordings]
             check_same(self._passes)
+            if not live:
+                announce(self._passes[0].n_channels, self._passes[0].welch)
             aligned = self._passes[0].aligned
             unit = canonical(self.settings.unit or aligned.channels[0][1].unit)
             self._equalisation = Equalisation(
@@ -228,8 +230,6 @@ class Estimation:
         self._continue()
         for each in self._passes:
             each.aligned.refresh()
-        first = self._passes[0]
-        announce(first.n_channels, first.welch.sampling_rate, self.settings.segment)
         is_exact = all(each.aligned.is_exact for each in self._passes)
         if not is_exact:
             self._equalisation.reset()

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 INTERVAL = 20.0
 """Seconds between returns, at least."""
 LARGE = 1 << 21
-"""Bytes from which an array gets a mapping of its own. Mappings cost system time where many
-segments come at once, in the result: of 2 h of three triaxial sensors 2 s before, 8 s by this, 14 s
-from 128 kB on; the peaks are 237, 187 and 181 MB. Live, arrays are smaller."""
+"""Size in bytes from which an array gets a mapping of its own. Mappings cost system time. Estimate
+of 2 h of three triaxial sensors: 2 s without mappings, 8 s with this limit, 14 s with 128 kB; the
+peaks are 237, 187 and 181 MB. Arrays of a live estimate are smaller."""
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of malloc.h
 _HEAPS = 2
 

@@ -18,6 +18,7 @@ from estimator.diagnostics.shared_noise import MAX_CHANNELS
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
     from daq.recording.interface import ReadableRecording
+    from estimator.spectra.welch import WelchSettings
 
 _LOGGER = logging.getLogger(__name__)
 MATRICES = 9
@@ -27,10 +28,10 @@ PAIR_TABLES = 27
 LARGE = 1e9
 """Bytes from which on an estimate is announced, and is not live with all sensors."""
 PART_BYTES = 100e6
-"""That an estimate of a part of the sensors may take, at most; it is not diagnosed, and takes
-less."""
+"""Bytes that the matrices of a live estimate of a part of the sensors may take, by the prediction
+of a diagnosed one: such an estimate is not diagnosed."""
 MIN_SENSORS = 3
-"""That it has in any case."""
+"""Minimum number of sensors in a live estimate."""
 
 
 def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
@@ -44,26 +45,30 @@ def bytes_of(n_channels: int, sampling_rate: float, segment: float) -> float:
     segment : float
         In seconds.
     """
-    matrices = MATRICES * 16.0 * (segment * sampling_rate / 2 + 1) * n_channels**2
     n_pairs = n_channels * (n_channels - 1) / 2 if n_channels <= MAX_CHANNELS else 0.0
-    return matrices + PAIR_TABLES * 8.0 * n_pairs**2
+    return _matrices(n_channels, sampling_rate, segment) + PAIR_TABLES * 8.0 * n_pairs**2
+
+
+def _matrices(n_channels: int, sampling_rate: float, segment: float) -> float:
+    return MATRICES * 16.0 * (segment * sampling_rate / 2 + 1) * n_channels**2
 
 
 def live_sensors(recording: ReadableRecording, settings: Settings) -> tuple[str, ...] | None:
     """Return the sensors of a live estimate: the first ones; None where that is all of them."""
     rate = settings.sampling_rate or min(each.sampling_rate for each in recording.sensors)
-    n_channels = accumulate(len(main_columns(record)) for record in recording.sensors)
-    needed = [bytes_of(n, rate, settings.segment) for n in n_channels]
-    if needed[-1] <= LARGE:
+    n_channels = [*accumulate(len(main_columns(record)) for record in recording.sensors)]
+    if bytes_of(n_channels[-1], rate, settings.segment) <= LARGE:
         return None
-    n_sensors = max(MIN_SENSORS, bisect_right(needed, PART_BYTES))
+    matrices = [_matrices(n, rate, settings.segment) for n in n_channels]
+    n_sensors = max(MIN_SENSORS, bisect_right(matrices, PART_BYTES))
     names = tuple(record.name for record in recording.sensors)
     return names[:n_sensors] if n_sensors < len(names) else None
 
 
-def announce(n_channels: int, sampling_rate: float, segment: float) -> None:
+def announce(n_channels: int, welch: WelchSettings) -> None:
     """Log how much memory a large estimate is about to take."""
-    needed = bytes_of(n_channels, sampling_rate, segment)
+    rate = welch.sampling_rate
+    needed = bytes_of(n_channels, rate, welch.segment_length / rate)
     if needed > LARGE:
         _LOGGER.warning(
             "the result of %d channels takes about %.0f GB of memory;"

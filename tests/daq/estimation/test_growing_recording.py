@@ -17,6 +17,7 @@ from tests.tui.example_snapshot import SETTINGS, growing
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import pytest
     from numpy.typing import NDArray
 
 
@@ -68,3 +69,16 @@ def test_what_overlaps_is_read_once_as_long_as_clocks_stay(tmp_path: Path) -> No
                 expected = AlignedRecording.read(aligned, 200 * number, 200 * number + 400)
                 np.testing.assert_array_equal(samples, expected[0])
                 np.testing.assert_array_equal(valid, expected[1])
+
+
+def test_a_large_estimate_is_announced_before_it_starts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.estimation.segments.memory.LARGE", 1.0)
+    with growing(tmp_path / "run.h5") as writer:
+        Bench(writer).send("ABC", 3)
+        with Estimation([writer.path], SETTINGS):
+            assert "takes about" in caplog.text
+        caplog.clear()
+        with Estimation([writer.path], SETTINGS, live=True):
+            assert not caplog.text

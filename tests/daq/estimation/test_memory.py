@@ -76,11 +76,12 @@ def test_a_clock_is_smoothed_with_one_set_of_states() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_channels", "measured"),
-    [(48, 596e6), (72, 522e6)],  # of docs/validation/torture.md, without the program
+    ("n_channels", "measured", "most"),
+    [(48, 596e6, 1.2), (72, 522e6, 5.0)],  # the second with too few averages for tables of pairs
 )
-def test_the_memory_of_a_result_is_predicted(n_channels: int, measured: float) -> None:
-    assert 0.9 * measured < bytes_of(n_channels, 200.0, 10.0) < 5 * measured
+def test_the_memory_of_a_result_is_predicted(n_channels: int, measured: float, most: float) -> None:
+    """Measured values are those of docs/validation/torture.md, without the program."""
+    assert 0.9 * measured < bytes_of(n_channels, 200.0, 10.0) < most * measured
 
 
 def test_more_channels_than_have_tables_of_pairs_take_matrices_alone() -> None:
