@@ -44,7 +44,7 @@ FILTER_SEGMENTS = 240
 """Segments of each recording, from its start, that filters are found from."""
 ROUNDS = 3
 METHOD = "three-sensor"
-"""Whose noise the leakage is compared with: it takes little time."""
+"""Method of the noise with which leakage is compared: it takes little time."""
 _ASSUMED_SNR = 1e6  # of known responses that differ
 _PREDICTION = 0.2  # above 0.14, the noise of a prediction under Hann (`ChannelResponses.leakage`)
 _EQUAL = 1e-6  # mean leakage by known responses, as a share, that is not worth a filter
@@ -202,8 +202,7 @@ class Equalisation:
         if self.filters is not None:
             own = self.filters.response(frequency)
             response = response * own
-            plain = self._leaks(bands, filters=own)
-            whole = found if plain is None else plain
+            whole = self._leaks(bands, found.noise, filters=own)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.abs(response) ** -2.0
         share = np.concatenate([_unseen(band) for band in bands])[:, None]
@@ -233,15 +232,15 @@ class Equalisation:
         """Return what leaks; the averages of the last round are often those of the result."""
         key = _key(bands)
         if key != self._found[0]:
-            self._found = key, self._leaks(bands)
+            noise = self._noise(bands)
+            self._found = key, None if noise is None else self._leaks(bands, noise)
         return self._found[1]
 
-    def _leaks(self, bands: Sequence[Band], filters: ComplexArray | None = None) -> _Leaks | None:
-        """Return what leaks, or would leak without the filters of this response."""
+    def _noise(self, bands: Sequence[Band]) -> tuple[SelfNoise, ...] | None:
+        """Return the noise of each band, as filtered; None if there is too little data."""
         if len(self._dims) < 3 or not bands:
             return None
-        parts: list[_Leaks] = []
-        at = 0
+        found = []
         for band in bands:
             try:
                 with np.errstate(invalid="ignore", divide="ignore"):
@@ -254,6 +253,19 @@ class Equalisation:
                     )
             except InsufficientDataError:
                 return None
+            found.append(result)
+        return tuple(found)
+
+    def _leaks(
+        self,
+        bands: Sequence[Band],
+        noise_of_bands: tuple[SelfNoise, ...],
+        filters: ComplexArray | None = None,
+    ) -> _Leaks:
+        """Return what leaks, or would leak without the filters of this response."""
+        parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        at = 0
+        for band, result in zip(bands, noise_of_bands, strict=True):
             noise = result.noise_psd
             motion = np.einsum("fpp->fp", band.csm).real - noise
             csm = band.csm
@@ -270,14 +282,8 @@ class Equalisation:
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
             share = share - _noise_of_prediction(band, factor)
             least = significant_minimum(share, deviation, band.frequencies)
-            parts.append(_Leaks((result,), motion, left, least))
-        return _Leaks(
-            tuple(each for part in parts for each in part.noise),
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("motion_psd", "left", "share")
-            ),
-        )
+            parts.append((motion, left, least))
+        return _Leaks(noise_of_bands, *map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _key(bands: Sequence[Band]) -> tuple[tuple[float, bytes], ...]:
