@@ -67,7 +67,7 @@ class Source:
         recorder that was killed, and not repaired since.
     bench : Bench or None
     sensors : tuple of RecordedSensor
-    happenings : tuple of LoggedEvent
+    logged_events : tuple of LoggedEvent
         In time order.
     """
 
@@ -83,7 +83,7 @@ class Source:
     state: State
     bench: Bench | None
     sensors: tuple[RecordedSensor, ...]
-    happenings: tuple[LoggedEvent, ...]
+    logged_events: tuple[LoggedEvent, ...]
 
 
 def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
@@ -110,13 +110,13 @@ def _source(recording: Recording, *, continued: bool) -> Source:
         (int(s.blocks[-1:]["utc_ns"][0]) for s in recording.sensors if len(s.blocks)),
         default=created,
     )
-    happenings = [
+    logged_events = [
         LoggedEvent(event.received.utc_ns, event.sensor, event.kind, event.text)
         for event in recording.events
     ]
     for sensor in recording.sensors:
-        happenings += _gaps(sensor, created)
-    happenings.sort(key=lambda each: each.utc_ns)
+        logged_events += _gaps(sensor, created)
+    logged_events.sort(key=lambda each: each.utc_ns)
     state: State = "closed"
     if not recording.closed:
         state = "continued" if continued else "left open"
@@ -145,7 +145,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
             )
             for sensor in recording.sensors
         ),
-        happenings=tuple(happenings),
+        logged_events=tuple(logged_events),
     )
 
 

@@ -39,9 +39,10 @@ class HostSleep:
     def breaks(self, index: IntArray, late: FloatArray, restarts: BoolArray) -> BoolArray:
         """Return which blocks are the first after a restart or a sleep, shape (n_blocks,).
 
-        One is the first after a sleep if its lateness is below that of all blocks of this stretch
-        of `_HELD_UP` and the one before, even if the rate is off. So late blocks do not make the
-        next one early, unless all before it are late: those of the first `_STARTING` may be.
+        A block is the first after a sleep if its lateness is lower than that of all earlier blocks
+        in its own and the previous stretch of `_HELD_UP` seconds, even if the rate is off. So late
+        blocks do not make the next one early, unless all before it are late. In the first
+        `_STARTING` seconds after a restart they may be: a sleep there is not found.
 
         Parameters
         ----------
@@ -50,7 +51,8 @@ class HostSleep:
         late : float64, shape (n_blocks,)
             Lateness in s.
         restarts : bool, shape (n_blocks,)
-            Whether the device's clock has started anew: lateness before tells nothing.
+            Whether the device's clock restarted with this block. The lateness of earlier blocks is
+            then not comparable.
         """
         raised = late + _RATE_OFF * index / self.sampling_rate
         stretch = index // round(_HELD_UP * self.sampling_rate)

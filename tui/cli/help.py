@@ -78,7 +78,7 @@ class _Converter:
         return self
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the value; that of typer if none is given."""
+        """Return what typer makes of a value; without one None, or () if several may be given."""
         if value is None:
             return () if param.multiple or param.nargs == -1 else None
         return self._of_typer().coerce(value, param=param, ctx=ctx)

@@ -14,7 +14,7 @@ from tui.report.evidence import (
     advice_section,
     alignment_section,
     clocks_section,
-    happenings_section,
+    events_section,
     model_test_section,
 )
 from tui.report.noise import limits_section, noise_section, verdict
@@ -86,7 +86,7 @@ def report_of(
         model_test_section(snapshot, settings),
         alignment_section(snapshot),
         clocks_section(snapshot, settings),
-        happenings_section(snapshot, found),
+        events_section(snapshot, found),
         _settings_section(snapshot, settings),
         Section(
             "Signed off",

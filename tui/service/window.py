@@ -80,7 +80,7 @@ class Window:
         self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
         self._folder, self._min_free, self._shortest = folder, min_free, shortest
         self.status: dict[str, Any] | None = None
-        """What the recorder last is_logged of itself and its sensors."""
+        """Latest status that the recorder reported of itself and its sensors; None before."""
         self.progressed_at: float | None = None
         """Time of the event loop at which the recorder last made progress; None before."""
 

@@ -40,7 +40,7 @@ TimeFormat: TypeAlias = Literal["witmotion", "uint32-s", "uint32-ms", "uint32-us
 MAX_REGISTERS = 125
 """Maximum number of registers in one Modbus reply."""
 N_ADDRESSES = 65536
-GATHER = 0.25
+BLOCK_DURATION = 0.25
 """Host time per block, s."""
 GAP = 2.5
 """Minimum gap, in sample periods: polls jitter, so that one reading may be late."""
@@ -273,7 +273,7 @@ class RegisterDecoder:
         self._sensor = sensor
         self._map = registers
         self._period_ns = 1e9 / sampling_rate
-        self._gather = max(1, round(GATHER * sampling_rate))
+        self._gather = max(1, round(BLOCK_DURATION * sampling_rate))
         self._rows: list[Sequence[int]] = []
         self._sent: list[int] = []
         self._received: list[int] = []

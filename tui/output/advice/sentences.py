@@ -277,8 +277,8 @@ def _motion_across(advice: MotionAcross, names: Names) -> Explanation:
 def _missing_dimension(advice: MissingDimension, names: Names) -> Explanation:
     del names
     return Explanation(
-        f"At {where(advice)} motion is found in only {advice.n_dimensions:.0f} of "
-        f"{advice.n_channels} dimensions, and is weaker than can be found in the others: the "
+        f"At {where(advice)} motion is significant in only {advice.n_dimensions:.0f} of "
+        f"{advice.n_channels} dimensions; in the others it is absent or too weak to detect. The "
         "three-sensor estimate stays unbiased but scatters more.",
         "Choose the dimension from the data (--dimension auto), or excite the floor in all "
         "directions.",

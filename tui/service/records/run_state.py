@@ -166,7 +166,7 @@ class Run:
         return replace(self, state=state, **changes)
 
     def because(self, reason: str) -> Run:
-        """Return the run with further reasons, separated by semicolons; each is reasons once."""
+        """Return the run with further reasons, separated by semicolons, without repetitions."""
         reasons = [*(self.reason.split("; ") if self.reason else []), *reason.split("; ")]
         return replace(self, reason="; ".join(dict.fromkeys(reasons)))
 

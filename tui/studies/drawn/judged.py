@@ -12,7 +12,7 @@ from estimator.self_noise.band_means import band_edges
 from tui.studies.study import Panel, Point, Series, Study
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping, Sequence
 
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
@@ -46,7 +46,7 @@ class Judged:
         settings: Settings,
         *,
         noise_psd: FloatArray,
-        bands: Iterable[tuple[float, float]],
+        bands: Sequence[tuple[float, float]],
         snr: float,
         is_wrong: Mapping[type[Advice], bool],
     ) -> None:

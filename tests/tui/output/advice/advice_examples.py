@@ -253,7 +253,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         MissingDimension(
             level=Level.WARNING, band=BAND, n_dimensions=2.0, n_channels=3, condition=100.0
         ),
-        ("At 2–8 Hz motion is found in only 2 of 3 dimensions", "--dimension auto"),
+        ("At 2–8 Hz motion is significant in only 2 of 3 dimensions", "--dimension auto"),
     ),
     (
         NearlySingular(level=Level.NOTE, band=BAND, condition=123.0),
