@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
-BLOCK_VALUES = 2**21  # maximum number of values per group: 16 MB
+BLOCK_VALUES = 2**20  # maximum number of values per group: 8 MB
+FEW_GROUPS = 4
 FREQUENCIES_PER_BLOCK = 512
 PRODUCT_VALUES = 2**22  # maximum number of values of products of channels at a time: 32 MB
 THREADS = 2
@@ -204,9 +205,9 @@ class CrossSpectra:
         trend = np.empty((block, len(self._fit), n_channels))
         # Real and imaginary parts as 2 n_channels real numbers: their Gram matrix is symmetric,
         # so that BLAS does half the work. It takes twice the memory of `total`, and is kept only
-        # where several groups of segments add up.
-        several = len(starts) > block
-        gram = np.zeros((n_freqs if several else 0, 2 * n_channels, 2 * n_channels))
+        # where many groups of segments add up.
+        many = len(starts) > FEW_GROUPS * block
+        gram = np.zeros((n_freqs if many else 0, 2 * n_channels, 2 * n_channels))
         step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // (2 * n_channels) ** 2))
         pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
         single: list[ComplexArray] = []
@@ -229,11 +230,11 @@ class CrossSpectra:
                 products = np.matmul(
                     parts[:, some].transpose(1, 2, 0), parts[:, some].swapaxes(0, 1)
                 )
-                if several:
+                if many:
                     gram[some] += products
                 else:
                     _add_gram(total[some], products)
-        if several:
+        if many:
             for some in pieces:
                 _add_gram(total[some], gram[some])
         return single

@@ -27,7 +27,7 @@ PAIR_TABLES = 27
 """Tables of all pairs of channels by all pairs that exist at the same time: some 20 bands."""
 LARGE = 1e9
 """Bytes from which on an estimate is announced, and is not live with all sensors."""
-PART_BYTES = 100e6
+PART_BYTES = 60e6
 """Bytes that the matrices of a live estimate of a part of the sensors may take, by the prediction
 of a diagnosed one: such an estimate is not diagnosed."""
 MIN_SENSORS = 3
