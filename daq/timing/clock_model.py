@@ -302,8 +302,11 @@ class Clock:
         evaluate: Callable[[Epoch, FloatArray], FloatArray],
     ) -> FloatArray:
         out = np.empty(len(values))
-        for number in np.unique(which).tolist():
-            rows = which == number
+        order = np.argsort(which, kind="stable")
+        numbers, begins = np.unique(which[order], return_index=True)
+        ends = [*begins[1:].tolist(), len(order)]
+        for number, begin, end in zip(numbers.tolist(), begins.tolist(), ends, strict=False):
+            rows = order[begin:end]
             out[rows] = evaluate(self.epochs[number], values[rows])
         return out
 
