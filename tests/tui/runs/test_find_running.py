@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from daq.recording.reader import Recording
 from daq.recording.storage.names import continuation_names, continued_name
 from tests.tui.example_snapshot import growing
 from tui.runs.find_running import first_part
@@ -62,3 +63,19 @@ def test_names_of_continuations_lead_back() -> None:
     assert {continued_name(next(names)) for _ in range(20)} == {path}
     others = ("run.h5", "run-1.h5", "run-02.h5", "run-x.h5", "-2.h5", "run-20261123T080000Z.h5")
     assert [continued_name(Path(name)) for name in others] == [None] * len(others)
+
+
+def test_a_name_that_ends_in_a_date_costs_no_more_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, second = parts_in(tmp_path, "run.h5", "run-20261123.h5")
+    opened: list[Path] = []
+    open_recording = Recording.open
+
+    def counted(path: Path) -> Recording:
+        opened.append(path)
+        assert len(opened) < 10
+        return open_recording(path)
+
+    monkeypatch.setattr(Recording, "open", counted)
+    assert first_part(second) == tmp_path / "run.h5"
