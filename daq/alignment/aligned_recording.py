@@ -26,7 +26,7 @@ from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterable
 
     from numpy.typing import NDArray
 
@@ -144,8 +144,9 @@ class AlignedRecording:
 
     @property
     def is_exact(self) -> bool:
-        """Whether every sensor's samples are on the grid, so that no clock was estimated."""
-        return self._untouched and not any(source.offset_in_doubt for source in self._sources)
+        """Whether every sensor's samples are on the grid, so that no clock is estimated."""
+        doubted = any(source.offset_in_doubt or source.doubted for source in self._sources)
+        return self._untouched and not doubted
 
     @property
     def usable(self) -> float:
@@ -196,11 +197,27 @@ class AlignedRecording:
         seen = {self._sources[reference].clock_name}
         free = []
         for number, source in enumerate(self._sources):
-            known = source.device_utc or source.polled or number == reference
-            if not known and (source.clock_name not in seen or source.offset_in_doubt):
+            stated = source.device_utc and not source.doubted
+            known = stated or source.polled or number == reference
+            doubted = source.offset_in_doubt or source.doubted
+            if not known and (source.clock_name not in seen or doubted):
                 free.append(number)
                 seen.add(source.clock_name)
         return (reference, *free) if free else ()
+
+    @property
+    def stated(self) -> tuple[int, ...]:
+        """Indices of sensors that state UTC and have not been doubted, one per clock."""
+        stated = [n for n, each in enumerate(self._sources) if each.device_utc and not each.doubted]
+        first_of = {self._sources[number].clock_name: number for number in reversed(stated)}
+        return tuple(sorted(first_of.values()))
+
+    def doubt(self, sensors: Iterable[int]) -> None:
+        """Refine the UTC that sensors, and others of their clocks, state."""
+        names = {self._sources[number].clock_name for number in sensors}
+        for source in self._sources:
+            source.doubted |= source.device_utc and source.clock_name in names
+        self._lay_grid()
 
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays
@@ -309,8 +326,8 @@ class AlignedRecording:
         if not self._sources:
             if any(record.n_samples == 0 for record in self._records):
                 return
-            at = self._recording.created_at
-            self._origin = (at.monotonic_ns, at.utc_ns)
+            created = self._recording.created_at
+            self._origin = (created.monotonic_ns, created.utc_ns)
             self._sources = [SensorSource.of(record, *self._origin) for record in self._records]
         for source in self._sources:
             source.refresh()
@@ -326,7 +343,12 @@ class AlignedRecording:
             for source in self._sources:
                 source.clock = source.known_clock.extended(source.end_sample)
         if self._grid is None:
-            self._grid = self._laid()
+            self._lay_grid()
+
+    def _lay_grid(self) -> None:
+        begin, end = (None if at is None else (at - self._origin[1]) * 1e-9 for at in self._wanted)
+        self._end = math.inf if end is None else end
+        self._grid = Grid.laid(self._sources, self.sampling_rate, wanted=begin)
 
     def read(self, start: int, stop: int) -> tuple[FloatArray, BoolArray]:
         """Return grid samples `start` to `stop` (not included).
@@ -364,10 +386,7 @@ class AlignedRecording:
     @property
     def _preferred(self) -> int:
         """Return the index of the best reference: a sensor with its own UTC, else the first."""
-        for number, source in enumerate(self._sources):
-            if source.device_utc:
-                return number
-        return 0
+        return next(iter(self.stated), 0)
 
     @property
     def _untouched(self) -> bool:
@@ -378,21 +397,3 @@ class AlignedRecording:
     def _start(self) -> float:
         """Return the time from the recording's creation to grid sample 0, in s."""
         return 0.0 if self._grid is None else self._grid.start
-
-    def _laid(self) -> Grid:
-        """Return the grid from the start of all sensors on, and set its end."""
-        start_utc_ns, end_utc_ns = self._wanted
-        start = max(source.known_clock.start for source in self._sources)
-        grid = Grid(self.sampling_rate, start)
-        if not all(map(grid.has, self._sources)):
-            start += max(map(grid.reach, self._sources))
-        first = self._sources[0].known_clock
-        if start_utc_ns is not None:
-            wanted = (start_utc_ns - self._origin[1]) * 1e-9
-            if wanted > start:  # the first sensor's next sample
-                epoch = first.epochs[0]
-                index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
-                start = float(epoch.at(index)[0])
-        if end_utc_ns is not None:
-            self._end = (end_utc_ns - self._origin[1]) * 1e-9
-        return Grid(self.sampling_rate, start)

@@ -12,6 +12,8 @@ from daq.alignment.resampling import SPAN, all_present, reach, resample
 from daq.errors import CannotAlignError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from daq.alignment.sensor_reader import SensorSource
@@ -38,6 +40,21 @@ class Grid:
 
     sampling_rate: float
     start: float
+
+    @classmethod
+    def laid(
+        cls, sources: Sequence[SensorSource], sampling_rate: float, *, wanted: float | None
+    ) -> Grid:
+        """Return the grid from the start of all sensors on, or from `wanted` (s) if later."""
+        start = max(source.known_clock.start for source in sources)
+        grid = cls(sampling_rate, start)
+        if not all(grid.has(source) and not source.doubted for source in sources):
+            start += max(map(grid.reach, sources))
+        if wanted is not None and wanted > start:  # the first sensor's next sample
+            epoch = sources[0].known_clock.epochs[0]
+            index = np.ceil(epoch.position(np.array([wanted])) - SNAP)
+            start = float(epoch.at(index)[0])
+        return cls(sampling_rate, start)
 
     def has(self, source: SensorSource) -> bool:
         """Return whether the sensor's samples are on the grid."""

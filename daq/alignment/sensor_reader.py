@@ -13,8 +13,9 @@ from daq.alignment.growing_rows import GrowingRows
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag
 from daq.timing.arrival_times import ArrivalTimes
-from daq.timing.clock_model import MeasuredDelays, OffsetSource, from_instants
+from daq.timing.clock_model import MeasuredDelays, OffsetSource
 from daq.timing.quantiles import median
+from daq.timing.sample_instants import from_instants
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -61,6 +62,8 @@ class SensorSource:
     runs: list[_Run] = field(default_factory=list)
     n_blocks: int = 0
     device_utc: bool = False
+    doubted: bool = False
+    """Whether its stated UTC drifts against the motion, and is refined as arrival times are."""
     polled: bool = False
     clock: Clock | None = None
     learnt: GrowingRows[np.float64] = field(default_factory=lambda: GrowingRows(np.float64, 4))
@@ -173,7 +176,7 @@ class SensorSource:
 
     def measured(self, reference: Clock) -> MeasuredDelays | None:
         """Return the sample times that follow from measured delays against the reference."""
-        if not self.learnt:
+        if not self.learnt and not self.doubted:
             return None
         found = self.learnt.values  # of segments with gaps after those without
         index, at_reference, delay, std = found[np.argsort(found[:, 0], kind="stable")].T

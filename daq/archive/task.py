@@ -109,6 +109,7 @@ def _archived(task: Task) -> Outcome:
         with SpectraWriter(Path(task.target), n_freqs=n_freqs, n_channels=sum(plan.dims)) as writer:
             each = StretchPass(recording, plan, writer)
             plan.check_fits(each)
+            each.doubt_stated_times()
             each.finish()
             each.end_stretch(last=True)
             left_out = dict(each.left_out)

@@ -202,6 +202,8 @@ class Estimation:
                 self._next_equalising = math.ceil(_EQUALISING * seen)
                 self._equalise_growing()
             for each in self._passes:
+                if each.doubt_stated_times():
+                    each.advance()
                 for _ in range(_MOST_LIVE_PASSES):
                     each.set_clocks()
                     if not each.is_outdated(_LIVE_TOLERANCE):
@@ -228,14 +230,14 @@ class Estimation:
             If nothing lies between start and end.
         """
         self._continue()
-        for each in self._passes:
+        for number, each in enumerate(self._passes):
             each.aligned.refresh()
+            if each.n_seen and not each.aligned.is_exact:
+                self._passes[number] = self._pass(each.recording)
+            self._passes[number].doubt_stated_times()
         is_exact = all(each.aligned.is_exact for each in self._passes)
         if not is_exact:
             self._equalisation.reset()
-        for number, each in enumerate(self._passes):
-            if each.n_seen and not each.aligned.is_exact:
-                self._passes[number] = self._pass(each.recording)
         self._filter()
         check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)

@@ -22,9 +22,9 @@ one, the sample index counts without error. A block that says ``CLOCK_RESTART`` 
 
 Where the device itself states UTC (``BlockFlag.DEVICE_UTC``) there is nothing to estimate: its
 statements are the clock, and a sensor whose statements agree with its nominal rate runs exactly at
-its nominal rate. Beside sensors without UTC the host's UTC must place them; where arrivals show
-that to be wrong, statements are moved to where arrivals put them. A step of one second while the
-samples are counted on is a leap second: UTC's, and not the sensor's.
+its nominal rate. If they drift against the motion, delays measured from it are the clock. Beside
+sensors without UTC the host's UTC must place them; where arrivals show that to be wrong, statements
+are moved to where arrivals put them. A step of one second is a leap second: UTC's.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import numpy as np
 
 from daq.protocols.block import BlockFlag
 from daq.timing.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
-from daq.timing.device_utc import from_device_utc
+from daq.timing.device_utc import corrected, from_device_utc
 from daq.timing.host_sleep import HostSleep
 from daq.timing.kalman import Observations, smooth
 from daq.timing.lower_envelope import least_of_each, levelled, scatter_of_least, supporting_line
@@ -221,16 +221,23 @@ class ArrivalTimes:
         """
         if self._device_utc:
             rate = self.sampling_rate
-            return from_device_utc(sensor, self.earliest(), sampling_rate=rate, moved=self.moved)
+            stated = from_device_utc(sensor, self.earliest(), sampling_rate=rate, moved=self.moved)
+            if measured is None:
+                return stated
+            return corrected(stated, measured, self.with_motion(sensor, measured))
         if measured is not None:
-            if len(measured.restarts):
-                once = replace(measured, restarts=measured.restarts[:0])
-                clock = self._restarting(measured.restarts).solve(sensor, once)
-                return replace(clock, state=replace(clock.state, n_epochs=len(self._epoch_starts)))
-            return self._filtered(sensor, *self._lines(), measured)
+            return self.with_motion(sensor, measured)
         if self._unmeasured is None or self._unmeasured.state.sensor != sensor:
             self._unmeasured = self._filtered(sensor, *self._lines(), None)
         return self._unmeasured
+
+    def with_motion(self, sensor: str, measured: MeasuredDelays) -> Clock:
+        """Return the clock that arrivals, or what is stated, and measured delays give together."""
+        if not len(measured.restarts):
+            return self._filtered(sensor, *self._lines(), measured)
+        once = replace(measured, restarts=measured.restarts[:0])
+        clock = self._restarting(measured.restarts).with_motion(sensor, once)
+        return replace(clock, state=replace(clock.state, n_epochs=len(self._epoch_starts)))
 
     def _restarting(self, samples: IntArray) -> ArrivalTimes:
         """Return the same arrivals with epochs that begin at these samples besides.
@@ -334,11 +341,9 @@ class ArrivalTimes:
         beat = min(duration, step / abs(slope * self.sampling_rate)) if slope else duration
         node = max(_NODE, duration / _MOST_NODES)
         if step and shows(self._index / self.sampling_rate, left, step=step, beat=beat):
-            node, step = (
-                max(node, BEATS_PER_WINDOW * beat),
-                0.0,
-            )  # the earliest of those is early indeed
-        group = self._stretches(self.sampling_rate * node)
+            node = max(node, BEATS_PER_WINDOW * beat)  # the earliest of those is early indeed
+            step = 0.0
+        group = self._epoch if self._device_utc else self._stretches(self.sampling_rate * node)
         kept = least_of_each(group, left, self._epoch)
         begins = np.diff(group, prepend=-1) != 0
         begins |= np.diff(self._epoch, prepend=-1) != 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +15,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daq.timing.clock_model import MeasuredDelays
+
     FloatArray = NDArray[np.float64]
 
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
+_ENOUGH = 8  # measured delays, for their scatter to be known
 
 
 def from_device_utc(
@@ -52,3 +57,21 @@ def from_device_utc(
     source = ClockSource.DEVICE_UTC
     state = ClockState(sensor, source, found[0].start, ppm, 0.0, wander, 0.0, len(found))
     return Clock(tuple(found), state)
+
+
+def corrected(stated: Clock, measured: MeasuredDelays, found: Clock) -> Clock:
+    """Return the clock that was found with the motion, and by how much what is stated drifts.
+
+    Where the motion is too weak, that is the stated one. What measured delays scatter by is then
+    taken for its drift, which is at most that; of few nobody knows it.
+    """
+    if found.state.refined:
+        late = np.concatenate([stated.at(epoch.index) - epoch.seconds for epoch in found.epochs])
+        state = replace(found.state, source=ClockSource.DEVICE_UTC, corrected=float(np.std(late)))
+        return replace(found, state=state)
+    late, weight = measured.seconds - stated.at(measured.index), measured.std**-2.0
+    left = math.nan
+    if np.count_nonzero(weight) >= _ENOUGH:
+        mean = weight @ late / weight.sum()
+        left = math.sqrt(weight @ (late - mean) ** 2 / weight.sum())
+    return replace(stated, state=replace(stated.state, residual=left))

@@ -35,7 +35,7 @@ def result(snapshot: Snapshot, settings: Settings) -> str:
         ]
     except BandError as error:
         parts = [Text(f"Self-noise: {error}")]
-    parts.append(Text(remarks(snapshot)[0]))
+    parts += map(Text, (remarks(snapshot)[0], *results.wrong_times(snapshot)))
     if advice(snapshot):
         parts.append(Text("advice on the test: print(*result.advice, sep='\\n')"))
     return rendered(parts)

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.results.band_summary import band_of, channel_means, data_means, highest_known
+from daq.results.clock_effect import reference
 from daq.results.partners import without_partners
 from daq.timing.clock_model import ClockSource
 from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
@@ -121,8 +122,8 @@ def remarks(snapshot: Snapshot) -> list[str]:
         rates = ", ".join(f"{clock.sensor} {signed(clock.ppm, '+.1f')} ppm" for clock in fitted)
         left = snapshot.diagnostics.synchronisation.residual  # between them
         worst = max(left[clock.sensor] for clock in fitted) * 1e6
-        within = f"{worst:.0f}" if worst > 10 else f"{worst:.1f}"
-        lines.append(f"clocks {rates}, aligned to about {within} µs")
+        lines.append(f"clocks {rates}, aligned to about {_short(worst)} µs")
+    lines += wrong_times(snapshot)
     if (limit := highest_known(snapshot)) < snapshot.frequency[-1]:
         lines.append(f"no estimate above {limit:.4g} Hz, where resampling attenuates")
     lines += [*faulty_channels(snapshot), *not_searched(snapshot)]
@@ -142,6 +143,30 @@ def remarks(snapshot: Snapshot) -> list[str]:
             lines.append(f"{method}: {of} {'is' if negative == 1 else 'are'} at or below zero")
     lines += [f"{method}: {reason}" for method, reason in snapshot.refused.items()]
     return lines
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if value > 10 else f"{value:.1f}"
+
+
+def wrong_times(snapshot: Snapshot) -> list[str]:
+    """Return a remark on sensors whose stated UTC drifts against the motion."""
+    stated = [clock for clock in snapshot.clocks if clock.source is ClockSource.DEVICE_UTC]
+    wrong = [clock for clock in stated if clock.corrected]
+    lost = [clock.sensor for clock in stated if clock.residual != 0 and not clock.corrected]
+    if not wrong and not lost:
+        return []
+    against = reference(snapshot)
+    text = f"Stated times drift{'' if against is None else f' against those of {against}'}, as the"
+    text += " motion shows"
+    if wrong:
+        left = snapshot.diagnostics.synchronisation.residual
+        worst = max(left[clock.sensor] for clock in wrong) * 1e6
+        by = ", ".join(f"{each.sensor} by {_short(each.corrected * 1e6)} µs rms" for each in wrong)
+        text += f": {by}. They were corrected to within about {_short(worst)} µs"
+    if lost:
+        text += f". Those of {', '.join(lost)} could not be corrected: the motion is too weak"
+    return [f"{text}. Check whether the clocks were synchronised."]
 
 
 def not_searched(snapshot: Snapshot) -> list[str]:

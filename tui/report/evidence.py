@@ -16,7 +16,7 @@ from estimator.diagnostics.advice import NoSharedMotion
 from estimator.likelihood.goodness_of_fit import rejected_below
 from tui.output.advice.diagnostics import summary, why_untested
 from tui.output.formatting import several, span, utc
-from tui.output.results import faulty_channels, left_out, not_searched
+from tui.output.results import faulty_channels, left_out, not_searched, wrong_times
 from tui.output.vocabulary import clock_source
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
@@ -192,6 +192,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
         if tone == "bad":
             text += " Give the sensors one clock, or record longer for their rates to be known."
         parts.append(Paragraph(text, tone))
+    parts += [Paragraph(text, "doubtful") for text in wrong_times(snapshot)]
     left, against = residuals(snapshot), reference(snapshot)
     rows = [
         _clock_row(

@@ -18,6 +18,7 @@ from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
 from daq.estimation.segments.newest_samples import NewestSamples
 from daq.estimation.segments.read_ahead import read_ahead
+from daq.estimation.segments.stated_times import drifting
 from daq.estimation.segments.usable_samples import surrounded, whole_segments
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
@@ -332,6 +333,14 @@ class Pass:
         """Set the clocks by the delays measured in the segments taken."""
         if self._delays.has_begun:
             self.aligned.set_clocks()
+
+    def doubt_stated_times(self) -> bool:
+        """Return whether stated UTC was found to drift only now; then all begins again."""
+        drift = drifting(self.aligned, self.welch) if self._settings.clocks == "refined" else ()
+        if drift:
+            self.aligned.doubt(drift)
+            self.restart()
+        return bool(drift)
 
     def is_outdated(self, tolerance: float) -> bool:
         """Whether clocks, as known now, differ from those that segments were taken by.

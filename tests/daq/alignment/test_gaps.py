@@ -14,7 +14,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.recording.reader import Recording
 from daq.recording.sensor_record import SensorRecord
-from daq.timing.clock_model import from_instants
+from daq.timing.sample_instants import from_instants
 from tests.daq.alignment.recordings import Sensor as FreeRunning
 from tests.daq.alignment.recordings import counts, write, write_polled
 

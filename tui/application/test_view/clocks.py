@@ -49,7 +49,7 @@ def clock_line(snapshot: Snapshot, settings: Settings, *, width: int) -> Text:
         words = "all sensors share one" if shared else "the time of every sample is known"
         return Text(f"clocks: {words}", MUTED)
     words, style = _verdict(snapshot, settings)
-    left = f"within {microseconds(max(residuals(snapshot).values()))}"
+    left = f"within {microseconds(float(np.max(list(residuals(snapshot).values()))))}"
     by = "by motion" if any(clock.refined for clock in free) else "by arrival times"
     rates = ", ".join(f"{clock.sensor} {_ppm(clock.ppm)}" for clock in free) + " ppm"
     span = f"{_ppm(min(c.ppm for c in free))} … {_ppm(max(c.ppm for c in free))} ppm"

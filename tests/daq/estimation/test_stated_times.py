@@ -1,0 +1,133 @@
+"""Stated UTC against the motion: what drifts is found and corrected, what does not is left."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.segments.stated_times import drifts
+from daq.estimation.settings import Settings
+from daq.timing.clock_model import ClockSource
+from sim_devices.world.scenario import Scenario
+from sim_devices.world.world import World
+from tests.daq.alignment.recordings import Sensor, blocks, create, write
+from tui.output.results import wrong_times
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
+RATE, SECONDS, NOISE = 50.0, 480.0, 1e-6  # unit²/Hz
+PPM = (0.0, 1.0, -2.0)
+BAND = slice(2, 40)  # 1 to 20 Hz
+
+
+def huddle(snr: float, ppm: tuple[float, ...]) -> dict[str, Sensor]:
+    """Return sensors of one motion that state the UTC of their nominal rate."""
+    scenario = Scenario.from_dict(
+        {
+            "seed": 6,
+            "motion": {"spectra": [{"shape": "white", "level": snr * NOISE}]},
+            "sensors": {
+                name: {
+                    "sampling_rate": RATE,
+                    "noise": [{"shape": "white", "level": NOISE}],
+                    "clock": {"ppm": each},
+                }
+                for name, each in zip("abc", ppm, strict=True)
+            },
+        }
+    )
+    world = World(scenario)
+    counts = {name: world.samples(name, 0, round(SECONDS * RATE)) for name in "abc"}
+    return {
+        name: Sensor(np.round(1e6 * found).astype(np.int32), rate=RATE, utc=True)
+        for name, found in counts.items()
+    }
+
+
+@pytest.mark.parametrize("snr", [1e3, 1e5])
+def test_sensors_whose_stated_times_drift_are_aligned_by_the_motion(
+    tmp_path: Path, snr: float
+) -> None:
+    snapshot = estimate([write(tmp_path / "r.h5", huddle(snr, PPM))], SETTINGS)
+    found = snapshot.results["three-sensor"]
+    ratio = found.noise_psd[BAND].mean(axis=0) / (1e12 * NOISE)
+    error = found.cov[BAND].mean(axis=0) / np.sqrt(len(found.cov[BAND]) / 1.94)
+    assert (np.abs(ratio - 1) < 5 * error).all()  # neighbours at Hann windows: 1 + 2 (4/9 + 1/36)
+    for clock, ppm in zip(snapshot.clocks, PPM, strict=True):
+        assert clock.source is ClockSource.DEVICE_UTC
+        drift = abs(ppm) * 1e-6 * SECONDS / np.sqrt(12)
+        assert clock.corrected == pytest.approx(drift, rel=0.1, abs=1e-9)
+    assert re.search(r"of a, .*: b by 1[34]. µs rms, c by 2[78]. µs", wrong_times(snapshot)[0])
+
+
+def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: Path) -> None:
+    path = write(tmp_path / "r.h5", huddle(1e4, (0.0, 0.0, 0.0)))
+    snapshot = estimate([path], SETTINGS)
+    nominal = estimate([path], replace(SETTINGS, clocks="nominal"))
+    assert [(clock.corrected, clock.residual) for clock in snapshot.clocks] == 3 * [(0.0, 0.0)]
+    assert np.array_equal(snapshot.csm, nominal.csm)
+    assert not wrong_times(snapshot)
+
+
+def test_drift_is_corrected_while_the_recording_grows(tmp_path: Path) -> None:
+    sensors = huddle(1e4, PPM)
+    arriving = sorted(
+        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
+        key=lambda block: block.received.monotonic_ns,
+    )
+    path = tmp_path / "r.h5"
+    writer = create(path, sensors)
+    corrected = []
+    with Estimation([path], SETTINGS) as estimation:
+        for block in arriving:
+            writer.append(block)
+            if block.first_sample % 3000 == 0 and block.sensor == "c":
+                writer.commit()
+                estimation.update()
+                corrected += [each.corrected for each in estimation.snapshot().clocks[2:]]
+        writer.close()
+        live = estimation.finish()
+    offline = estimate([path], SETTINGS)
+    assert corrected == sorted(corrected)  # a drift that grows
+    assert corrected[-1] > 1e-4
+    assert [clock.corrected for clock in live.clocks] == [c.corrected for c in offline.clocks]
+    noise = [each.results["three-sensor"].noise_psd for each in (live, offline)]
+    np.testing.assert_allclose(noise[0], noise[1], rtol=1e-9)
+
+
+def delays(seed: int, n: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return delays that scatter as they are said to."""
+    std = np.full(n, 1e-6)
+    return np.arange(float(n)), np.random.default_rng(seed).normal(0, std), std
+
+
+def test_steady_delays_are_never_called_drifting() -> None:
+    assert not any(
+        drifts(*delays(seed), nominal=nominal) for seed in range(500) for nominal in (False, True)
+    )
+
+
+def test_delays_that_drift_by_three_standard_deviations_are() -> None:
+    at, steady, std = delays(1)
+    assert drifts(at, steady + 1e-5 * at / at[-1], std, nominal=True)
+    assert not drifts(at[:15], steady[:15] + 1e-5 * at[:15] / at[15], std[:15], nominal=True)
+
+
+def test_scatter_of_measured_delays_alone_is_waves_that_cross_a_nominal_bench() -> None:
+    at, steady, std = delays(2)
+    assert not drifts(at, 10 * steady, std, nominal=True)
+    assert drifts(at, 10 * steady, std, nominal=False)
+
+
+def test_delays_that_nobody_knows_do_not_count() -> None:
+    at, steady, std = delays(3)
+    unknown = np.where(at % 2 == 0, np.inf, std)
+    wild = np.where(at % 2 == 0, 1e-3 * at, steady)
+    assert not drifts(at, wild, unknown, nominal=True)
