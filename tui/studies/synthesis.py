@@ -66,8 +66,10 @@ def synthesise(
     seed: int = 1,
     instants: bool = False,
     utc: Mapping[str, float] | None = None,
+    has_gps: bool = True,
     lost: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     restarts: bool = False,
+    computer_ppm: float = 0.0,
 ) -> Path:
     """Write the recording that a bench of this scenario would have given.
 
@@ -87,10 +89,15 @@ def synthesise(
         Store when each sample was really taken, as no device could.
     utc : mapping of str to float, optional
         Sensors that state UTC themselves, and by how many seconds the host's is behind theirs.
+    has_gps : bool
+        Whether they state the UTC of their samples. Else it is that of the nominal rate from their
+        first sample on, as that of a digitizer without GPS.
     lost : mapping of str to sequence of (float, float), optional
         Begin and end, in seconds of a sensor's own count, of samples whose blocks never arrive.
     restarts : bool
         Whether clocks restart after each loss, as where nobody knows how many samples were lost.
+    computer_ppm : float
+        By how much the computer's clock, of arrival times, runs fast.
     """
     latency = latency or Latency()
     layouts = [
@@ -110,11 +117,12 @@ def synthesise(
     world = World(scenario)
     with ArrayWriter(path, sensors=layouts, created=ORIGIN) as writer:
         for layout in layouts:
-            begin = scenario.sensors[layout.name].clock.offset
+            begin, rate = scenario.sensors[layout.name].clock.offset, layout.sampling_rate
             length = max(1, round(block * layout.sampling_rate))
             n_blocks = int((duration - begin) * layout.sampling_rate) // length
             ends = world.sample_times(layout.name, 0, n_blocks * length)[length - 1 :: length]
-            arrivals_ns = _ns(latency.arrivals(ends, rng))
+            arrivals_ns = _ns(latency.arrivals(ends, rng) * (1 + computer_ppm * 1e-6))
+            start = world.sample_times(layout.name, 0, 1)[0]
             behind = (utc or {}).get(layout.name)
             at_once = max(1, 20_000 // length)
             arrived = np.ones(n_blocks, dtype=bool)
@@ -130,6 +138,7 @@ def synthesise(
                 first, n_samples = number * length, len(received_ns) * length
                 samples = world.samples(layout.name, first, n_samples)
                 times = world.sample_times(layout.name, first, n_samples)
+                stated = times if has_gps else start + np.arange(n_samples) / rate + first / rate
                 writer.samples(
                     layout.name,
                     np.round(samples * SENSITIVITY).astype(np.int32),
@@ -137,7 +146,7 @@ def synthesise(
                     restart=number == 0 or (restarts and not arrived[number - 1]),
                     block_rows=length,
                     received_ns=received_ns,
-                    utc_ns=None if behind is None else _ns(times[::length] + behind),
+                    utc_ns=None if behind is None else _ns(stated[::length] + behind),
                     instants_ns=_ns(times) if instants else None,
                 )
     return Path(path)

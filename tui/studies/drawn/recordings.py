@@ -47,6 +47,8 @@ FREE, WITH_GAPS, STEPS = 0.8, 0.6, 0.2
 """Shares of recordings with free clocks and with gaps, and of clocks with a step of temperature."""
 AGAIN_AND_AGAIN, RESTARTS = 0.4, 0.5
 """Shares of recordings with gaps that have some every 5 to 60 s, and where clocks restart there."""
+STATED, WITH_GPS = 0.4, 0.5
+"""Shares of recordings whose sensors state UTC, some or all, and where that is true."""
 MIDDLE, HIGHEST = 10.0, 0.4
 """Limit in Hz of the two bands, and the end of the second over the lowest sampling rate."""
 ALWAYS_WRONG = (
@@ -79,6 +81,12 @@ class Drawn:
         Begin and end in seconds of samples that never arrived, by sensor.
     restarts : bool
         Whether clocks restart after each loss.
+    stated : tuple of str
+        Sensors that state UTC.
+    has_gps : bool
+        Whether that is the UTC of their samples.
+    computer_ppm : float
+        By how much the computer's clock runs fast.
     """
 
     scenario: Scenario
@@ -90,6 +98,9 @@ class Drawn:
     latency: Latency
     lost: dict[str, list[tuple[float, float]]]
     restarts: bool
+    stated: tuple[str, ...]
+    has_gps: bool
+    computer_ppm: float
 
 
 def draw(rng: np.random.Generator) -> Drawn:
@@ -136,7 +147,15 @@ def draw(rng: np.random.Generator) -> Drawn:
         LATENCIES[int(rng.integers(len(LATENCIES)))],
         lost,
         bool(rng.random() < RESTARTS),
+        _stated(rng, names),
+        bool(rng.random() < WITH_GPS),
+        float(rng.normal(0, 20)),
     )
+
+
+def _stated(rng: np.random.Generator, names: str) -> tuple[str, ...]:
+    n_stated = len(names) if rng.random() < 0.5 else int(rng.integers(1, len(names)))
+    return tuple(rng.permutation(list(names))[:n_stated]) if rng.random() < STATED else ()
 
 
 def _clock(rng: np.random.Generator, seconds: float) -> dict[str, Any]:
@@ -191,6 +210,9 @@ def _judge(drawn: Drawn, number: int, judged: Judged) -> None:
             seed=number,
             lost=drawn.lost,
             restarts=drawn.restarts,
+            utc=dict.fromkeys(drawn.stated, 0.0),
+            has_gps=drawn.has_gps,
+            computer_ppm=drawn.computer_ppm,
         )
         settings = Settings(segment=drawn.segment, methods=METHODS)
         snapshot = estimate([path], settings)
