@@ -24,6 +24,7 @@ from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import SensorSource, main_columns
 from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
+from daq.timing.utc_rate import UtcRate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -145,8 +146,7 @@ class AlignedRecording:
     @property
     def is_exact(self) -> bool:
         """Whether every sensor's samples are on the grid, so that no clock is estimated."""
-        doubted = any(source.offset_in_doubt or source.doubted for source in self._sources)
-        return self._untouched and not doubted
+        return self._untouched and not any(s.offset_in_doubt or s.doubted for s in self._sources)
 
     @property
     def usable(self) -> float:
@@ -280,6 +280,7 @@ class AlignedRecording:
         )
         together = together and len({source.record.sampling_rate for source in sources}) == 1
         reference = sources[self._reference]
+        utc = UtcRate() if all(each.device_utc for each in sources) else reference.utc_rate()
         first_of: dict[str, SensorSource] = {}
         for source in [reference, *(each for each in sources if each is not reference)]:
             name = source.clock_name
@@ -287,7 +288,7 @@ class AlignedRecording:
             first_of[name] = first
             measured = None if source is reference else source.measured(reference.known_clock)
             if source.polled:
-                source.clock = source.by_instants()
+                source.clock = utc.by_utc(source.by_instants())
             elif first is not source and not source.device_utc:
                 source.share(first, measured)
             elif together:
@@ -302,7 +303,7 @@ class AlignedRecording:
                     shared_clock=source.clock_name,
                 )
             else:
-                clock = source.arrivals.solve(source.record.name, measured)
+                clock = source.solved(measured, utc)
                 if clock.state.refined:  # relative to the reference, whose rate is also uncertain
                     clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
                 source.clock = clock

@@ -16,6 +16,7 @@ from daq.timing.arrival_times import ArrivalTimes
 from daq.timing.clock_model import MeasuredDelays, OffsetSource
 from daq.timing.quantiles import median
 from daq.timing.sample_instants import from_instants
+from daq.timing.utc_rate import UtcRate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -71,6 +72,8 @@ class SensorSource:
     frame_delay: float = 0.0
     _seconds: FloatArray = field(default_factory=lambda: np.empty(0))
     """Times of a polled sensor's samples that `by_instants` has read, in s."""
+    _utc_rate: tuple[int, UtcRate] = (0, UtcRate())
+    """How many blocks `utc_rate` has read, and what it found."""
     offset_in_doubt: bool = False
     """Whether the offset of its sample index to others of its clock is an estimate."""
 
@@ -184,6 +187,29 @@ class SensorSource:
         starts = np.array([epoch.start for epoch in reference.epochs[1:]])
         restarts = np.ceil(self.known_clock.position(starts)).astype(np.int64)
         return MeasuredDelays(index, seconds, std, restarts)
+
+    def utc_rate(self) -> UtcRate:
+        """Return the rate of the UTC that it states, if any, against the computer's clock."""
+        if self.device_utc and self._utc_rate[0] != self.n_blocks:
+            arrivals = self.arrivals
+            origin = arrivals.origin_monotonic_ns, arrivals.origin_utc_ns
+            heard = ArrivalTimes(self.record.sampling_rate, *origin)
+            for first in range(0, self.n_blocks, _CHUNK_BLOCKS):
+                stop = min(first + _CHUNK_BLOCKS, self.n_blocks)
+                blocks = np.array(self.record.blocks[first:stop])
+                blocks["flags"] &= ~int(BlockFlag.DEVICE_UTC)
+                heard.add(blocks)
+            states = (each.solve(self.record.name).state for each in (arrivals, heard))
+            self._utc_rate = self.n_blocks, UtcRate.of(*states)
+        return self._utc_rate[1]
+
+    def solved(self, measured: MeasuredDelays | None, utc: UtcRate) -> Clock:
+        """Return the clock in the time of a reference with UTC, to which measured delays belong."""
+        name = self.record.name
+        if self.device_utc:
+            return self.arrivals.solve(name, measured)
+        measured = None if measured is None else utc.by_computer(measured)
+        return utc.by_utc(self.arrivals.solve(name, measured))
 
     def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
         """Return the source in `others` that is the same sensor over another connection."""

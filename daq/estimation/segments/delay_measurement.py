@@ -105,18 +105,18 @@ class DelayMeasurement:
     ) -> None:
         """Measure what delays are left in segments with gaps.
 
-        Of each segment this takes what no clock restarts in, around its middle: a delay across a
-        restart would be that of neither side. Segments of which gaps and the rest take more than
-        the share `most` are left out. The other parameters are those of `measure`.
+        Those of which gaps take more than the share `most` are left out. The other parameters are
+        those of `measure`.
         """
         length = self._welch.segment_length
         segments, taken = [np.empty((0, samples.shape[1]))], []
         for start, at in zip(starts.tolist(), begin.tolist(), strict=True):
-            low, high = self._aligned.epoch_around(at + length / 2)
-            span, place = slice(start, start + length), at + np.arange(length)
-            weight = gap_window(usable[span] & (place >= low) & (place <= high), length)
-            if np.count_nonzero(weight < 1) <= most * length:
-                segments.append(without_trend(samples[span], weight, self._welch.detrend))
+            span = slice(start, start + length)
+            segment = around_gaps(
+                self._aligned, self._welch, samples[span], usable[span], at, most=most
+            )
+            if segment is not None:
+                segments.append(segment)
                 taken.append(at)
         rows = np.arange(len(taken)) * length
         self.measure(np.concatenate(segments), rows, np.array(taken, np.int64), together=together)
@@ -145,3 +145,36 @@ class DelayMeasurement:
         """Return delays of frames; the clocks, about to be set, know all segments before."""
         self._learn_held()
         return np.empty(0) if self._meter is None else self._meter.frame_delays()
+
+
+def around_gaps(
+    aligned: AlignedRecording,
+    welch: WelchSettings,
+    samples: FloatArray,
+    usable: BoolArray,
+    begin: int,
+    *,
+    most: float,
+) -> FloatArray | None:
+    """Return a segment without its trend, and zero in its gaps.
+
+    It holds what no clock restarts in, around its middle: a delay across a restart would be that of
+    neither side. None if gaps and the rest take more than the share `most` of it.
+
+    Parameters
+    ----------
+    aligned : AlignedRecording
+    welch : WelchSettings
+    samples : float64, shape (segment_length, n_channels)
+    usable : bool, shape (segment_length,)
+    begin : int
+        Its first grid sample.
+    most : float
+    """
+    length = welch.segment_length
+    low, high = aligned.epoch_around(begin + length / 2)
+    place = begin + np.arange(length)
+    weight = gap_window(usable & (place >= low) & (place <= high), length)
+    if np.count_nonzero(weight < 1) > most * length:
+        return None
+    return without_trend(samples, weight, welch.detrend)

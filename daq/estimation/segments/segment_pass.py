@@ -336,7 +336,7 @@ class Pass:
 
     def doubt_stated_times(self) -> bool:
         """Return whether stated UTC was found to drift only now; then all begins again."""
-        drift = drifting(self.aligned, self.welch) if self._settings.clocks == "refined" else ()
+        drift = drifting(self.aligned, self._settings, self.welch)
         if drift:
             self.aligned.doubt(drift)
             self.restart()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.delay_estimation import DelayEstimator
-from daq.estimation.segments.usable_samples import whole_segments
+from daq.estimation.segments.delay_measurement import around_gaps
 from daq.timing.quantiles import median
 from estimator.spectra.windows import get_window
 
@@ -21,13 +21,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daq.alignment.aligned_recording import AlignedRecording
+    from daq.estimation.settings import Settings
     from estimator.spectra.welch import WelchSettings
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 _SPREAD = 48  # segments from the whole recording, besides the first ones
 _AT_ONCE = 8
-_TRIES = 4  # stretches that are searched for the first segments, which define the frame
+_TRIES = 4  # stretches that are searched for first segments, which define the frame
 _PARTS = 8
 _DRIFTS = 60.0  # χ² of 7 degrees of freedom: 2e-10; the scatter is estimated
 _OVERLAPS = 1.4  # variance of a mean of half overlapping segments, against independent ones
@@ -35,25 +37,25 @@ _NORMAL = 1.4826  # standard deviation of normal values over the median of their
 _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are wrong
 
 
-def drifting(aligned: AlignedRecording, welch: WelchSettings) -> tuple[int, ...]:
+def drifting(
+    aligned: AlignedRecording, settings: Settings, welch: WelchSettings
+) -> tuple[int, ...]:
     """Return the sensors whose stated UTC drifts against that of another, by their index.
 
-    Empty where fewer than two sensors state UTC, or the motion is too weak to tell.
+    Empty where fewer than two sensors state UTC, the motion is too weak to tell, or clocks are not
+    to be refined.
 
     Parameters
     ----------
     aligned : AlignedRecording
+    settings : Settings
     welch : WelchSettings
         Of the segments.
     """
     sensors = aligned.stated
-    if len(sensors) < 2 or not aligned.n_available:
+    if len(sensors) < 2 or not aligned.n_available or settings.clocks != "refined":
         return ()
-    edges = np.cumsum([0, *aligned.dims])
-    columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
-    window = get_window(welch.window, welch.segment_length)
-    meter = DelayEstimator(welch.sampling_rate, window, columns)
-    at, delays, std = _measured(aligned, welch, meter)
+    at, delays, std = _measured(aligned, welch, sensors, settings.bridge)
     stated = [aligned.clocks[number] for number in sensors]
     nominal = [clock.ppm == clock.wander_ppm == 0 for clock in stated]
     return tuple(
@@ -96,31 +98,44 @@ def drifts(at: FloatArray, delays: FloatArray, std: FloatArray, *, nominal: bool
 
 
 def _measured(
-    aligned: AlignedRecording, welch: WelchSettings, meter: DelayEstimator
+    aligned: AlignedRecording, welch: WelchSettings, sensors: tuple[int, ...], most: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return segments of the lattice, their delays and standard deviations; increasing."""
-    hop, length = welch.hop, welch.segment_length
-    total = max(0, (aligned.n_available - length) // hop + 1)
+    edges = np.cumsum([0, *aligned.dims])
+    columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
+    window = get_window(welch.window, welch.segment_length)
+    total = max(0, (aligned.n_available - welch.segment_length) // welch.hop + 1)
     found: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    first, several = 0, 2 * meter.min_segments
-    for _ in range(_TRIES):
-        count = min(several, total - first)
-        if count < meter.min_segments or meter.has_frame:
+
+    def measure(segments: IntArray) -> bool:
+        parts = [_segment(aligned, welch, n, most) for n in segments.tolist()]
+        kept = [samples for samples in parts if samples is not None]
+        if not kept:
+            return False
+        starts = np.arange(len(kept)) * welch.segment_length
+        known = np.array([samples is not None for samples in parts])
+        found.append((segments[known] * 1.0, *meter.measure(np.concatenate(kept), starts)))
+        return bool(np.isfinite(found[-1][2]).any(axis=0).sum() > 1)  # one is the reference
+
+    for begin in np.linspace(0, total, _TRIES, endpoint=False).astype(np.int64).tolist():
+        meter = DelayEstimator(welch.sampling_rate, window, columns)
+        found.clear()
+        first = np.arange(begin, min(begin + 2 * meter.min_segments, total))
+        if measure(first):
+            rest = np.setdiff1d(np.linspace(0, total - 1, _SPREAD).astype(np.int64), first)
+            for some in np.split(rest, range(_AT_ONCE, len(rest), _AT_ONCE)):
+                measure(some)
             break
-        samples, valid = aligned.read(first * hop, (first + count - 1) * hop + length)
-        starts = np.arange(count) * hop
-        starts = starts[whole_segments(valid & np.isfinite(samples).all(axis=1), starts, length)]
-        found.append((first + starts / hop, *meter.measure(samples, starts)))
-        first += count
-    wanted = min(_SPREAD, total - first) if meter.has_frame else 0
-    spread = np.linspace(first, total - 1, wanted).astype(np.int64)
-    for some in np.split(spread, range(_AT_ONCE, wanted, _AT_ONCE)):
-        parts = [aligned.read(n * hop, n * hop + length) for n in some.tolist()]
-        whole = [bool((valid & np.isfinite(samples).all(axis=1)).all()) for samples, valid in parts]
-        kept = [samples for (samples, _), good in zip(parts, whole, strict=True) if good]
-        if kept:
-            starts = np.arange(len(kept)) * length
-            found.append((some[whole].astype(float), *meter.measure(np.concatenate(kept), starts)))
-    none = np.empty(0), np.empty((0, len(meter.columns))), np.empty((0, len(meter.columns)))
-    at, delays, std = zip(none, *found, strict=True)
-    return np.concatenate(at), np.concatenate(delays), np.concatenate(std)
+    none = np.empty(0), np.empty((0, len(columns))), np.empty((0, len(columns)))
+    at, delays, std = map(np.concatenate, zip(none, *found, strict=True))
+    order = np.argsort(at)
+    return at[order], delays[order], std[order]
+
+
+def _segment(
+    aligned: AlignedRecording, welch: WelchSettings, number: int, most: float
+) -> FloatArray | None:
+    begin = number * welch.hop
+    samples, valid = aligned.read(begin, begin + welch.segment_length)
+    valid &= np.isfinite(samples).all(axis=1)
+    return around_gaps(aligned, welch, samples, valid, begin, most=most)

@@ -10,7 +10,9 @@ import pytest
 
 from daq.alignment.aligned_recording import AlignedRecording
 from daq.recording.reader import Recording
+from sim_devices.world.scenario import Scenario
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
+from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,3 +83,29 @@ def test_a_correction_of_device_utc_moves_no_samples(tmp_path: Path, ahead: int)
         aligned = AlignedRecording(recording)
         at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
         assert np.ptp(aligned.delays(at)) < 1e-3
+
+
+@pytest.mark.parametrize("has_gps", [True, False])
+def test_sensors_without_utc_are_in_the_time_of_those_with_it(
+    tmp_path: Path, *, has_gps: bool
+) -> None:
+    sensor = {"sampling_rate": 100.0, "noise": [{"shape": "white", "level": 1e-8}]}
+    scenario = Scenario.from_dict(
+        {
+            "seed": 1,
+            "motion": {"spectra": [{"shape": "white", "level": 1e-12}]},
+            "sensors": {
+                "a": sensor | {"clock": {"ppm": 20.0}},
+                "b": sensor | {"clock": {"ppm": -5.0}},
+            },
+        }
+    )
+    path = tmp_path / "r.h5"
+    synthesise(path, scenario, duration=600, utc={"a": 0.0}, has_gps=has_gps, computer_ppm=30.0)
+    with Recording.open(path) as recording:
+        stated, other = AlignedRecording(recording).clocks
+    assert stated.ppm == pytest.approx(20 if has_gps else 0, abs=0.01)
+    assert other.ppm - stated.ppm == pytest.approx(
+        -25, abs=3 * other.residual / 600 * 12**0.5 * 1e6
+    )
+    assert other.residual < 1e-4  # 5e-3 is what 30 ppm would leave

@@ -67,6 +67,24 @@ def test_sensors_whose_stated_times_drift_are_aligned_by_the_motion(
     assert re.search(r"of a, .*: b by 1[34]. µs rms, c by 2[78]. µs", wrong_times(snapshot)[0])
 
 
+def test_drift_is_found_where_every_segment_has_a_gap(tmp_path: Path) -> None:
+    sensors = huddle(1e4, PPM)
+    sensors["b"].gaps = tuple((first, first + 5) for first in range(40, 24_000, 250))
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], replace(SETTINGS, segment=10.0))
+    assert snapshot.bridged is not None
+    assert snapshot.n_segments == snapshot.bridged.n_segments
+    drift = abs(PPM[2]) * 1e-6 * SECONDS / np.sqrt(12)
+    assert snapshot.clocks[2].corrected == pytest.approx(drift, rel=0.1)
+
+
+def test_a_beginning_without_motion_does_not_hide_a_drift(tmp_path: Path) -> None:
+    sensors, noise = huddle(1e4, PPM), np.random.default_rng(2)
+    for sensor in sensors.values():
+        sensor.counts[:8000] = noise.integers(-10, 10, (8000, 1))
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
+    assert snapshot.clocks[2].corrected > 1e-4
+
+
 def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: Path) -> None:
     path = write(tmp_path / "r.h5", huddle(1e4, (0.0, 0.0, 0.0)))
     snapshot = estimate([path], SETTINGS)
