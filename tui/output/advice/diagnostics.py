@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
+from daq.results.band_summary import highest_known
 from estimator.diagnostics.advice import (
+    Delay,
+    Gain,
     ModelMisfit,
     NoSharedMotion,
     TooFewDimensions,
@@ -18,7 +21,7 @@ from estimator.diagnostics.kinds import Level, Untested
 from estimator.spectra.segment_rejection import Reason
 from tui.output.advice.sentences import Names, explain, model
 from tui.output.advice.summary import summarise
-from tui.output.formatting import degrees, ratio, signed, span
+from tui.output.formatting import degrees, listed, ratio, signed, span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,6 +42,9 @@ _LEGEND = (
     "statistic over its expectation, 1 if one common motion explains the averages; p: "
     "probability of a statistic this large by chance."
 )
+_LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
+"""Advice that unknown clocks alone can bring about."""
+_TURN = 0.3  # rad at the highest frequency: 9 % of the motion is taken for noise there
 
 
 def summary(snapshot: Snapshot) -> list[str]:
@@ -58,7 +64,23 @@ def summary(snapshot: Snapshot) -> list[str]:
                 )
         elif not any(isinstance(advice, TooFewSensors) for advice in found.advice):
             lines.append(why_untested(snapshot))
-    return lines + _dimensions(diagnostics.dimensions)
+    return lines + _by_clocks(snapshot) + _dimensions(diagnostics.dimensions)
+
+
+def _by_clocks(snapshot: Snapshot) -> list[str]:
+    """Return a line on clocks so little known that what is wrong may come from them."""
+    if not any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
+        return []
+    short = _TURN / (2 * math.pi * highest_known(snapshot))
+    left = snapshot.diagnostics.synchronisation.residual
+    loose = {sensor: late for sensor, late in left.items() if late > short}
+    if not loose:
+        return []
+    clocks = "clock" if len(loose) == 1 else "clocks"
+    text = f"The {clocks} of {listed(list(loose))} {'is' if len(loose) == 1 else 'are'} known to"
+    text += f" about {max(loose.values()) * 1e3:.2g} ms only. Lags, missing motion or a misfit as"
+    text += " above may come from that alone. Give the sensors one clock, see that connections are"
+    return [f"{text} not lost, or record with more motion."]
 
 
 def problems(snapshot: Snapshot) -> list[str]:

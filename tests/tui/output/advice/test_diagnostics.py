@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from daq.estimation.snapshot import Octave
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
+    Synchronisation,
 )
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level, Untested
@@ -204,18 +205,33 @@ def test_why_there_is_no_diagnosis_is_said(why: Untested) -> None:
     assert summary(snapshot) == []
 
 
+STRANGER = NoSharedMotion(
+    level=Level.PROBLEM,
+    sensors=(0,),
+    band=(0.5, 100.0),
+    partners=(1, 2),
+    share=0.001,
+    share_of_partners=0.99,
+)
+
+
+def test_what_may_come_from_a_clock_that_is_not_known_says_so() -> None:
+    snapshot = diagnosed()
+    assert snapshot.diagnostics.diagnosis is not None
+    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
+    for late, advised, expected in ((7e-3, diagnosis, 1), (1e-5, diagnosis, 0), (7e-3, None, 0)):
+        clocks = Synchronisation(residual={"A": late, "B": 0.0, "C": 1e-7})
+        found = advised or snapshot.diagnostics.diagnosis
+        diagnostics = replace(snapshot.diagnostics, synchronisation=clocks, diagnosis=found)
+        said = [x for x in summary(replace(snapshot, diagnostics=diagnostics)) if "The clock" in x]
+        assert len(said) == expected
+        assert all(x.startswith("The clock of A is known to about 7 ms only.") for x in said)
+
+
 def test_a_sensor_elsewhere_has_no_noise_level_and_nothing_contradicts_it() -> None:
     snapshot = diagnosed()
-    stranger = NoSharedMotion(
-        level=Level.PROBLEM,
-        sensors=(0,),
-        band=(0.5, 100.0),
-        partners=(1, 2),
-        share=0.001,
-        share_of_partners=0.99,
-    )
     assert snapshot.diagnostics.diagnosis is not None
-    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(stranger,))
+    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
     snapshot = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
     table = shown([result_table(snapshot, SETTINGS)])
     assert table.count("no shared motion") == 3 * len(snapshot.results)
