@@ -156,7 +156,7 @@ def around_gaps(
     *,
     most: float,
 ) -> FloatArray | None:
-    """Return a segment without its trend, and zero in its gaps.
+    """Return a segment; one with gaps without its trend, and zero in them.
 
     It holds what no clock restarts in, around its middle: a delay across a restart would be that of
     neither side. None if gaps and the rest take more than the share `most` of it.
@@ -174,7 +174,10 @@ def around_gaps(
     length = welch.segment_length
     low, high = aligned.epoch_around(begin + length / 2)
     place = begin + np.arange(length)
-    weight = gap_window(usable & (place >= low) & (place <= high), length)
+    whole = usable & (place >= low) & (place <= high)
+    if whole.all():
+        return samples
+    weight = gap_window(whole, length)
     if np.count_nonzero(weight < 1) > most * length:
         return None
     return without_trend(samples, weight, welch.detrend)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 _SPREAD = 48  # segments from the whole recording, besides the first ones
-_AT_ONCE = 8
+_VALUES_AT_ONCE = 1 << 20  # samples times channels: 8 MB
 _TRIES = 4  # stretches that are searched for first segments, which define the frame
 _PARTS = 8
 _DRIFTS = 60.0  # χ² of 7 degrees of freedom: 2e-10; the scatter is estimated
@@ -123,7 +123,8 @@ def _measured(
         first = np.arange(begin, min(begin + 2 * meter.min_segments, total))
         if measure(first):
             rest = np.setdiff1d(np.linspace(0, total - 1, _SPREAD).astype(np.int64), first)
-            for some in np.split(rest, range(_AT_ONCE, len(rest), _AT_ONCE)):
+            at_once = max(1, _VALUES_AT_ONCE // (welch.segment_length * int(edges[-1])))
+            for some in np.split(rest, range(at_once, len(rest), at_once)):
                 measure(some)
             break
     none = np.empty(0), np.empty((0, len(columns))), np.empty((0, len(columns)))
