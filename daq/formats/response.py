@@ -36,6 +36,8 @@ _TOLERANCE = 0.01
 _END_OF_TIME_NS = 2**63 - 1
 _FAR_NS = 4 * 10**18
 """Ends beyond the year 2096 are written for "not yet"."""
+_EDGE_NS = 10**9
+"""By which data may begin before their epoch, or end after it: dates are often whole seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +95,15 @@ class Responses:
                 )
             return epochs[0].response
         found: list[Epoch] = []
-        for start, end in stretches:
+        for begin, last in stretches:
+            edge = min(_EDGE_NS, (last - begin) // 2)
+            start, end = begin + edge, last - edge
             met = [epoch for epoch in epochs if epoch.start_ns <= end and start < epoch.end_ns]
             if not met or met[0].start_ns > start or max(e.end_ns for e in met) < end:
                 known = ", ".join(f"{_date(e.start_ns)} to {_date(e.end_ns)}" for e in epochs)
                 raise ImportFormatError(
                     f"{where} is known for {known}; expected one for the data, from"
-                    f" {_date(start)} to {_date(end)}"
+                    f" {_date(begin)} to {_date(last)}"
                 )
             found += met
         for epoch in found:

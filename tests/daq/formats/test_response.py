@@ -93,6 +93,12 @@ def test_a_change_within_the_data_is_refused_with_its_date(tmp_path: Path) -> No
     assert sensitivity(tmp_path, same, "2025-05-01", "2025-07-01") == 7
 
 
+def test_dates_of_epochs_may_be_off_by_less_than_a_second(tmp_path: Path) -> None:
+    late = [("2020-01-01T00:00:00.9", "2025-06-01", 1000.0), *EPOCHS[1:]]
+    assert sensitivity(tmp_path, late, "2020-01-01") == 1000
+    assert sensitivity(tmp_path, EPOCHS, "2025-05-31T23:59:00.5") == 1000
+
+
 def test_data_without_a_response_at_their_time_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ImportFormatError, match=r"from 2019-12-01 to 2019-12-01T00:00:59"):
         sensitivity(tmp_path, EPOCHS, "2019-12-01")
