@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from textual.pilot import Pilot
 
 FOLDER = Path(__file__).parent / "pictures"
-TURNS = 20
+TURNS = 100
 
 
 def screen_text(app: App[None]) -> str:
@@ -23,6 +23,10 @@ def screen_text(app: App[None]) -> str:
     with patch.object(Console, "export_svg", lambda console, **_: console.export_text()):
         lines = app.export_screenshot().replace("\xa0", " ").rstrip().splitlines()
     return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+AT_REST = 4
+"""Turns in which a screen at rest does not change."""
 
 
 async def assert_looks_as_before(pilot: Pilot[None], name: str) -> None:
@@ -40,3 +44,19 @@ async def assert_looks_as_before(pilot: Pilot[None], name: str) -> None:
             return
         await pilot.pause()
     assert screen_text(pilot.app) == expected
+
+
+async def resized(pilot: Pilot[None], size: tuple[int, int]) -> None:
+    """Resize the terminal, and wait until the screen has that size and comes to rest.
+
+    On a busy machine the new layout comes some turns later.
+    """
+    await pilot.resize_terminal(*size)
+    before, still = "", 0
+    for _ in range(TURNS):
+        await pilot.pause()
+        now = screen_text(pilot.app)
+        still = still + 1 if now == before and pilot.app.screen.size == size else 0
+        if still == AT_REST:
+            return
+        before = now

@@ -11,7 +11,7 @@ from textual.widgets import Static
 
 from daq.recording.sensor_state import SensorState
 from daq.timing.clock_model import ClockSource
-from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.application.screen_text import assert_looks_as_before, resized, screen_text
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
@@ -304,7 +304,7 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Progress
         assert [word in text for word in ("▲ clipping", "○ disconnected 1:15", "▲ Y stuck")] == [
             True
         ] * 3
-        await pilot.resize_terminal(*WIDE)
+        await resized(pilot, WIDE)
         await shown(pilot, app)
         assert "C.Y is stuck: no signal" in screen_text(app)
 
@@ -336,7 +336,7 @@ async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(
         await shown(pilot, app, *running())
         await pilot.press("question_mark")
         await shown(pilot, app, *running(n_effective=500))
-        await pilot.resize_terminal(100, 40)
+        await resized(pilot, (100, 40))
         await pilot.pause()
         await pilot.press("escape")
         await pilot.pause()

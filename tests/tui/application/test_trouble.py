@@ -13,7 +13,7 @@ from daq.drivers.bench_file import parse
 from daq.errors import HuddleError
 from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.kinds import Level
-from tests.tui.application.screen_text import screen_text
+from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
 from tests.tui.example_snapshot import (
     SETTINGS,
@@ -156,7 +156,7 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
         text = screen_text(app)
         assert "▲ A records none of the motion that B and C share: check its input" in text
         assert text.count("no shared motion") == 3
-        await pilot.resize_terminal(*NARROW)
+        await resized(pilot, NARROW)
         await shown(pilot, app)
         assert "▲ A records none of the motion that B and C share" in screen_text(app)
 
@@ -172,10 +172,10 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
         snapshot = made_snapshot(n_effective=60.0)
         await shown(pilot, app, StatusUpdated(made_now()), SnapshotReady(snapshot, SETTINGS))
         assert screen_text(app).count("NOT DECIDED") == 2  # beside the time, and with what to do
-        await pilot.resize_terminal(*NARROW)
+        await resized(pilot, NARROW)
         await shown(pilot, app)
         assert "recording  1:40  NOT DECIDED" in screen_text(app)
-        await pilot.resize_terminal(*WIDE)
+        await resized(pilot, WIDE)
         snapshot = made_snapshot(n_effective=5000.0, closed=True)
         await shown(
             pilot, app, StatusUpdated(made_now(closed=True)), SnapshotReady(snapshot, SETTINGS)
