@@ -22,12 +22,13 @@ import numpy as np
 from daq.alignment.grid import SNAP, Grid, grid_rate
 from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import SensorSource, main_columns
+from daq.alignment.stated_utc import place_stated, undoubted
 from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 from daq.timing.utc_rate import UtcRate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Mapping
 
     from numpy.typing import NDArray
 
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 _GROWTH = 0.05  # fraction by which a recording grows before its clocks are set again
 _FIRST_GROWTH = 0.25  # the same for a short recording, up to
 _MIN_SECONDS = 30.0  # this time in s: three observations of the clock's filter
-_LATEST = 5.0  # maximum delay in s of the blocks of a device with UTC
 
 
 class AlignedRecording:
@@ -93,13 +93,13 @@ class AlignedRecording:
         self.dims = tuple(len(main_columns(record)) for record in records)
         self._records = records
         self._sources: list[SensorSource] = []
-        self._origin = (0, 0)
+        self._origin = self._set_at = (0, 0)
         self._grid: Grid | None = None
-        self._set_at = (0, 0)
         self.n_settings = 0  # of the clocks, so far
         self._end = math.inf
         self._at_face_value = nominal_clocks
         self._measured_against: int | None = None
+        self._stated_reference: int | None = None
         self._frame_delays: tuple[tuple[int, ...], FrameDelays] | None = None
         self.refresh()
 
@@ -207,17 +207,30 @@ class AlignedRecording:
 
     @property
     def stated(self) -> tuple[int, ...]:
-        """Indices of sensors that state UTC and have not been doubted, one per clock."""
-        stated = [n for n, each in enumerate(self._sources) if each.device_utc and not each.doubted]
-        first_of = {self._sources[number].clock_name: number for number in reversed(stated)}
-        return tuple(sorted(first_of.values()))
+        """Indices of sensors that state UTC and are not doubted: the reference, two per clock."""
+        return undoubted(self._sources, self._stated_reference)
 
-    def doubt(self, sensors: Iterable[int]) -> None:
-        """Refine the UTC that sensors, and others of their clocks, state."""
-        names = {self._sources[number].clock_name for number in sensors}
+    def compare_stated(self, drift: Mapping[int, float], reference: int) -> bool:
+        """Take by how much stated UTC drifts, in s rms; return whether that of any sensor does.
+
+        Parameters
+        ----------
+        drift : mapping of int to float
+            Of `stated` sensors; NaN where nobody knows.
+        reference : int
+            The sensor against which.
+        """
+        names = {self._sources[number].clock_name for number, each in drift.items() if each > 0}
         for source in self._sources:
-            source.doubted |= source.device_utc and source.clock_name in names
-        self._lay_grid()
+            found = [drift[n] for n in drift if self._sources[n].clock_name == source.clock_name]
+            if source.device_utc and not source.doubted and found:
+                known = [each for each in found if not math.isnan(each)]
+                source.drift = max(known, default=math.nan)
+        if names:
+            self._stated_reference = reference
+            self._lay_grid()
+        self.set_clocks()
+        return bool(names)
 
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays
@@ -259,7 +272,7 @@ class AlignedRecording:
         """Set every clock from all current data."""
         sources = self._sources
         self.n_settings += 1
-        self._place_stated()
+        place_stated(sources)
         numbers, frame_delays = self._frame_delays or ((), list)
         for number, delay in zip(numbers, frame_delays(), strict=True):
             sources[number].frame_delay = float(delay)
@@ -307,19 +320,6 @@ class AlignedRecording:
                 if clock.state.refined:  # relative to the reference, whose rate is also uncertain
                     clock = clock.rate_known_to(reference.known_clock.state.ppm_std)
                 source.clock = clock
-
-    def _place_stated(self) -> None:
-        """Shift devices' UTC to arrival times, if the host's UTC, used by other sensors, is wrong.
-
-        The host's UTC is wrong if no device's blocks arrive at possible times. A block of all
-        channels arrives with its slowest channel: if channels are not synchronised, up to twice its
-        duration after its end.
-        """
-        stated = [source.arrivals for source in self._sources if source.device_utc]
-        if 0 < len(stated) < len(self._sources):
-            wrong = all(not 0 <= each.latency < _LATEST + 2 * each.longest_block for each in stated)
-            for each in stated:
-                each.moved = min(other.latency for other in stated) if wrong else 0.0
 
     def refresh(self) -> None:
         """Read newly committed blocks, and set every clock."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,8 +63,11 @@ class SensorSource:
     runs: list[_Run] = field(default_factory=list)
     n_blocks: int = 0
     device_utc: bool = False
-    doubted: bool = False
-    """Whether its stated UTC drifts against the motion, and is refined as arrival times are."""
+    drift: float | None = None
+    """By how much its stated UTC drifts against the motion, in seconds rms.
+
+    NaN where they could not be compared, None where nobody tried.
+    """
     polled: bool = False
     clock: Clock | None = None
     learnt: GrowingRows[np.float64] = field(default_factory=lambda: GrowingRows(np.float64, 4))
@@ -76,6 +79,11 @@ class SensorSource:
     """How many blocks `utc_rate` has read, and what it found."""
     offset_in_doubt: bool = False
     """Whether the offset of its sample index to others of its clock is an estimate."""
+
+    @property
+    def doubted(self) -> bool:
+        """Whether its stated UTC drifts, and is refined as arrival times are."""
+        return self.drift is not None and self.drift > 0
 
     @property
     def end_sample(self) -> int:
@@ -179,7 +187,7 @@ class SensorSource:
 
     def measured(self, reference: Clock) -> MeasuredDelays | None:
         """Return the sample times that follow from measured delays against the reference."""
-        if not self.learnt and not self.doubted:
+        if not self.learnt:
             return None
         found = self.learnt.values  # of segments with gaps after those without
         index, at_reference, delay, std = found[np.argsort(found[:, 0], kind="stable")].T
@@ -207,9 +215,17 @@ class SensorSource:
         """Return the clock in the time of a reference with UTC, to which measured delays belong."""
         name = self.record.name
         if self.device_utc:
-            return self.arrivals.solve(name, measured)
+            return self._judged(self.arrivals.solve(name, measured))
         measured = None if measured is None else utc.by_computer(measured)
         return utc.by_utc(self.arrivals.solve(name, measured))
+
+    def _judged(self, clock: Clock) -> Clock:
+        """Return the clock of stated UTC with what its comparison with the motion says of it."""
+        if self.drift is None or (self.doubted and clock.state.refined):
+            return clock
+        if math.isnan(self.drift):
+            return replace(clock, state=replace(clock.state, unchecked=True))
+        return replace(clock, state=replace(clock.state, residual=self.drift, drifts=self.doubted))
 
     def repeats(self, others: Iterable[SensorSource]) -> SensorSource | None:
         """Return the source in `others` that is the same sensor over another connection."""

@@ -122,28 +122,12 @@ def _archived(task: Task) -> Outcome:
                     usable=each.aligned.usable,
                     elapsed=each.elapsed,
                     left_out={reason: left_out.get(reason, 0) for reason in Reason},
-                    residual=_residual(each),
+                    residual=synchronisation([each]).residual,
                     clipped=clipped_columns([recording], channels),
                     stood_still=still_for_a_while([each], settings),
                 )
             )
             return Outcome(task.source, each.n_stretches, each.n_written, origin.closed)
-
-
-def _residual(each: Pass) -> dict[str, float]:
-    """Return what is left between the clocks, in seconds rms, by sensor."""
-    if not each.aligned.clocks:
-        return {}
-    found = synchronisation(
-        each.aligned.clocks,
-        each.aligned.is_reference,
-        each.moved(),
-        dims=each.aligned.dims,
-        frequency=np.empty(0),
-        csm=np.empty((0, each.n_channels, each.n_channels), dtype=np.complex128),
-        results={},
-    )
-    return dict(found.residual)
 
 
 class StretchPass(Pass):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Channel
     from daq.estimation.noise_estimates import Dimensions
+    from daq.estimation.segments.segment_pass import Pass
     from daq.timing.clock_model import ClockState
     from estimator.diagnostics.stability import SegmentCourse
     from estimator.self_noise.result import SelfNoise
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 MIN_AVERAGES = 2.0
 """Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""
+_MOST_TURN = 50.0  # rad²: no motion is left in common
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
 
 
@@ -97,35 +100,65 @@ class Findings:
         )
 
 
-def synchronisation(
-    clocks: Sequence[ClockState],
-    is_reference: Sequence[bool],
-    moved: FloatArray,
-    *,
-    dims: tuple[int, ...],
-    frequency: FloatArray,
-    csm: ComplexArray,
-    results: dict[str, SelfNoise],
-) -> Synchronisation:
-    """Return the residual between the clocks, and its effect on the noise estimate.
+def synchronisation(passes: Sequence[Pass]) -> Synchronisation:
+    """Return what is left between the clocks of all recordings: rms, by their segments.
+
+    A delay that varies by δ (rms) leaves ``exp(-(ωδ)²)`` of a channel's coherent power in the
+    common motion, and puts the rest into its noise: `bias_of_clocks`.
+    """
+    squares: dict[str, float] = {}
+    against, total = "", sum(max(each.n_segments, 1) for each in passes)
+    for each in passes:
+        if clocks := each.aligned.clocks:
+            found, name = residuals(clocks, each.aligned.is_reference, each.moved())
+            against = name or against
+            share = max(each.n_segments, 1) / total
+            for sensor, residual in found.items():
+                squares[sensor] = squares.get(sensor, 0.0) + share * residual**2
+    return Synchronisation({name: math.sqrt(each) for name, each in squares.items()}, None, against)
+
+
+def residuals(
+    clocks: Sequence[ClockState], is_reference: Sequence[bool], moved: FloatArray
+) -> tuple[dict[str, float], str]:
+    """Return what is left of each sensor's clock in s rms, and the sensor against which.
 
     `is_reference` marks the sensors on the reference clock. `moved`, shape (n_segments, n_sensors),
-    is the difference of the clocks from those that segments were taken by.
-    A delay that varies by δ (rms) takes ``(ωδ)²`` of a channel's coherent power out of the common
-    motion, and so into its noise.
+    is the difference of the clocks from those that segments were taken by. The sensor is empty
+    where the motion measures no clock.
     """
     residual = np.array([state.residual for state in clocks])
     refined = np.array([state.refined for state in clocks], dtype=bool)
+    against, first = "", list(is_reference).index(True)
     if refined.any():  # what counts is the delay against the reference, however late all are
         reference = np.array(is_reference, dtype=bool)
         residual = np.where(refined, residual, np.hypot(residual, residual[reference].max()))
         residual[reference] = 0.0
+        against = clocks[first].sensor
+    drifting = sum(state.residual**2 for state in clocks if state.drifts)
+    if drifting:  # the others' noise is measured with these
+        residual = np.maximum(residual, math.sqrt(drifting))
     if len(moved):
-        first = list(is_reference).index(True)
         residual = np.hypot(residual, (moved - moved[:, [first]]).std(axis=0))
-    by_sensor = zip((state.sensor for state in clocks), residual.tolist(), strict=True)
-    found = Synchronisation(residual=dict(by_sensor))
-    return bias_of_clocks(found, dims=dims, frequency=frequency, csm=csm, results=results)
+    return dict(zip((state.sensor for state in clocks), residual.tolist(), strict=True)), against
+
+
+def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
+    """Return what is known of the clocks in the last recording, and of stated UTC in any."""
+    states = []
+    for number, state in enumerate(passes[-1].aligned.clocks):
+        every = [p.aligned.clocks[number] for p in passes if p.aligned.clocks]
+        wrong = [each.residual for each in every if each.drifts]
+        states.append(
+            replace(
+                state,
+                residual=max(wrong, default=state.residual),
+                corrected=max(each.corrected for each in every),
+                drifts=bool(wrong),
+                unchecked=any(each.unchecked for each in every),
+            )
+        )
+    return tuple(states)
 
 
 def bias_of_clocks(
@@ -143,8 +176,9 @@ def bias_of_clocks(
     noise = next(iter(results.values())).noise_psd
     coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
     turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
+    lost = np.expm1(np.minimum(turn**2, _MOST_TURN))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return replace(found, noise_bias=turn**2 * coherent / np.abs(noise))
+        return replace(found, noise_bias=lost * coherent / np.abs(noise))
 
 
 def vertical_channel(channels: Sequence[Channel]) -> int | None:

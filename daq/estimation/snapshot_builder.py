@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.alignment.sensor_reader import main_columns
-from daq.estimation.diagnosis import Findings, diagnosis, synchronisation
+from daq.estimation.diagnosis import (
+    Findings,
+    bias_of_clocks,
+    clock_states,
+    diagnosis,
+    synchronisation,
+)
 from daq.estimation.equalisation import METHOD
 from daq.estimation.noise_estimates import (
     Dimensions,
@@ -128,10 +134,8 @@ class SnapshotBuilder:
         latest = recordings[-1]
         events = latest.events
         diagnostics = SnapshotDiagnostics(
-            synchronisation=synchronisation(
-                last.aligned.clocks,
-                last.aligned.is_reference,
-                last.moved(),
+            synchronisation=bias_of_clocks(
+                synchronisation(passes),
                 dims=dims,
                 frequency=frequency,
                 csm=csm,
@@ -169,7 +173,7 @@ class SnapshotBuilder:
             elapsed=sum(each.elapsed for each in passes),
             start_utc_ns=first.aligned.start_utc_ns,
             sensors=tuple(SensorTotals.of(record, events) for record in latest.sensors),
-            clocks=last.aligned.clocks,
+            clocks=clock_states(passes),
             drift=last.drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
             left_out=_left_out(passes),

@@ -43,10 +43,13 @@ class Synchronisation:
     noise_bias : float64, shape (n_freqs, n_channels), or None
         What it is expected to add to the noise PSD, as a fraction of it; None where there is no
         estimate.
+    reference : str
+        The sensor against which the motion measures clocks; empty where it does not.
     """
 
     residual: Mapping[str, float] = field(default_factory=dict)
     noise_bias: FloatArray | None = None
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -88,8 +88,7 @@ def reference(snapshot: Snapshot) -> str | None:
     """Return the sensor against which the motion measures the others' clocks, if it does."""
     if not any(clock.refined for clock in snapshot.clocks):
         return None
-    left = residuals(snapshot)
-    return next((clock.sensor for clock in snapshot.clocks if left[clock.sensor] == 0), None)
+    return snapshot.diagnostics.synchronisation.reference or None
 
 
 def lags(snapshot: Snapshot) -> FloatArray:

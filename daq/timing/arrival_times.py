@@ -224,7 +224,8 @@ class ArrivalTimes:
             stated = from_device_utc(sensor, self.earliest(), sampling_rate=rate, moved=self.moved)
             if measured is None:
                 return stated
-            return corrected(stated, measured, self.with_motion(sensor, measured))
+            measured = replace(measured, seconds=measured.seconds - self.moved)
+            return corrected(stated, self.with_motion(sensor, measured), moved=self.moved)
         if measured is not None:
             return self.with_motion(sensor, measured)
         if self._unmeasured is None or self._unmeasured.state.sensor != sensor:

@@ -167,6 +167,10 @@ class ClockState:
     corrected : float
         By how much stated UTC drifted against the motion, in seconds rms; 0 where it is used as
         stated.
+    drifts : bool
+        Whether stated UTC drifts and could not be corrected; by `residual` then.
+    unchecked : bool
+        Whether stated UTC could not be compared with the motion.
     """
 
     sensor: str
@@ -181,6 +185,8 @@ class ClockState:
     shared_clock: str = ""
     offset_source: OffsetSource | None = None
     corrected: float = 0.0
+    drifts: bool = False
+    unchecked: bool = False
 
     def shared_by(self, sensor: str) -> ClockState:
         """Return the state of a sensor that is sampled by this clock."""

@@ -15,12 +15,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daq.timing.clock_model import MeasuredDelays
-
     FloatArray = NDArray[np.float64]
 
 _UTC_TOLERANCE = 2e-6  # seconds; how well device UTC must agree with the nominal rate
-_ENOUGH = 8  # measured delays, for their scatter to be known
+_NODES = 33  # of an epoch, at which clocks are compared
 
 
 def from_device_utc(
@@ -59,19 +57,29 @@ def from_device_utc(
     return Clock(tuple(found), state)
 
 
-def corrected(stated: Clock, measured: MeasuredDelays, found: Clock) -> Clock:
+def corrected(stated: Clock, found: Clock, *, moved: float) -> Clock:
     """Return the clock that was found with the motion, and by how much what is stated drifts.
 
-    Where the motion is too weak, that is the stated one. What measured delays scatter by is then
-    taken for its drift, which is at most that; of few nobody knows it.
+    Where the motion is too weak, that is the stated one.
+
+    Parameters
+    ----------
+    stated, found : Clock
+    moved : float
+        Seconds by which stated times are moved, and times of `found` are not yet.
     """
-    if found.state.refined:
-        late = np.concatenate([stated.at(epoch.index) - epoch.seconds for epoch in found.epochs])
-        state = replace(found.state, source=ClockSource.DEVICE_UTC, corrected=float(np.std(late)))
-        return replace(found, state=state)
-    late, weight = measured.seconds - stated.at(measured.index), measured.std**-2.0
-    left = math.nan
-    if np.count_nonzero(weight) >= _ENOUGH:
-        mean = weight @ late / weight.sum()
-        left = math.sqrt(weight @ (late - mean) ** 2 / weight.sum())
-    return replace(stated, state=replace(stated.state, residual=left))
+    if not found.state.refined:
+        return stated
+    squares = n = 0.0
+    for epoch in found.epochs:
+        index = np.linspace(epoch.first_sample, epoch.end_sample - 1, _NODES)
+        late, length = stated.at(index) - epoch.at(index), epoch.end_sample - epoch.first_sample
+        squares, n = squares + length * float(np.var(late)), n + length
+    epochs = tuple(replace(epoch, seconds=epoch.seconds + moved) for epoch in found.epochs)
+    state = replace(
+        found.state,
+        source=ClockSource.DEVICE_UTC,
+        offset=epochs[0].start,
+        corrected=math.sqrt(squares / n),
+    )
+    return Clock(epochs, state)

@@ -105,6 +105,7 @@ def made_snapshot(
             synchronisation=Synchronisation(
                 residual=dict(zip(SENSORS, RESIDUALS, strict=True)),
                 noise_bias=np.full((len(frequency), sum(dims)), clock_share),
+                reference=SENSORS[0],
             )
         ),
     )
@@ -168,6 +169,7 @@ def diagnosed(
             synchronisation=replace(
                 snapshot.diagnostics.synchronisation,
                 residual=dict(zip(sensors, RESIDUALS, strict=True)),
+                reference=sensors[0],
             ),
             diagnosis=diagnosis,
             untested=found.untested,

@@ -238,7 +238,10 @@ def _diagnostics(snapshot: Snapshot) -> dict[str, Any]:
         "sensors": snapshot.sensors,
         "clocks": snapshot.clocks,
         "drift": snapshot.drift,
-        "synchronisation": {"residual": found.synchronisation.residual},
+        "synchronisation": {
+            "residual": found.synchronisation.residual,
+            "reference": found.synchronisation.reference,
+        },
         "untested": found.untested,
     }
     if found.synchronisation.noise_bias is not None:

@@ -22,6 +22,7 @@ from tui.output.formatting import (
     clock_time,
     level,
     level_with_error,
+    listed,
     percent,
     several,
     signed,
@@ -150,23 +151,37 @@ def _short(value: float) -> str:
 
 
 def wrong_times(snapshot: Snapshot) -> list[str]:
-    """Return a remark on sensors whose stated UTC drifts against the motion."""
-    stated = [clock for clock in snapshot.clocks if clock.source is ClockSource.DEVICE_UTC]
-    wrong = [clock for clock in stated if clock.corrected]
-    lost = [clock.sensor for clock in stated if clock.residual != 0 and not clock.corrected]
-    if not wrong and not lost:
-        return []
-    against = reference(snapshot)
-    text = f"Stated times drift{'' if against is None else f' against those of {against}'}, as the"
-    text += " motion shows"
+    """Return remarks on stated UTC that drifts against the motion, or could not be compared."""
+    wrong = [clock for clock in snapshot.clocks if clock.corrected]
+    lost = [clock for clock in snapshot.clocks if clock.drifts]
+    unchecked = [clock.sensor for clock in snapshot.clocks if clock.unchecked]
+    lines = []
+    if wrong or lost:
+        against = reference(snapshot)
+        text = f"Stated times drift{'' if against is None else f' against those of {against}'}, as"
+        by = ", ".join(
+            f"{each.sensor} by {_short(size * 1e6)} µs rms"
+            for each, size in [(c, c.corrected) for c in wrong] + [(c, c.residual) for c in lost]
+        )
+        text += f" the motion shows: {by}."
     if wrong:
         left = snapshot.diagnostics.synchronisation.residual
         worst = max(left[clock.sensor] for clock in wrong) * 1e6
-        by = ", ".join(f"{each.sensor} by {_short(each.corrected * 1e6)} µs rms" for each in wrong)
-        text += f": {by}. They were corrected to within about {_short(worst)} µs"
+        text += f" {'They' if not lost else listed([c.sensor for c in wrong])} were corrected to"
+        text += f" within about {_short(worst)} µs."
     if lost:
-        text += f". Those of {', '.join(lost)} could not be corrected: the motion is too weak"
-    return [f"{text}. Check whether the clocks were synchronised."]
+        text += f" {listed([clock.sensor for clock in lost])} could not be corrected: the motion is"
+        text += " too weak for so short segments. Choose longer ones."
+    if wrong or lost:
+        text += " Check whether the clocks were synchronised, or whether waves changed direction."
+        lines.append(text)
+    if unchecked:
+        lines.append(
+            f"The times that {listed(unchecked)} {'states' if len(unchecked) == 1 else 'state'}"
+            " could not be compared with the motion: it is too weak, or the recording too short. If"
+            " they drift, motion counts as noise."
+        )
+    return lines
 
 
 def not_searched(snapshot: Snapshot) -> list[str]:

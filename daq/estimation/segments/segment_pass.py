@@ -18,7 +18,7 @@ from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.gap_bridge import GapBridge
 from daq.estimation.segments.newest_samples import NewestSamples
 from daq.estimation.segments.read_ahead import read_ahead
-from daq.estimation.segments.stated_times import drifting
+from daq.estimation.segments.stated_times import compare
 from daq.estimation.segments.usable_samples import surrounded, whole_segments
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
@@ -336,11 +336,10 @@ class Pass:
 
     def doubt_stated_times(self) -> bool:
         """Return whether stated UTC was found to drift only now; then all begins again."""
-        drift = drifting(self.aligned, self._settings, self.welch)
+        drift = compare(self.aligned, self._settings, self.welch)
         if drift:
-            self.aligned.doubt(drift)
             self.restart()
-        return bool(drift)
+        return drift
 
     def is_outdated(self, tolerance: float) -> bool:
         """Whether clocks, as known now, differ from those that segments were taken by.

@@ -1,13 +1,15 @@
 """Whether the times that devices or files state agree with the motion that the sensors share.
 
 A digitizer without GPS, or whose receiver has lost it, states times that drift. The delays between
-its sensors and others then drift as well. They are measured in a few segments from the whole
-recording, and their means over parts of it are compared with their scatter within the parts. That
-scatter is measured, not predicted: waves that cross the bench in changing directions add to it.
+its sensors and others then drift as well. They are measured in pieces of the whole recording, and
+their means over parts of it are compared with their scatter within the parts. That scatter is
+measured, not predicted: waves that cross the bench in changing directions add to it.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,24 +28,29 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
+    Delays = tuple[FloatArray, FloatArray, FloatArray]
 
-_SPREAD = 48  # segments from the whole recording, besides the first ones
+_PIECES = 40  # lengths of a piece in the recording, at least where it is short
+_LONGEST = 60.0  # s of a piece, where there are few gaps
+_SHORTEST = 256  # samples of a piece
+_SPREAD = 48  # pieces from the whole recording, besides the first ones
 _VALUES_AT_ONCE = 1 << 20  # samples times channels: 8 MB
-_TRIES = 4  # stretches that are searched for first segments, which define the frame
+_MOST_VALUES = 1 << 22  # the same of the first pieces together: 32 MB
+_TRIES = 4  # stretches that are searched for first pieces, which define the frame
 _PARTS = 8
 _DRIFTS = 60.0  # χ² of 7 degrees of freedom: 2e-10; the scatter is estimated
-_OVERLAPS = 1.4  # variance of a mean of half overlapping segments, against independent ones
+_OVERLAPS = 1.4  # variance of a mean of half overlapping pieces, against independent ones
 _NORMAL = 1.4826  # standard deviation of normal values over the median of their magnitudes
 _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are wrong
+_GROWTH = 0.5  # of the stretch whose clocks are set, from one setting to the next
+_STEP = 16  # pieces that are measured in between
 
 
-def drifting(
-    aligned: AlignedRecording, settings: Settings, welch: WelchSettings
-) -> tuple[int, ...]:
-    """Return the sensors whose stated UTC drifts against that of another, by their index.
+def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings) -> bool:
+    """Compare stated UTC with the motion; return whether that of any sensor drifts.
 
-    Empty where fewer than two sensors state UTC, the motion is too weak to tell, or clocks are not
-    to be refined.
+    Clocks that drift are then set by the motion. Does nothing where fewer than two sensors state
+    UTC, or clocks are not to be refined.
 
     Parameters
     ----------
@@ -54,32 +61,71 @@ def drifting(
     """
     sensors = aligned.stated
     if len(sensors) < 2 or not aligned.n_available or settings.clocks != "refined":
-        return ()
-    at, delays, std = _measured(aligned, welch, sensors, settings.bridge)
-    stated = [aligned.clocks[number] for number in sensors]
-    nominal = [clock.ppm == clock.wander_ppm == 0 for clock in stated]
-    return tuple(
-        number
-        for column, number in enumerate(sensors)
-        if drifts(at, delays[:, column], std[:, column], nominal=nominal[column])
-    )
+        return False
+    longest = _LONGEST
+    drift, reference = _drifts(aligned, welch, sensors, most=settings.bridge, longest=longest)
+    unknown = sum(map(math.isnan, drift.values()))
+    if unknown:  # gaps may leave nothing of long pieces
+        short = settings.segment
+        found, against = _drifts(aligned, welch, sensors, most=settings.bridge, longest=short)
+        if sum(map(math.isnan, found.values())) < unknown:
+            drift, reference, longest = found, against, short
+    if not aligned.compare_stated(drift, reference):
+        return False
+    _follow(aligned, welch, most=settings.bridge, longest=longest)
+    return True
 
 
-def drifts(at: FloatArray, delays: FloatArray, std: FloatArray, *, nominal: bool) -> bool:
-    """Return whether delays of a sensor drift, by more than a segment can show.
+def _drifts(
+    aligned: AlignedRecording,
+    welch: WelchSettings,
+    sensors: tuple[int, ...],
+    *,
+    most: float,
+    longest: float,
+) -> tuple[dict[int, float], int]:
+    """Return `drift_of` sensors, and that against which, in pieces of `longest` s at most."""
+    pieces = _Pieces(aligned, welch, sensors, most=most, longest=longest)
+    first = pieces.begin()
+    rest = np.linspace(0, pieces.total - 1, _SPREAD).astype(np.int64)
+    found = [*first, *pieces.measure(np.setdiff1d(rest, pieces.first))] if first else []
+    none = np.empty(0), np.empty((0, len(sensors))), np.empty((0, len(sensors)))
+    at, delays, std = map(np.concatenate, zip(none, *found, strict=True))
+    order = np.argsort(at)
+    at, delays, std = at[order] / welch.sampling_rate, delays[order], std[order]
+    is_reference = (std == 0).all(axis=0) & (len(at) > 0)
+    duration = aligned.n_available / welch.sampling_rate
+    drift = {}
+    for column, number in enumerate(sensors):
+        clock, mine = aligned.clocks[number], (at, delays[:, column], std[:, column])
+        nominal = clock.ppm == clock.wander_ppm == 0
+        drift[number] = drift_of(*mine, nominal=nominal, duration=duration)
+        if is_reference[column]:
+            drift[number] = 0.0
+    return drift, sensors[int(np.argmax(is_reference))]
+
+
+def drift_of(
+    at: FloatArray, delays: FloatArray, std: FloatArray, *, nominal: bool, duration: float
+) -> float:
+    """Return by how much delays of a sensor drift over a recording, in s rms.
+
+    0 where that is not more than they scatter, NaN where too few are known.
 
     Parameters
     ----------
-    at, delays, std : float64, shape (n_segments,)
-        When, in any unit; delays and their predicted standard deviations, in s.
+    at, delays, std : float64, shape (n,)
+        When, the delays and their predicted standard deviations, in s.
     nominal : bool
         Whether the times stated are those of the nominal rate. Of others single ones may be wrong
         too, which shows as scatter.
+    duration : float
+        Of the recording in s. Delays that drift far cannot be measured any more.
     """
     known = np.isfinite(std) & (std > 0)
     at, delays, std = at[known], delays[known], std[known]
     if len(at) < 2 * _PARTS:
-        return False
+        return math.nan
     part = np.minimum((at - at[0]) / (at[-1] - at[0]) * _PARTS, _PARTS - 1).astype(np.int64)
     n = np.bincount(part, minlength=_PARTS)
     used = np.flatnonzero(n)
@@ -92,51 +138,101 @@ def drifts(at: FloatArray, delays: FloatArray, std: FloatArray, *, nominal: bool
     means[used] = np.bincount(part, delays, minlength=_PARTS)[used] / n[used]
     between = float(n @ (means - delays.mean()) ** 2)
     scatter = max(within, least)
-    if between > max(_DRIFTS * _OVERLAPS * scatter**2, len(at) * least**2):
-        return True
-    return not nominal and within > _SCATTERS * least
+    drifts = between > max(_DRIFTS * _OVERLAPS * scatter**2, len(at) * least**2)
+    if not drifts and (nominal or within <= _SCATTERS * least):
+        return 0.0
+    slope = float(np.polyfit(at, delays, 1)[0])
+    return max(abs(slope) * duration / math.sqrt(12), float(np.std(delays)))
 
 
-def _measured(
-    aligned: AlignedRecording, welch: WelchSettings, sensors: tuple[int, ...], most: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return segments of the lattice, their delays and standard deviations; increasing."""
-    edges = np.cumsum([0, *aligned.dims])
-    columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
-    window = get_window(welch.window, welch.segment_length)
-    total = max(0, (aligned.n_available - welch.segment_length) // welch.hop + 1)
-    found: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+class _Pieces:
+    """Pieces of a recording, half overlapping, in which delays are measured.
 
-    def measure(segments: IntArray) -> bool:
-        parts = [_segment(aligned, welch, n, most) for n in segments.tolist()]
-        kept = [samples for samples in parts if samples is not None]
-        if not kept:
-            return False
-        starts = np.arange(len(kept)) * welch.segment_length
-        known = np.array([samples is not None for samples in parts])
-        found.append((segments[known] * 1.0, *meter.measure(np.concatenate(kept), starts)))
-        return bool(np.isfinite(found[-1][2]).any(axis=0).sum() > 1)  # one is the reference
+    They are as long as the recording allows, so that weak motion does; segments are as long as
+    those who estimate noise want them.
+    """
 
-    for begin in np.linspace(0, total, _TRIES, endpoint=False).astype(np.int64).tolist():
-        meter = DelayEstimator(welch.sampling_rate, window, columns)
-        found.clear()
-        first = np.arange(begin, min(begin + 2 * meter.min_segments, total))
-        if measure(first):
-            rest = np.setdiff1d(np.linspace(0, total - 1, _SPREAD).astype(np.int64), first)
-            at_once = max(1, _VALUES_AT_ONCE // (welch.segment_length * int(edges[-1])))
-            for some in np.split(rest, range(at_once, len(rest), at_once)):
-                measure(some)
-            break
-    none = np.empty(0), np.empty((0, len(columns))), np.empty((0, len(columns)))
-    at, delays, std = map(np.concatenate, zip(none, *found, strict=True))
-    order = np.argsort(at)
-    return at[order], delays[order], std[order]
+    def __init__(
+        self,
+        aligned: AlignedRecording,
+        welch: WelchSettings,
+        sensors: tuple[int, ...],
+        *,
+        most: float,
+        longest: float,
+    ) -> None:
+        self._aligned, self._most = aligned, most
+        edges = np.cumsum([0, *aligned.dims])
+        self._columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
+        self._n_channels = int(edges[-1])
+        n_first = 2 * DelayEstimator(welch.sampling_rate, np.empty(0), self._columns).min_segments
+        length = min(
+            aligned.n_available / _PIECES,
+            longest * welch.sampling_rate,
+            2 * _MOST_VALUES / (n_first * self._n_channels),
+        )
+        self._welch = replace(welch, segment_length=max(round(length), _SHORTEST), overlap=0.5)
+        hop, length = self._welch.hop, self._welch.segment_length
+        self.total = max(0, (aligned.n_available - length) // hop + 1)
+        self.first = np.arange(min(n_first, self.total))
+
+    def begin(self) -> list[Delays]:
+        """Measure the first pieces, where there is motion; return nothing if there is none."""
+        n_first = len(self.first)
+        for begin in np.linspace(0, self.total, _TRIES, endpoint=False).astype(np.int64).tolist():
+            window = get_window(self._welch.window, self._welch.segment_length)
+            self.meter = DelayEstimator(self._welch.sampling_rate, window, self._columns)
+            self.first = np.arange(begin, min(begin + n_first, self.total))
+            found = self.measure(self.first, at_once=n_first)
+            if any(np.isfinite(std).any(axis=0).sum() > 1 for _, _, std in found):
+                return found  # one is the reference
+        return []
+
+    def measure(self, numbers: IntArray, *, at_once: int = 0) -> list[Delays]:
+        """Return grid positions, delays and their standard deviations of pieces that are usable."""
+        found = []
+        length = self._welch.segment_length
+        at_once = at_once or max(1, _VALUES_AT_ONCE // (length * self._n_channels))
+        for some in np.split(numbers, range(at_once, len(numbers), at_once)):
+            parts = [self._piece(n) for n in some.tolist()]
+            known = np.array([samples is not None for samples in parts], dtype=bool)
+            kept = [samples for samples in parts if samples is not None]
+            if kept:
+                starts = np.arange(len(kept)) * length
+                at = some[known] * self._welch.hop + length / 2
+                found.append((at, *self.meter.measure(np.concatenate(kept), starts)))
+        return found
+
+    def _piece(self, number: int) -> FloatArray | None:
+        begin = number * self._welch.hop
+        if begin + self._welch.segment_length > self._aligned.n_available:
+            return None  # clocks that have been set may end earlier
+        samples, valid = self._aligned.read(begin, begin + self._welch.segment_length)
+        valid &= np.isfinite(samples).all(axis=1)
+        return around_gaps(self._aligned, self._welch, samples, valid, begin, most=self._most)
 
 
-def _segment(
-    aligned: AlignedRecording, welch: WelchSettings, number: int, most: float
-) -> FloatArray | None:
-    begin = number * welch.hop
-    samples, valid = aligned.read(begin, begin + welch.segment_length)
-    valid &= np.isfinite(samples).all(axis=1)
-    return around_gaps(aligned, welch, samples, valid, begin, most=most)
+def _follow(
+    aligned: AlignedRecording, welch: WelchSettings, *, most: float, longest: float
+) -> None:
+    """Set clocks by delays in a stretch that grows.
+
+    Over hours they drift by more than a segment is long. Each setting brings the next pieces near
+    enough to be measured.
+    """
+    pieces = _Pieces(aligned, welch, aligned.measurable, most=most, longest=longest)
+    found = pieces.begin()
+    if not found:
+        return
+    low, high = int(pieces.first[0]), int(pieces.first[-1]) + 1
+    while True:
+        for at, delays, std in found:
+            frame_delays = pieces.meter.frame_delays
+            aligned.learn(at, delays, std=std, frame_delays=frame_delays)
+        aligned.set_clocks()
+        if low == 0 and high == pieces.total:
+            return
+        more = math.ceil(_GROWTH * (high - low))
+        low, before, high, after = max(0, low - more), low, min(pieces.total, high + more), high
+        new = np.concatenate([np.arange(low, before), np.arange(after, high)])
+        found = pieces.measure(new[:: math.ceil(len(new) / _STEP)])

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from daq.alignment.aligned_recording import AlignedRecording
+from daq.estimation.estimation import estimate
+from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
+from daq.timing.device_utc import corrected
 from sim_devices.world.scenario import Scenario
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 from tui.studies.synthesis import synthesise
@@ -109,3 +112,40 @@ def test_sensors_without_utc_are_in_the_time_of_those_with_it(
         -25, abs=3 * other.residual / 600 * 12**0.5 * 1e6
     )
     assert other.residual < 1e-4  # 5e-3 is what 30 ppm would leave
+
+
+def test_utc_that_drifts_is_corrected_though_the_computer_has_another_date(tmp_path: Path) -> None:
+    sensor = {"sampling_rate": 50.0, "noise": [{"shape": "white", "level": 1e-12}]}
+    scenario = Scenario.from_dict(
+        {
+            "seed": 1,
+            "motion": {"spectra": [{"shape": "white", "level": 1e-8}]},
+            "sensors": {
+                n: sensor | {"clock": {"ppm": p}} for n, p in zip("abc", (0, 5, -3), strict=True)
+            },
+        }
+    )
+    path = tmp_path / "r.h5"
+    synthesise(path, scenario, duration=480, utc={"a": 3600.0, "b": 3600.0}, has_gps=False)
+    snapshot = estimate([path], Settings(segment=2.0))
+    drift = 5e-6 * 480 / np.sqrt(12)
+    assert [clock.refined for clock in snapshot.clocks] == [False, True, True]
+    assert snapshot.clocks[1].corrected == pytest.approx(drift, rel=0.1)
+    noise = snapshot.results["three-sensor"].noise_psd[2:40].mean(axis=0)
+    assert np.abs(noise / 1e-12 - 1).max() < 0.1
+
+
+def test_a_drift_is_counted_within_epochs_and_not_between_dates(tmp_path: Path) -> None:
+    sensors = {"a": Sensor(counts(6000, 1, 1), utc=True, restarts=(500,))}
+    writer = create(tmp_path / "r.h5", sensors)
+    for block in blocks("a", sensors["a"]):
+        counter = block.device_counter
+        assert counter is not None
+        past = 40 * 365 * 86_400 * 10**9 if block.first_sample < 500 else 0
+        writer.append(replace(block, device_counter=counter - past))
+    writer.close()
+    with Recording.open(tmp_path / "r.h5") as recording:
+        stated = AlignedRecording(recording)._sources[0].known_clock  # noqa: SLF001
+    state = replace(stated.state, refined=True)
+    found = corrected(stated, replace(stated, state=state), moved=0.0)
+    assert found.state.corrected < 1e-6

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from daq.estimation.estimation import Estimation, estimate
-from daq.estimation.segments.stated_times import drifts
+from daq.estimation.segments.stated_times import drift_of
 from daq.estimation.settings import Settings
+from daq.results.band_summary import channel_means
 from daq.timing.clock_model import ClockSource
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
@@ -85,6 +86,49 @@ def test_a_beginning_without_motion_does_not_hide_a_drift(tmp_path: Path) -> Non
     assert snapshot.clocks[2].corrected > 1e-4
 
 
+def test_a_first_sensor_without_the_motion_is_not_the_reference(tmp_path: Path) -> None:
+    sensors = huddle(1e4, PPM)
+    noise = np.random.default_rng(3).integers(-10_000, 10_000, (24_000, 1), dtype=np.int32)
+    first = Sensor(noise, rate=RATE, utc=True)
+    snapshot = estimate([write(tmp_path / "r.h5", {"0": first} | sensors)], SETTINGS)
+    found = snapshot.results["three-sensor"]
+    ratio = found.noise_psd[BAND, 1:].mean(axis=0) / (1e12 * NOISE)
+    assert np.abs(ratio - 1).max() < 0.1
+    assert snapshot.diagnostics.synchronisation.reference == "a"
+    drifting, unchecked = wrong_times(snapshot)
+    assert "against those of a" in drifting
+    assert unchecked.startswith("The times that 0 states could not be compared")
+
+
+def test_a_drift_that_segments_are_too_short_for_widens_the_intervals(tmp_path: Path) -> None:
+    path = write(tmp_path / "r.h5", huddle(0.8, (0.0, 60.0, -60.0)))
+    short, longer = (estimate([path], replace(SETTINGS, segment=each)) for each in (1.0, 10.0))
+    assert [clock.drifts for clock in short.clocks] == [False, True, True]
+    assert "b and c could not be corrected" in wrong_times(short)[0]
+    assert [clock.drifts for clock in longer.clocks] == [False, False, False]
+    for snapshot in (short, longer):
+        means = channel_means(snapshot.results["three-sensor"], snapshot, SETTINGS, (1.0, 20.0))
+        for mean in means:
+            assert mean.low[0] < 1e12 * NOISE < mean.high[0]
+
+
+def test_what_is_said_of_times_is_that_of_all_recordings(tmp_path: Path) -> None:
+    later = huddle(1e4, (0.0, 0.0, 0.0))
+    for sensor in later.values():
+        sensor.start = 1000.0
+    drifting = write(tmp_path / "1.h5", huddle(1e4, PPM))
+    snapshot = estimate([drifting, write(tmp_path / "2.h5", later)], SETTINGS)
+    assert re.search(r"c by 2[78]. µs", wrong_times(snapshot)[0])
+
+
+def test_a_few_seconds_are_said_not_to_be_compared(tmp_path: Path) -> None:
+    sensors = huddle(1e4, (0.0, 0.0, 0.0))
+    for sensor in sensors.values():
+        sensor.counts = sensor.counts[:1500]
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
+    assert wrong_times(snapshot)[0].startswith("The times that b and c state could not be")
+
+
 def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: Path) -> None:
     path = write(tmp_path / "r.h5", huddle(1e4, (0.0, 0.0, 0.0)))
     snapshot = estimate([path], SETTINGS)
@@ -126,26 +170,35 @@ def delays(seed: int, n: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.arange(float(n)), np.random.default_rng(seed).normal(0, std), std
 
 
+def drift(at: np.ndarray, late: np.ndarray, std: np.ndarray, *, nominal: bool = True) -> float:
+    return drift_of(at, late, std, nominal=nominal, duration=64.0)
+
+
 def test_steady_delays_are_never_called_drifting() -> None:
-    assert not any(
-        drifts(*delays(seed), nominal=nominal) for seed in range(500) for nominal in (False, True)
-    )
+    found = {
+        drift(*delays(seed), nominal=nominal) for seed in range(500) for nominal in (False, True)
+    }
+    assert found == {0.0}
 
 
 def test_delays_that_drift_by_three_standard_deviations_are() -> None:
     at, steady, std = delays(1)
-    assert drifts(at, steady + 1e-5 * at / at[-1], std, nominal=True)
-    assert not drifts(at[:15], steady[:15] + 1e-5 * at[:15] / at[15], std[:15], nominal=True)
+    drifting = steady + 1e-5 * at / at[-1]
+    assert drift(at, drifting, std) == pytest.approx(1e-5 / np.sqrt(12), rel=0.1)
+    far = steady + 1e-4 * at / at[-1]
+    known = at < 32  # the rest can no longer be measured
+    assert drift(at, far, np.where(known, std, np.inf)) == pytest.approx(2.9e-5, rel=0.1)
+    assert np.isnan(drift(at[:15], drifting[:15], std[:15]))
 
 
 def test_scatter_of_measured_delays_alone_is_waves_that_cross_a_nominal_bench() -> None:
     at, steady, std = delays(2)
-    assert not drifts(at, 10 * steady, std, nominal=True)
-    assert drifts(at, 10 * steady, std, nominal=False)
+    assert drift(at, 10 * steady, std) == 0
+    assert drift(at, 10 * steady, std, nominal=False) > 0
 
 
 def test_delays_that_nobody_knows_do_not_count() -> None:
     at, steady, std = delays(3)
     unknown = np.where(at % 2 == 0, np.inf, std)
     wild = np.where(at % 2 == 0, 1e-3 * at, steady)
-    assert not drifts(at, wild, unknown, nominal=True)
+    assert drift(at, wild, unknown) == 0
