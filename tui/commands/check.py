@@ -73,8 +73,9 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
             found, errors = runner.run(probe_bench(bench, clock))
         if found:
             screen.print(_device_table(found))
+            expected = {sensor.name: sensor.serial_number for sensor in bench.sensors}
             for entry in found:
-                for remark in _remarks(entry):
+                for remark in remarks(entry, expected[entry.information.sensor]):
                     screen.print(f"  {entry.information.sensor}: {remark}")
             screen.print(_channel_table(found))
     if write and (identities := new_identities(bench, found)):
@@ -209,8 +210,11 @@ def _device_table(found: Sequence[SensorCheck]) -> Table:
     return table
 
 
-def _remarks(entry: SensorCheck) -> Iterator[str]:
-    """Yield remarks on a sensor, one per line."""
+def remarks(entry: SensorCheck, serial_number: str) -> Iterator[str]:
+    """Yield remarks on a sensor, for which the bench file expects a serial number or none."""
+    about = entry.information
+    if serial_number and not about.serial_number and not about.trouble:
+        yield f"states no serial number: {serial_number!r} of the bench file cannot be checked"
     if entry.clipped:
         yield "clipped: samples at the end of the range"
     if entry.n_missing:

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -15,11 +16,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.acquisition.before_test.device_check import SensorCheck
+from daq.drivers.interface import DeviceInformation
 from daq.python_process import python_command
 from sim_devices.world.paper_scenarios import SCENARIOS
 from tui.cli.help import subcommand
 from tui.cli.main import app, main
 from tui.cli.subcommands import MODULES, PANELS
+from tui.commands.check import remarks
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]
@@ -322,6 +326,15 @@ def test_check_names_sensor_and_port_that_are_not_there(tmp_path: Path) -> None:
     for name, port in (("A", "tty0"), ("B", "tty1"), ("C", "tty2")):
         assert any(name in line and port in line for line in result.stderr.splitlines())
     assert len(json.loads(result.stdout)["errors"]) == 3
+
+
+def test_check_says_where_a_serial_number_cannot_be_checked() -> None:
+    found = SensorCheck(DeviceInformation("A"), 200, 0, 100.0, False, (), ())
+    assert list(remarks(found, "")) == []
+    (remark,) = remarks(found, "1001")
+    assert "'1001' of the bench file cannot be checked" in remark
+    known = replace(found, information=DeviceInformation("A", serial_number="1001"))
+    assert list(remarks(known, "1001")) == []
 
 
 def test_serve_lists_the_next_runs_and_wants_cron_lines(tmp_path: Path) -> None:
