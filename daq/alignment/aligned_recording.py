@@ -22,7 +22,7 @@ import numpy as np
 from daq.alignment.grid import SNAP, Grid, grid_rate
 from daq.alignment.resampling import USABLE
 from daq.alignment.sensor_reader import SensorSource, main_columns
-from daq.alignment.stated_utc import place_stated, undoubted
+from daq.alignment.stated_utc import place_stated, take_drift, undoubted
 from daq.errors import CannotAlignError
 from daq.timing.clock_model import ClockSource, ClockState, nominal
 from daq.timing.utc_rate import UtcRate
@@ -99,7 +99,7 @@ class AlignedRecording:
         self._end = math.inf
         self._at_face_value = nominal_clocks
         self._measured_against: int | None = None
-        self._stated_reference: int | None = None
+        self.stated_reference: int | None = None  # where stated UTC drifts
         self._frame_delays: tuple[tuple[int, ...], FrameDelays] | None = None
         self.refresh()
 
@@ -208,7 +208,7 @@ class AlignedRecording:
     @property
     def stated(self) -> tuple[int, ...]:
         """Indices of sensors that state UTC and are not doubted: the reference, two per clock."""
-        return undoubted(self._sources, self._stated_reference)
+        return undoubted(self._sources, self.stated_reference)
 
     def compare_stated(self, drift: Mapping[int, float], reference: int) -> bool:
         """Take by how much stated UTC drifts, in s rms; return whether that of any sensor does.
@@ -220,17 +220,16 @@ class AlignedRecording:
         reference : int
             The sensor against which.
         """
-        names = {self._sources[number].clock_name for number, each in drift.items() if each > 0}
-        for source in self._sources:
-            found = [drift[n] for n in drift if self._sources[n].clock_name == source.clock_name]
-            if source.device_utc and not source.doubted and found:
-                known = [each for each in found if not math.isnan(each)]
-                source.drift = max(known, default=math.nan)
-        if names:
-            self._stated_reference = reference
+        unchecked = [source.unchecked for source in self._sources]
+        take_drift(self._sources, drift, reference)
+        found = any(self._sources[number].doubted for number in drift)
+        if found:
+            self.stated_reference, self._measured_against = reference, None
+            self.reset_delays()  # they were measured against another sensor
             self._lay_grid()
-        self.set_clocks()
-        return bool(names)
+        if found or unchecked != [source.unchecked for source in self._sources]:
+            self.set_clocks()
+        return found
 
     def learn(
         self, at: FloatArray, delays: FloatArray, *, std: FloatArray, frame_delays: FrameDelays

@@ -45,7 +45,8 @@ _NEWTON_STEPS = 3
 MIN_SEGMENTS = 6
 """Segments of the first batch for each channel of the reference: P is their mean."""
 _SHARED = 0.1  # samples; precision of delays in most segments, for sensors with common motion
-_REFERENCES = 3  # maximum number of sensors tried as reference, to bound the cost
+REFERENCES = 3
+"""Maximum number of sensors tried as reference, to bound the cost."""
 _SIGNIFICANT = 50.0  # 2 E / κ: a peak of seven standard deviations
 _LONGEST = 32.0  # samples, in both directions
 _CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
@@ -89,11 +90,14 @@ class DelayEstimator:
     window : float64, shape (segment_length,)
     columns : tuple of slice
         Columns of the samples of each sensor, with the preferred reference first.
+    n_candidates : int
+        Sensors tried as reference.
     """
 
     sampling_rate: float
     window: FloatArray
     columns: tuple[slice, ...]
+    n_candidates: int = REFERENCES
     _reference: int = 0
     _frames: dict[int, _Frame] = field(default_factory=dict)
 
@@ -165,7 +169,7 @@ class DelayEstimator:
         """Return the reference, and the others' delays and standard deviations against it."""
         best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
         most = -1
-        for reference, x0 in enumerate(sensors[:_REFERENCES]):
+        for reference, x0 in enumerate(sensors[: self.n_candidates]):
             power = _products(x0, x0)
             found = {
                 number: self._first_delays(x0, xj, power)

@@ -86,6 +86,11 @@ class SensorSource:
         return self.drift is not None and self.drift > 0
 
     @property
+    def unchecked(self) -> bool:
+        """Whether its stated UTC could not be compared with the motion."""
+        return self.drift is not None and math.isnan(self.drift)
+
+    @property
     def end_sample(self) -> int:
         """Index of the sample after the last one."""
         run = self.runs[-1]
@@ -221,9 +226,9 @@ class SensorSource:
 
     def _judged(self, clock: Clock) -> Clock:
         """Return the clock of stated UTC with what its comparison with the motion says of it."""
-        if self.drift is None or (self.doubted and clock.state.refined):
+        if self.drift is None or clock.state.refined:
             return clock
-        if math.isnan(self.drift):
+        if self.unchecked:
             return replace(clock, state=replace(clock.state, unchecked=True))
         return replace(clock, state=replace(clock.state, residual=self.drift, drifts=self.doubted))
 

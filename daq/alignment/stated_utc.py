@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daq.alignment.sensor_reader import SensorSource
 
@@ -23,6 +24,22 @@ def undoubted(sources: Sequence[SensorSource], reference: int | None) -> tuple[i
             seen[source.clock_name] = taken + 1
             found += [number] if number != reference else []
     return tuple(found)
+
+
+def take_drift(sources: Sequence[SensorSource], drift: Mapping[int, float], reference: int) -> None:
+    """Set by how much stated UTC drifts: the most of any sensor on a clock, and NaN if none knows.
+
+    The clock of the reference does not drift: what drifts beside it is a sensor.
+    """
+    for source in sources:
+        if not source.device_utc or source.doubted:
+            continue
+        found = [each for n, each in drift.items() if sources[n].clock_name == source.clock_name]
+        known = [each for each in found if not math.isnan(each)]
+        if source.clock_name == sources[reference].clock_name:
+            known = [0.0] * bool(known)
+        if found:
+            source.drift = max(known, default=math.nan)
 
 
 def place_stated(sources: Sequence[SensorSource]) -> None:

@@ -177,6 +177,7 @@ def bias_of_clocks(
     coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
     turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
     lost = np.expm1(np.minimum(turn**2, _MOST_TURN))
+    coherent = np.where(turn > 1, np.abs(coherent), coherent)  # else nothing but scatter is left
     with np.errstate(invalid="ignore", divide="ignore"):
         return replace(found, noise_bias=lost * coherent / np.abs(noise))
 

@@ -33,7 +33,7 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
     inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
     noise = found.noise_psd[inside]
     known = np.isfinite(share[inside] * noise)
-    added = np.where(known, share[inside] * np.abs(noise), 0.0)
+    added = np.where(known, np.minimum(share[inside], 1.0) * np.abs(noise), 0.0)
     total = np.where(known, noise, 0.0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))

@@ -191,7 +191,8 @@ class ClockState:
     def shared_by(self, sensor: str) -> ClockState:
         """Return the state of a sensor that is sampled by this clock."""
         name = self.shared_clock or self.sensor
-        return replace(self, sensor=sensor, source=ClockSource.SHARED_CLOCK, shared_clock=name)
+        state = replace(self, corrected=0.0, drifts=False, unchecked=False)  # it states no time
+        return replace(state, sensor=sensor, source=ClockSource.SHARED_CLOCK, shared_clock=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -152,7 +152,7 @@ def _short(value: float) -> str:
 
 def wrong_times(snapshot: Snapshot) -> list[str]:
     """Return remarks on stated UTC that drifts against the motion, or could not be compared."""
-    wrong = [clock for clock in snapshot.clocks if clock.corrected]
+    wrong = [clock for clock in snapshot.clocks if clock.corrected and not clock.drifts]
     lost = [clock for clock in snapshot.clocks if clock.drifts]
     unchecked = [clock.sensor for clock in snapshot.clocks if clock.unchecked]
     lines = []
@@ -166,12 +166,12 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
         text += f" the motion shows: {by}."
     if wrong:
         left = snapshot.diagnostics.synchronisation.residual
-        worst = max(left[clock.sensor] for clock in wrong) * 1e6
-        text += f" {'They' if not lost else listed([c.sensor for c in wrong])} were corrected to"
-        text += f" within about {_short(worst)} µs."
+        worst = max(each.residual if lost else left[each.sensor] for each in wrong) * 1e6
+        those = f"Those of {listed([each.sensor for each in wrong])}" if lost else "They"
+        text += f" {those} were corrected to within about {_short(worst)} µs."
     if lost:
-        text += f" {listed([clock.sensor for clock in lost])} could not be corrected: the motion is"
-        text += " too weak for so short segments. Choose longer ones."
+        text += f" Those of {listed([each.sensor for each in lost])} could not be corrected: the"
+        text += " motion is too weak for so short segments. Choose longer ones."
     if wrong or lost:
         text += " Check whether the clocks were synchronised, or whether waves changed direction."
         lines.append(text)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.delay_estimation import MIN_SEGMENTS, DelayEstimator
+from daq.alignment.delay_estimation import MIN_SEGMENTS, REFERENCES, DelayEstimator
 from estimator.spectra.gap_window import gap_window, without_trend
 from estimator.spectra.windows import get_window
 
@@ -84,7 +84,8 @@ class DelayMeasurement:
             sensors = self._aligned.measurable
             columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
             window = get_window(self._welch.window, self._welch.segment_length)
-            self._meter = DelayEstimator(self._welch.sampling_rate, window, columns)
+            rate, fixed = self._welch.sampling_rate, self._aligned.stated_reference is not None
+            self._meter = DelayEstimator(rate, window, columns, 1 if fixed else REFERENCES)
         if not (together and self._meter.has_frame):
             self._learn(samples, starts, begin)
             return

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.alignment.delay_estimation import DelayEstimator
+from daq.alignment.delay_estimation import REFERENCES, DelayEstimator
 from daq.estimation.segments.delay_measurement import around_gaps
 from daq.timing.quantiles import median
 from estimator.spectra.windows import get_window
@@ -65,8 +65,9 @@ def compare(aligned: AlignedRecording, settings: Settings, welch: WelchSettings)
     longest = _LONGEST
     drift, reference = _drifts(aligned, welch, sensors, most=settings.bridge, longest=longest)
     unknown = sum(map(math.isnan, drift.values()))
-    if unknown:  # gaps may leave nothing of long pieces
-        short = settings.segment
+    short = settings.segment
+    of_short = aligned.n_available / welch.sampling_rate / _PIECES
+    if unknown and short < min(longest, of_short):  # gaps may leave nothing of long pieces
         found, against = _drifts(aligned, welch, sensors, most=settings.bridge, longest=short)
         if sum(map(math.isnan, found.values())) < unknown:
             drift, reference, longest = found, against, short
@@ -165,11 +166,12 @@ class _Pieces:
         edges = np.cumsum([0, *aligned.dims])
         self._columns = tuple(slice(int(edges[n]), int(edges[n + 1])) for n in sensors)
         self._n_channels = int(edges[-1])
-        n_first = 2 * DelayEstimator(welch.sampling_rate, np.empty(0), self._columns).min_segments
+        fewest = DelayEstimator(welch.sampling_rate, np.empty(0), self._columns).min_segments
+        n_first = max(2 * fewest, 3 * _PARTS)
         length = min(
             aligned.n_available / _PIECES,
             longest * welch.sampling_rate,
-            2 * _MOST_VALUES / (n_first * self._n_channels),
+            _MOST_VALUES / (n_first * self._n_channels),
         )
         self._welch = replace(welch, segment_length=max(round(length), _SHORTEST), overlap=0.5)
         hop, length = self._welch.hop, self._welch.segment_length
@@ -181,7 +183,10 @@ class _Pieces:
         n_first = len(self.first)
         for begin in np.linspace(0, self.total, _TRIES, endpoint=False).astype(np.int64).tolist():
             window = get_window(self._welch.window, self._welch.segment_length)
-            self.meter = DelayEstimator(self._welch.sampling_rate, window, self._columns)
+            fixed = self._aligned.stated_reference is not None
+            self.meter = DelayEstimator(
+                self._welch.sampling_rate, window, self._columns, 1 if fixed else REFERENCES
+            )
             self.first = np.arange(begin, min(begin + n_first, self.total))
             found = self.measure(self.first, at_once=n_first)
             if any(np.isfinite(std).any(axis=0).sum() > 1 for _, _, std in found):
