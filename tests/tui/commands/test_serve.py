@@ -80,7 +80,7 @@ async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_ro
     assert {(each.sensor, each.channel) for each in run.noise} == {
         (sensor, channel) for sensor in "ABC" for channel in "XYZ"
     }
-    assert all(0 < each.low < each.psd < each.high for each in run.noise)
+    assert all(each.psd > 0 and each.low < each.psd < each.high for each in run.noise)
     assert all(each.serial_number for each in run.noise)
     out = bench.recording_directory / run.parts[0]
     names = {entry.name for entry in out.parent.iterdir()}
