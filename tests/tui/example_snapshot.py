@@ -29,7 +29,9 @@ from daq.recording.sensor_state import SensorState
 from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 from daq.timing.clock_model import ClockSource, ClockState
+from estimator.diagnostics.advice import NoSharedMotion
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
+from estimator.diagnostics.kinds import Level
 from estimator.methods import self_noise
 
 if TYPE_CHECKING:
@@ -49,6 +51,16 @@ SENSORS = ("A", "B", "C")
 CHANNELS = ("X", "Y", "Z")
 RATE = 200.0
 PPM, RESIDUALS = (5.9, -9.1, 4.0), (0.0, 0.4e-6, 0.6e-6)
+
+STRANGER = NoSharedMotion(
+    level=Level.PROBLEM,
+    sensors=(0,),
+    band=(0.5, 100.0),
+    partners=(1, 2),
+    share=0.001,
+    share_of_partners=0.99,
+)
+"""The first sensor is elsewhere."""
 
 
 def rotation(degrees: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -11,12 +11,11 @@ import pytest
 from daq.bench.model import Limit
 from daq.drivers.bench_file import parse
 from daq.errors import HuddleError
-from estimator.diagnostics.advice import NoSharedMotion
-from estimator.diagnostics.kinds import Level
 from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
 from tests.tui.example_snapshot import (
     SETTINGS,
+    STRANGER,
     ProgressCallback,
     demo_bench,
     diagnosed,
@@ -135,16 +134,8 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
 
 async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressCallback) -> None:
     snapshot = diagnosed()
-    stranger = NoSharedMotion(
-        level=Level.PROBLEM,
-        sensors=(0,),
-        band=(0.5, 100.0),
-        partners=(1, 2),
-        share=0.001,
-        share_of_partners=0.99,
-    )
     assert snapshot.diagnostics.diagnosis is not None
-    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(stranger,))
+    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
     diagnostics = replace(snapshot.diagnostics, diagnosis=diagnosis)
     snapshot = replace(snapshot, diagnostics=diagnostics, closed=False)
     live = tuple(replace(s, overdue_for=0.0, state=made_now().sensors[0].state)

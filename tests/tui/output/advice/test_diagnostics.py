@@ -18,12 +18,11 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
-from estimator.diagnostics.advice import NoSharedMotion
-from estimator.diagnostics.kinds import Level, Untested
+from estimator.diagnostics.kinds import Untested
 from estimator.diagnostics.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot, rotation
+from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, made_snapshot, rotation
 from tui.output.advice.diagnostics import details, summary
 from tui.output.results import remarks, result_table
 
@@ -203,16 +202,6 @@ def test_why_there_is_no_diagnosis_is_said(why: Untested) -> None:
     assert str(only).endswith(".")
     assert ("first segments" in str(only)) == (why is Untested.UNFINISHED)
     assert summary(snapshot) == []
-
-
-STRANGER = NoSharedMotion(
-    level=Level.PROBLEM,
-    sensors=(0,),
-    band=(0.5, 100.0),
-    partners=(1, 2),
-    share=0.001,
-    share_of_partners=0.99,
-)
 
 
 def test_what_may_come_from_a_clock_that_is_not_known_says_so() -> None:
