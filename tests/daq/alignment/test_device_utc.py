@@ -12,7 +12,7 @@ from daq.alignment.aligned_recording import AlignedRecording
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
-from daq.timing.device_utc import corrected
+from daq.timing.device_utc import corrected, from_device_utc
 from sim_devices.world.scenario import Scenario
 from tests.daq.alignment.recordings import ORIGIN, Sensor, blocks, counts, create, write
 from tui.studies.synthesis import synthesise
@@ -135,17 +135,10 @@ def test_utc_that_drifts_is_corrected_though_the_computer_has_another_date(tmp_p
     assert np.abs(noise / 1e-12 - 1).max() < 0.1
 
 
-def test_a_drift_is_counted_within_epochs_and_not_between_dates(tmp_path: Path) -> None:
-    sensors = {"a": Sensor(counts(6000, 1, 1), utc=True, restarts=(500,))}
-    writer = create(tmp_path / "r.h5", sensors)
-    for block in blocks("a", sensors["a"]):
-        counter = block.device_counter
-        assert counter is not None
-        past = 40 * 365 * 86_400 * 10**9 if block.first_sample < 500 else 0
-        writer.append(replace(block, device_counter=counter - past))
-    writer.close()
-    with Recording.open(tmp_path / "r.h5") as recording:
-        stated = AlignedRecording(recording)._sources[0].known_clock  # noqa: SLF001
-    state = replace(stated.state, refined=True)
-    found = corrected(stated, replace(stated, state=state), moved=0.0)
-    assert found.state.corrected < 1e-6
+def test_a_drift_is_counted_within_epochs_and_not_between_dates() -> None:
+    index = [np.arange(0.0, 500.0), np.arange(500.0, 6000.0)]
+    seconds = [index[0] / 100.0 - 40 * 365 * 86_400, index[1] / 100.0]
+    spans = [(0, 500, index[0], seconds[0]), (500, 6000, index[1], seconds[1])]
+    stated = from_device_utc("a", spans, sampling_rate=100.0, moved=0.0)
+    found = replace(stated, state=replace(stated.state, refined=True))
+    assert corrected(stated, found, moved=0.0).state.corrected < 1e-6

@@ -60,3 +60,4 @@ async def resized(pilot: Pilot[None], size: tuple[int, int]) -> None:
         if still == AT_REST:
             return
         before = now
+    raise AssertionError(f"the screen of {pilot.app.screen.size} does not come to rest at {size}")

@@ -71,9 +71,11 @@ def _by_clocks(snapshot: Snapshot) -> list[str]:
     """Return a line on clocks so little known that what is wrong may come from them."""
     if not any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
         return []
-    short = _TURN / (2 * math.pi * highest_known(snapshot))
-    left = snapshot.diagnostics.synchronisation.residual
-    loose = {sensor: late for sensor, late in left.items() if late > short}
+    left, omega = (
+        snapshot.diagnostics.synchronisation.residual,
+        2 * math.pi * highest_known(snapshot),
+    )
+    loose = {sensor: late for sensor, late in left.items() if omega * late > _TURN}
     if not loose:
         return []
     clocks = "clock" if len(loose) == 1 else "clocks"

@@ -155,7 +155,7 @@ def draw(rng: np.random.Generator) -> Drawn:
 
 def _stated(rng: np.random.Generator, names: str) -> tuple[str, ...]:
     n_stated = len(names) if rng.random() < 0.5 else int(rng.integers(1, len(names)))
-    return tuple(rng.permutation(list(names))[:n_stated]) if rng.random() < STATED else ()
+    return tuple(rng.permutation(list(names))[:n_stated].tolist()) if rng.random() < STATED else ()
 
 
 def _clock(rng: np.random.Generator, seconds: float) -> dict[str, Any]:
