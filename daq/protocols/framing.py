@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 OctetArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
-PIECE = 65536
-"""Maximum number of bytes per search: bounds the work that garbage can cause."""
+_WINDOWS_AT_ONCE = 1 << 14
+"""Bounds the memory that a search of garbage takes."""
 
 
 def find_frames(
@@ -30,7 +30,7 @@ def find_frames(
     Parameters
     ----------
     octets : uint8, shape (n_bytes,)
-        All bytes received and not yet consumed; at most ``PIECE`` bytes and one frame.
+        All bytes received and not yet consumed.
     size : int
         Length of a frame in bytes.
     valid : callable
@@ -50,7 +50,9 @@ def find_frames(
     position = n_good * size
     if n_good == n_frames:
         return runs, position
-    at_any = valid(sliding_window_view(octets, size))
+    windows = sliding_window_view(octets, size)
+    pieces = range(0, len(windows), _WINDOWS_AT_ONCE)
+    at_any = np.concatenate([valid(windows[at : at + _WINDOWS_AT_ONCE]) for at in pieces])
     starts = np.flatnonzero(at_any)
     while (following := int(np.searchsorted(starts, position))) < starts.size:
         start = int(starts[following])

@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.protocols.block import Block, BlockFlag, Event, EventKind
 from daq.protocols.epson.commands import BURST_HEADER, DELIMITER, FLAG_ERROR, are_sums_right
-from daq.protocols.framing import PIECE, BoolArray, OctetArray, find_frames
+from daq.protocols.framing import BoolArray, OctetArray, find_frames
 from daq.protocols.plural import several
 from daq.protocols.sample_counter import Run, SampleCounter
 
@@ -114,12 +114,7 @@ class BurstDecoder:
 
     def receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
         """Return the blocks and events of all frames completed by ``data``."""
-        found: list[Block | Event] = []
-        for start in range(0, len(data), PIECE):
-            found += self._receive(self._left + data[start : start + PIECE], at)
-        return found
-
-    def _receive(self, data: bytes, at: HostTime) -> list[Block | Event]:
+        data = self._left + data
         octets = np.frombuffer(data, np.uint8)
         runs, consumed = find_frames(octets, self._size, self._valid)
         self._left = data[consumed:]
