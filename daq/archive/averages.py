@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -31,6 +32,8 @@ from estimator.spectra.welch import WelchSettings, scale
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from daq.archive.plan import Plan
@@ -132,6 +135,7 @@ class Estimator:
                 self.channels,
                 dimensions=estimates.dimensions,
                 faulty={*average.clipped, *average.stood_still},
+                aligned=_aligned(average.residual),
             )
             diagnostics = Findings.of(
                 found,
@@ -166,6 +170,12 @@ class Estimator:
             left_out={reason: average.left_out[reason] for reason in Reason},
             diagnostics=diagnostics,
         )
+
+
+def _aligned(residual: Mapping[str, float]) -> set[tuple[str, str]]:
+    """Return the pairs of sensors of which something is left between the clocks."""
+    pairs = itertools.permutations(residual.items(), 2)
+    return {(one, other) for (one, left), (other, right) in pairs if left or right}
 
 
 class Average:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
+from daq.timing.clock_model import RelativeTime
 from estimator.diagnostics.advice import Advice, Gain
 from estimator.diagnostics.diagnose import Diagnostics, diagnose
 from estimator.diagnostics.kinds import Level, Untested
@@ -161,6 +163,15 @@ def clock_states(passes: Sequence[Pass]) -> tuple[ClockState, ...]:
     return tuple(states)
 
 
+def aligned_pairs(clocks: Sequence[ClockState]) -> set[tuple[str, str]]:
+    """Return the pairs of sensors whose delay cannot be told from their clocks."""
+    return {
+        (one.sensor, other.sensor)
+        for one, other in itertools.permutations(clocks, 2)
+        if one.relative_time(other) is RelativeTime.ALIGNED
+    }
+
+
 def bias_of_clocks(
     found: Synchronisation,
     *,
@@ -205,6 +216,7 @@ def diagnosis(
     *,
     dimensions: Dimensions | None = None,
     faulty: Collection[int] = (),
+    aligned: Collection[tuple[str, str]] = (),
     course: SegmentCourse | None = None,
 ) -> tuple[Diagnosis | None, Untested | None]:
     """Diagnose the test.
@@ -212,6 +224,7 @@ def diagnosis(
     The tested model has the dimensions of the settings; where `dimensions` were chosen by the
     motion, as many as the largest sensor has channels. `faulty` channels, by column, are clipped or
     were dead for a while: their sensitivities are not reported as wrong.
+    Delays between sensors that are `aligned` by their motion or by arrival times are not known.
     `course` is that of the segments of the only band.
 
     Returns
@@ -258,7 +271,12 @@ def diagnosis(
         n_factors=found[0].n_factors,
         pairs=found[0].pairs,
         bands=tuple(band for each in found for band in each.bands),
-        responses=clearest.responses,
+        responses=tuple(
+            replace(each, delay=math.nan, delay_error=math.nan)
+            if (sensors[each.first], sensors[each.second]) in aligned
+            else each
+            for each in clearest.responses
+        ),
         advice=tuple(
             advice
             for each in found

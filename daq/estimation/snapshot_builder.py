@@ -12,6 +12,7 @@ import numpy as np
 from daq.alignment.sensor_reader import main_columns
 from daq.estimation.diagnosis import (
     Findings,
+    aligned_pairs,
     bias_of_clocks,
     clock_states,
     diagnosis,
@@ -207,6 +208,7 @@ class SnapshotBuilder:
             channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
+            aligned=aligned_pairs(passes[-1].aligned.clocks),
             course=segment_course(passes, channels, self._unit, self._equalisation),
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,11 +11,13 @@ import numpy as np
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, channel_means, correlation_of, judged_method
 from daq.results.certificates import certificates_of, channel_of
-from daq.results.clock_effect import effect
+from daq.results.clock_effect import effect, relative_time
 from daq.results.uncertainty_budget import Budget, Component
+from daq.timing.clock_model import RelativeTime
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
+from estimator.responses.derived_quantities import Value
 from estimator.responses.edge_leakage import channel_responses, slope_factor
 from estimator.spectra.windows import get_window
 
@@ -44,7 +46,7 @@ class Calibration:
     certificates : tuple of Certificate
         Of its channels; empty where it has none, and all is relative to it.
     sensors : tuple of SensorCalibration
-        Over the whole band.
+        Over the whole band. The delay is NaN where the clocks are aligned.
     curves : tuple of ResponseCurve
         The same, in thirds of an octave.
     budgets : tuple of Budget
@@ -123,7 +125,11 @@ def calibrate(
         if sensor == chosen:
             continue
         try:
-            sensors.append(work.sensor(sensor, work.band))
+            found = work.sensor(sensor, work.band)
+            if relative_time(snapshot, names[sensor], names[chosen]) is RelativeTime.ALIGNED:
+                unknown = np.full(found.delay.value.shape, np.nan)
+                found = replace(found, delay=Value(unknown, unknown))
+            sensors.append(found)
             curves.append(work.curve(sensor))
         except InsufficientDataError as error:
             refused[sensor] = str(error)

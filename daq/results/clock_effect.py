@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from daq.results.band_summary import band_of, judged_method
+from daq.timing.clock_model import RelativeTime
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,6 +74,14 @@ def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]
 def grade(share: float) -> Literal["good", "doubtful", "bad"]:
     """Return how bad it is that clocks make up this share of the noise."""
     return "good" if share < NEGLIGIBLE_EFFECT else "doubtful" if share < SMALL_EFFECT else "bad"
+
+
+def relative_time(snapshot: Snapshot, sensor: str, other: str) -> RelativeTime:
+    """Return how the times of a sensor are known against those of another."""
+    clocks = {clock.sensor: clock for clock in snapshot.clocks}
+    if sensor in clocks and other in clocks:
+        return clocks[sensor].relative_time(clocks[other])
+    return RelativeTime.STATED  # all are columns of one array
 
 
 def residuals(snapshot: Snapshot) -> dict[str, float]:

@@ -138,6 +138,17 @@ class OffsetSource(StrEnum):
     """The times at which their blocks arrived."""
 
 
+class RelativeTime(StrEnum):
+    """How the times of one sensor are known against those of another."""
+
+    STATED = "stated"
+    """By one clock that counts the samples of both, or by the UTC that both state."""
+    WHOLE_SAMPLES = "whole samples"
+    """Up to whole samples: how many they are apart is known from arrivals or the motion."""
+    ALIGNED = "aligned"
+    """By arrival times or the motion: a delay of a sensor looks like a late clock."""
+
+
 @dataclass(frozen=True, slots=True)
 class ClockState:
     """What is known about one sensor's clock.
@@ -187,6 +198,19 @@ class ClockState:
     corrected: float = 0.0
     drifts: bool = False
     unchecked: bool = False
+
+    def relative_time(self, other: ClockState) -> RelativeTime:
+        """Return how the times of this sensor are known against those of another."""
+        states = (self, other)
+        if len({state.shared_clock or state.sensor for state in states}) == 1:
+            is_one_count = self.offset_source is other.offset_source is None
+            return RelativeTime.STATED if is_one_count else RelativeTime.WHOLE_SAMPLES
+        if all(state.source is ClockSource.NOMINAL_RATE for state in states):
+            return RelativeTime.WHOLE_SAMPLES
+        is_stated = all(state.source is ClockSource.DEVICE_UTC for state in states)
+        if is_stated and not any(each.refined or each.corrected or each.drifts for each in states):
+            return RelativeTime.STATED
+        return RelativeTime.ALIGNED
 
     def shared_by(self, sensor: str) -> ClockState:
         """Return the state of a sensor that is sampled by this clock."""

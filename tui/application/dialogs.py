@@ -41,7 +41,7 @@ WORDS = (
     ("clocks", "each sensor counts time by its own; aligned by when samples"),
     ("", "arrive, then by the motion that the sensors share"),
     ("ppm", "how fast a clock runs: +10 ppm gains 36 ms an hour"),
-    ("within", "what is left between the clocks after alignment"),
+    ("within", "error between the clocks after alignment, rms"),
     ("of noise", "share of the noise shown that this makes up; matters above 5 %"),
 )
 

@@ -6,7 +6,9 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.units import decibels
+from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import student_quantile
+from daq.timing.clock_model import RelativeTime
 from tui.output.formatting import signed, span
 from tui.output.json_values import plain
 
@@ -48,7 +50,9 @@ def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
     """Return a number with its expanded uncertainty, both to the same place."""
     if not math.isfinite(value):
         return "?"
-    if not math.isfinite(expanded) or expanded <= 0:
+    if not math.isfinite(expanded):
+        return f"{signed(value, '.6g')} ± ?"
+    if expanded <= 0:
         return signed(value, ".6g")
     place = max(0, digits - 1 - math.floor(math.log10(expanded)))
     step = 10.0 ** (digits - 1 - math.floor(math.log10(expanded)))
@@ -211,6 +215,7 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
             f"No certificate of {name} in the bench file: sensitivities are those of the bench file"
             f" times the values shown, if those of {name} are right."
         )
+    lines += _times(found, snapshot)
     lines += [
         f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
         f"{each.excess:.2g} times the errors, or not all motion is common. The budget includes it."
@@ -221,6 +226,36 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
         f"{snapshot.sensor_names[sensor]} is not calibrated: {why}"
         for sensor, why in found.refused.items()
     ]
+
+
+def _times(found: Calibration, snapshot: Snapshot) -> list[str]:
+    """Return which delays are not known, or not wholly, and which clocks."""
+    names = snapshot.sensor_names
+    by_time: dict[RelativeTime, list[str]] = {}
+    for each in found.sensors:
+        time = relative_time(snapshot, names[each.sensor], names[found.reference])
+        by_time.setdefault(time, []).append(names[each.sensor])
+    which = {time: ", ".join(sensors) for time, sensors in by_time.items()}
+    lines = []
+    if RelativeTime.ALIGNED in which:
+        lines.append(
+            f"Delay of {which[RelativeTime.ALIGNED]}: not known. The clocks are aligned by arrival "
+            "times or by the motion, so a delay of the sensor looks like a late clock. Give the "
+            "sensors one clock, or UTC, to measure it. Skews are between channels of a sensor, and "
+            "do not depend on this."
+        )
+    if RelativeTime.WHOLE_SAMPLES in which:
+        lines.append(
+            f"Delay of {which[RelativeTime.WHOLE_SAMPLES]}: known up to whole samples. How many "
+            "samples the sensors are apart follows from arrival times or from the motion."
+        )
+    unknown = [clock.sensor for clock in snapshot.clocks if math.isnan(clock.residual)]
+    if unknown:
+        lines.append(
+            f"The error of the clocks of {', '.join(unknown)} is not known, and not in the budgets:"
+            " their samples are taken to be at the nominal rate."
+        )
+    return lines
 
 
 def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, Any]:
@@ -249,6 +284,9 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                 "band_hz": [each.low, each.high],
                 "excess": each.excess,
                 "dof": each.dof,
+                "relative_time": relative_time(
+                    snapshot, names[each.sensor], names[found.reference]
+                ),
                 **{
                     key: {"value": value.value.tolist(), "standard_error": value.error.tolist()}
                     for key, value in _values(each).items()

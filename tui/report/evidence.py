@@ -187,7 +187,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
     if math.isfinite(worst):
         band = span(*band_of(settings, snapshot))
         tone = grade(worst)
-        text = f"What is left between the clocks makes up {share(worst)} of the noise within {band}"
+        text = f"Errors of the clocks make up {share(worst)} of the noise within {band}"
         text += " at most: they do not matter here." if tone == "good" else " in the worst channel."
         if tone == "bad":
             text += " Give the sensors one clock, or record longer for their rates to be known."
@@ -205,7 +205,7 @@ def clocks_section(snapshot: Snapshot, settings: Settings) -> Section:
     ]
     header = (
         "sensor", "time from", "offset (ms)", "rate (ppm)", "±", "wander (ppm)",
-        "left (µs rms)", "refined by motion", "of the noise",
+        "error (µs rms)", "refined by motion", "of the noise",
     )  # fmt: skip
     if rows:
         parts.append(Table(header, tuple(rows), left=frozenset({0, 1, 7})))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from datetime import date
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
+from daq.timing.clock_model import RelativeTime
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
@@ -49,6 +51,56 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def snapshot(recording: Path) -> Snapshot:
     return estimate([recording], SETTINGS)
+
+
+DELAY = 2
+"""Samples by which sensor c lags."""
+
+
+@pytest.mark.parametrize(
+    ("clocks", "utc", "time", "delay"),
+    [
+        ("one", False, RelativeTime.STATED, DELAY),
+        ("", True, RelativeTime.STATED, DELAY),
+        ("", False, RelativeTime.ALIGNED, math.nan),
+    ],
+    ids=["one clock", "UTC", "clocks of their own"],
+)
+def test_a_delay_is_known_only_where_clocks_are(
+    tmp_path: Path, clocks: str, utc: bool, time: RelativeTime, delay: float
+) -> None:
+    rng = np.random.default_rng(8)
+    motion = 1e4 * rng.standard_normal((10_000, 3))
+    sensors = {
+        name: Sensor(
+            np.round(np.roll(motion, lag, axis=0) + 100 * rng.standard_normal((10_000, 3))).astype(
+                np.int32
+            ),
+            rate=50.0,
+            clock=clocks or name,
+            utc=utc,
+        )
+        for name, lag in (("a", 0), ("b", 0), ("c", DELAY))
+    }
+    path = write(tmp_path / "r.h5", sensors)
+
+    snapshot = estimate([path], SETTINGS)
+    found = calibrate(snapshot, SETTINGS, None)
+
+    diagnosis = snapshot.diagnostics.diagnosis
+    assert diagnosis is not None
+    assert np.isnan([each.delay for each in diagnosis.responses]).all() == math.isnan(delay)
+    late = found.sensors[1].delay
+    error = 5 * float(np.nan_to_num(late.error).max())
+    assert late.value == pytest.approx(delay / 50.0, abs=error, nan_ok=True)
+    assert found.sensors[1].skew.value == pytest.approx(0, abs=1e-4)
+    shown = CliRunner().invoke(
+        app, ["calibrate", str(path), "--segment", "2s", "--band", "1:20", "--json", "-"]
+    )
+    told = json.loads(shown.stdout)["sensors"][1]
+    assert told["relative_time"] == time
+    assert told["delay"]["value"] == ([None] * 3 if math.isnan(delay) else late.value.tolist())
+    assert ("Delay of b, c: not known" in shown.stderr) == math.isnan(delay)
 
 
 def bench(value: float, expanded: float) -> Bench:

@@ -116,7 +116,7 @@ def test_report_and_application_judge_clocks_alike(share: float) -> None:
     colour = {"good": "green", "doubtful": "yellow", "bad": "bold #ff6b6b"}[verdict.tone]
     assert clock_line(snapshot, SETTINGS, width=100).spans[-1].style == colour
     (table,) = (part for part in section.parts if isinstance(part, Table))
-    left = table.header.index("left (µs rms)")
+    left = table.header.index("error (µs rms)")
     assert [row[left] for row in table.rows] == ["–", "0.40", "0.60"]
     said = next(p.text for p in section.parts if isinstance(p, Paragraph) and "Drift" in p.text)
     assert "that of A," in said

@@ -209,7 +209,7 @@ def _pairs(found: Diagnosis, names: Sequence[str]) -> Table:
             degrees(pair.horizontal_deg),
             degrees(pair.angle_error_deg),
             " ".join(f"{gain:.4f}" for gain in pair.gains),
-            f"{signed(pair.delay * 1e6, '.1f')} µs",
+            "?" if math.isnan(pair.delay) else f"{signed(pair.delay * 1e6, '.1f')} µs",
             f"{pair.nonorthogonality_deg:.2f}°",
         )
     return table
