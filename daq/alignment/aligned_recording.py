@@ -276,6 +276,7 @@ class AlignedRecording:
         for number, delay in zip(numbers, frame_delays(), strict=True):
             sources[number].frame_delay = float(delay)
         if self._at_face_value:
+            is_one = len({source.clock_name for source in sources}) == 1
             for source in sources:
                 rate = source.record.sampling_rate
                 source.clock = nominal(
@@ -284,7 +285,7 @@ class AlignedRecording:
                     end_sample=source.end_sample,
                     sampling_rate=rate,
                     first=round(source.arrivals.start * rate),
-                    residual=math.nan,
+                    residual=0.0 if is_one else math.nan,
                 )
             return
         together = len({source.clock_name for source in sources}) == 1 and not any(

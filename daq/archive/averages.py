@@ -146,8 +146,15 @@ class Estimator:
                 stood_still=average.stood_still,
             ).added_to(diagnostics)
         too_much = added(diagnostics, estimates.results)
+        too_little = np.nan_to_num(
+            0.0 if synchronisation.removed is None else synchronisation.removed
+        )
         results = {
-            name: each if too_much is None else replace(each, low=each.low - too_much)
+            name: replace(
+                each,
+                low=each.low - (0.0 if too_much is None else too_much),
+                high=each.high + too_little,
+            )
             for name, each in estimates.results.items()
         }
         return Snapshot(

@@ -11,6 +11,7 @@ import numpy as np
 
 from daq.estimation.noise_estimates import neighbours
 from daq.estimation.snapshot_diagnostics import (
+    CLOCK_FACTOR,
     Diagnosis,
     EdgeLeakage,
     FrequencyDiagnosis,
@@ -117,7 +118,8 @@ def synchronisation(passes: Sequence[Pass]) -> Synchronisation:
             share = max(each.n_segments, 1) / total
             for sensor, residual in found.items():
                 squares[sensor] = squares.get(sensor, 0.0) + share * residual**2
-    return Synchronisation({name: math.sqrt(each) for name, each in squares.items()}, None, against)
+    rms = {name: math.sqrt(square) for name, square in squares.items()}
+    return Synchronisation(rms, reference=against)
 
 
 def residuals(
@@ -180,17 +182,27 @@ def bias_of_clocks(
     csm: ComplexArray,
     results: Mapping[str, SelfNoise],
 ) -> Synchronisation:
-    """Return what is left between the clocks with its effect on the noise, if that is known."""
+    """Return the error between the clocks with its effect on the noise, if that is known.
+
+    The noise of sensor i by those of j and k is off by ``ω² S cov(τ_j − τ_i, τ_k − τ_i)``: too high
+    by errors of its own clock, too low by at most ``ω² S (σ_j + σ_k)²/4`` if j and k err in
+    opposite ways.
+    """
     residual = np.array(list(found.residual.values()))
     if not results or len(residual) != len(dims):
         return found
     noise = next(iter(results.values())).noise_psd
     coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
+    # a − b of two others is in error by σ_a + σ_b at most, and a third is between them at best
+    others = [np.sort(np.delete(residual, sensor))[-2:].mean() for sensor in range(len(dims))]
+    apart = (2 * np.pi * frequency[:, None] * np.repeat(others, dims)) ** 2
+    removed = np.maximum(coherent, 0.0) * -np.expm1(-CLOCK_FACTOR * apart)
     turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)
     lost = np.expm1(np.minimum(turn**2, _MOST_TURN))
     coherent = np.where(turn > 1, np.abs(coherent), coherent)  # else nothing but scatter is left
     with np.errstate(invalid="ignore", divide="ignore"):
-        return replace(found, noise_bias=lost * coherent / np.abs(noise))
+        bias = lost * coherent / np.abs(noise)
+    return replace(found, noise_bias=bias, removed=removed)
 
 
 def vertical_channel(channels: Sequence[Channel]) -> int | None:

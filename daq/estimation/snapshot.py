@@ -242,6 +242,12 @@ class Snapshot:
         return added(self.diagnostics, self.results)
 
     @property
+    def removed(self) -> FloatArray | None:
+        """What the clocks may have taken away from the noise PSD at most; as `added_by_clocks`."""
+        found = self.diagnostics.synchronisation.removed
+        return None if found is None else np.nan_to_num(found)
+
+    @property
     def data_psd(self) -> FloatArray:
         """PSD of what each channel recorded, shape (n_freqs, n_channels), in unit**2/Hz."""
         return np.ascontiguousarray(np.diagonal(self.csm, axis1=1, axis2=2).real)

@@ -151,6 +151,7 @@ class SnapshotBuilder:
         if self._findings.fits(frequency):
             diagnostics = self._findings.added_to(diagnostics)
         too_much = added(diagnostics, estimates.results)
+        too_little = diagnostics.synchronisation.removed
         gaps = _bridged(passes, estimates.results)
         found = diagnostics.diagnosis
         steady = None if found is None else found.stability
@@ -159,7 +160,9 @@ class SnapshotBuilder:
             frequency=frequency,
             csm=csm,
             results={
-                name: _widened(each, factor=factor, too_much=too_much, gaps=gaps)
+                name: _widened(
+                    each, factor=factor, too_much=too_much, too_little=too_little, gaps=gaps
+                )
                 for name, each in estimates.results.items()
             },
             refused=estimates.refused,
@@ -275,7 +278,12 @@ def _bridged(passes: Sequence[Pass], results: Mapping[str, SelfNoise]) -> Bridge
 
 
 def _widened(
-    result: SelfNoise, *, factor: float, too_much: FloatArray | None, gaps: Bridged | None
+    result: SelfNoise,
+    *,
+    factor: float,
+    too_much: FloatArray | None,
+    too_little: FloatArray | None,
+    gaps: Bridged | None,
 ) -> SelfNoise:
     """Return an estimate whose intervals include what its method does not know.
 
@@ -284,8 +292,8 @@ def _widened(
     result : SelfNoise
     factor : float
         Standard error over that for steady noise.
-    too_much : float64, shape (n_freqs, n_channels), optional
-        What the clocks may have added, unit**2/Hz.
+    too_much, too_little : float64, shape (n_freqs, n_channels), optional
+        What the clocks may have added, and taken away, unit**2/Hz.
     gaps : Bridged, optional
         What segments with gaps bring in.
     """
@@ -297,6 +305,8 @@ def _widened(
             high = np.where(in_log, psd * (high / psd) ** factor, psd + factor * (high - psd))
     if too_much is not None:
         low = low - too_much
+    if too_little is not None:
+        high = high + np.nan_to_num(too_little)
     if gaps is not None:
         low = low - np.clip(np.nan_to_num(gaps.leakage), 0.0, 1.0) * np.abs(psd)
         high = high + np.clip(np.nan_to_num(-gaps.leakage), 0.0, 1.0) * np.abs(psd)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 CLOCK_FACTOR = 4.0
-"""What clocks add goes with the square of what is left between them: twice its rms is allowed."""
+"""What clocks add goes with the square of their error: twice its rms is allowed."""
 
 
 PREDICTED_WITHIN = 1.2
@@ -34,7 +35,7 @@ PREDICTED_WITHIN = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Synchronisation:
-    """What is left between the clocks, and its effect on the noise.
+    """The error between the clocks, and its effect on the noise.
 
     Attributes
     ----------
@@ -43,13 +44,22 @@ class Synchronisation:
     noise_bias : float64, shape (n_freqs, n_channels), or None
         What it is expected to add to the noise PSD, as a fraction of it; None where there is no
         estimate.
+    removed : float64, shape (n_freqs, n_channels), or None
+        What it may take away from the noise PSD at most, where the errors of other sensors are
+        opposite, in unit**2/Hz; likewise.
     reference : str
         The sensor against which the motion measures clocks; empty where it does not.
     """
 
     residual: Mapping[str, float] = field(default_factory=dict)
     noise_bias: FloatArray | None = None
+    removed: FloatArray | None = None
     reference: str = ""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the errors of all clocks are known."""
+        return not any(map(math.isnan, self.residual.values()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

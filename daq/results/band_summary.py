@@ -72,7 +72,7 @@ def channel_means(
     """Return the mean noise of every channel in a band, each with its interval.
 
     It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
-    given, its lower end lowered by what the clocks may have added, and widened by errors that all
+    given, widened by what the clocks may have added or taken away, and by errors that all
     frequencies have in common (`dimension_error`, `second_order_error`). Where maximum likelihood
     stands at its bound of zero at many frequencies, the mean is that of a noise constant over each
     octave, or over the band (`estimator.self_noise.quiet_sensor`).
@@ -81,7 +81,7 @@ def channel_means(
     edges = band_edges(frequency, band)
     correlation, width = correlation_of(settings), np.gradient(frequency)
     at_bound = (noise.flags & Flag.BOUNDARY) != 0
-    added = snapshot.added
+    added, removed = snapshot.added, snapshot.removed
     means = [
         band_means(
             noise.noise_psd[:, column],
@@ -92,6 +92,7 @@ def channel_means(
             quantile=quantile,
             deviation=deviation_at_bound(noise, column),
             added=None if added is None else added[:, column],
+            removed=None if removed is None else removed[:, column],
         )
         for column in range(noise.noise_psd.shape[1])
     ]
@@ -105,14 +106,15 @@ def channel_means(
         found, is_pooled = _of_quiet_sensor(snapshot, sensor, inside, correlation, quantile)
         for column, (mean, low, high) in zip(own, zip(*found, strict=True), strict=True):
             if often[column] and np.isfinite((mean, low, high)).all():
-                extra = (
+                extra, missing = (
                     0.0
-                    if added is None
-                    else float(np.average(added[inside, column], weights=width[inside]))
+                    if each is None
+                    else float(np.average(each[inside, column], weights=width[inside]))
+                    for each in (added, removed)
                 )
                 # noise that varies over the band may be larger: at most the mean, which is too high
                 most = max(high, float(means[column].mean[0])) if is_pooled else high
-                parts = (mean, (most - low) / (2 * quantile), low - extra, most)
+                parts = (mean, (most - low) / (2 * quantile), low - extra, most + missing)
                 means[column] = BandMeans(*(np.array([float(part)]) for part in parts))
     share = np.hypot(
         dimension_error(snapshot, noise.method)[:, None], second_order_error(noise, frequency)

@@ -1,4 +1,4 @@
-"""What is left between the sensors' clocks, what that does to the noise, and how they drift."""
+"""Errors between the sensors' clocks, what they do to the noise, and how the clocks drift."""
 
 from __future__ import annotations
 
@@ -40,27 +40,35 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
         return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
 
 
-def added_in_bands(
+def effect_in_bands(
     snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64], column: int
-) -> FloatArray:
-    """Return what the clocks may have added to a channel's mean noise at most.
+) -> tuple[FloatArray, FloatArray]:
+    """Return what may have been added to a channel's mean noise, and taken from it, at most.
 
-    Shape (n_bands,), in unit²/Hz: no more than the noise itself, and 0 where it is not known.
+    By the clocks, and at the edges of segments. Shapes (n_bands,), in unit²/Hz; infinite where
+    nothing is known of the clocks.
     """
-    found = snapshot.added
+    nothing = np.zeros(len(edges) - 1)
+    if not snapshot.diagnostics.synchronisation.is_known:
+        return nothing + math.inf, nothing + math.inf
     noise = snapshot.results.get(judged_method(snapshot, settings))
-    if found is None or noise is None:
-        return np.zeros(len(edges) - 1)
+    if noise is None:
+        return nothing, nothing
     share = snapshot.diagnostics.synchronisation.noise_bias
     known = np.isfinite(noise.noise_psd[:, column])
     if share is not None:
         known &= np.isfinite(share[:, column])
     width = np.where(known, np.gradient(snapshot.frequency), 0.0)
-    added = found[:, column] * width
     first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
     whole = np.add.reduceat(width[first:last], starts)
-    total = np.add.reduceat(added[first:last], starts)
-    return np.asarray(total / np.where(whole > 0, whole, 1.0))
+
+    def mean(psd: FloatArray | None) -> FloatArray:
+        if psd is None:
+            return nothing
+        total = np.add.reduceat((psd[:, column] * width)[first:last], starts)
+        return np.asarray(total / np.where(whole > 0, whole, 1.0))
+
+    return mean(snapshot.added), mean(snapshot.removed)
 
 
 def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]:

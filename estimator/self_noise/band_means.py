@@ -80,6 +80,7 @@ def band_means(
     quantile: float = NORMAL_95,
     deviation: FloatArray | None = None,
     added: FloatArray | None = None,
+    removed: FloatArray | None = None,
 ) -> BandMeans:
     """Average a noise spectrum over bands of bins.
 
@@ -99,6 +100,8 @@ def band_means(
         Standard deviation of estimates of zero, for which `cov` is NaN; NaN if unknown.
     added : float64, shape (n_freqs,), optional
         Maximum contribution to the estimate that is no noise: lowers the lower end.
+    removed : float64, shape (n_freqs,), optional
+        Noise that the estimate may lack at most: raises the upper end.
 
     Returns
     -------
@@ -131,6 +134,9 @@ def band_means(
         high = np.where(certain, mean * factor, mean + quantile * spread)
         if added is not None:
             low -= np.add.reduceat(np.where(known, added[first:last], 0.0) * share, starts) / whole
+        if removed is not None:
+            missing = np.where(known, removed[first:last], 0.0) * share
+            high += np.add.reduceat(missing, starts) / whole
     return BandMeans(mean, spread, low, high)
 
 

@@ -21,7 +21,7 @@ from daq.drivers.bench_file import parse
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.band_summary import band_of, channel_means, data_means
-from daq.results.clock_effect import added_in_bands
+from daq.results.clock_effect import effect_in_bands
 from estimator.self_noise.band_means import band_edges
 from tui.commands.run import result_of
 from tui.output.console import check_places, for_people, notices, write_json
@@ -160,7 +160,7 @@ def compare(snapshot: Snapshot, settings: Settings, scenario: Scenario) -> list[
         for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
-            clocks = float(added_in_bands(snapshot, settings, edges, column)[0])
+            clocks = float(effect_in_bands(snapshot, settings, edges, column)[0][0])
             compared.append(
                 NoiseComparison(
                     sensor=label.sensor,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -151,7 +152,7 @@ def _short(value: float) -> str:
 
 
 def wrong_times(snapshot: Snapshot) -> list[str]:
-    """Return remarks on stated UTC that drifts against the motion, or could not be compared."""
+    """Return remarks on times that are wrong, or may be: drifting, not compared, or nominal."""
     wrong = [clock for clock in snapshot.clocks if clock.corrected and not clock.drifts]
     lost = [clock for clock in snapshot.clocks if clock.drifts]
     unchecked = [clock.sensor for clock in snapshot.clocks if clock.unchecked]
@@ -180,6 +181,12 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
             f"The times that {listed(unchecked)} {'states' if len(unchecked) == 1 else 'state'}"
             " could not be compared with the motion: it is too weak, or the recording too short. If"
             " they drift, motion counts as noise."
+        )
+    nominal = [clock.sensor for clock in snapshot.clocks if math.isnan(clock.residual)]
+    if nominal:
+        lines.append(
+            f"The samples of {listed(nominal)} are taken to be at their nominal rate. If it is not "
+            "exact, the noise is too high or too low, and the intervals do not contain it."
         )
     return lines
 

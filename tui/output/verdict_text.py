@@ -48,8 +48,8 @@ OBSTACLES: Mapping[Obstacle, str] = {
     Obstacle.MODEL_MISFIT: "{channels}: one common motion does not explain what the sensors have "
     "in common, and the noise estimate may be wrong by more than the margin. Follow the advice and "
     "record again.",
-    Obstacle.CLOCKS: "{channels}: what is above the limit may come from the clocks. Give the "
-    "sensors one clock, or record longer for their rates to be known.",
+    Obstacle.CLOCKS: "{channels}: errors of the clocks are too large to decide, or not known. Give "
+    "the sensors one clock, or record longer for their rates to be known.",
     Obstacle.TOO_FEW_AVERAGES: "The uncertainty of fewer than {averages:g} averages is not "
     "reliable: record longer.",
     Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",

@@ -1,12 +1,14 @@
 """Noise masks of the bench file, and which channels are below them for certain.
 
-A mask is judged in bands a third of an octave wide, where single frequencies scatter less. A
+A mask is judged in bands a third of an octave wide, where single frequencies scatter less: the mean
+noise beside the mean of the mask. Where the mask is steep, its own points divide the bands. A
 channel passes where the whole interval of its band means is below the mask in every band, and fails
 where the whole interval of one band is above it. The intervals hold for all channels, masks and
 bands together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
 
-What the clocks may have added to the noise, and what the estimate may be off by where one common
-motion does not explain the averages, widens the interval. Of a channel that is clipped, or was dead
+What the clocks may have added to the noise or taken from it, and what the estimate may be off by
+where one common motion does not explain the averages, widens the interval. Noise that is below zero
+for certain is wrong, so it decides nothing. Of a channel that is clipped, or was dead
 for a while, the estimate is an upper bound.
 """
 
@@ -24,12 +26,12 @@ from daq.results.band_summary import (
     correlation_of,
     deviation_at_bound,
     dimension_error,
-    highest_known,
     judged_method,
     second_order_error,
 )
-from daq.results.clock_effect import added_in_bands
+from daq.results.clock_effect import effect_in_bands
 from daq.results.decision.decision_time import Margins, predict
+from daq.results.decision.mask_bands import judged_range, mask_edges, mean_mask
 from daq.results.decision.verdict import (
     REMOVED_BY_TIME,
     LimitResult,
@@ -53,8 +55,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from daq.results.decision.verdict import Prediction
     from estimator.self_noise.band_means import FloatArray
+    from estimator.self_noise.result import SelfNoise
 
-BANDS_PER_OCTAVE = 3
 MIN_AVERAGES = 20.0
 """Averages below which the far tails of the interval have not been verified by simulation."""
 
@@ -70,7 +72,7 @@ def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVe
         for column, label in enumerate(snapshot.channels)
         if concerns(limit, label)
     ]
-    edges = {limit.name: _edges(snapshot, limit) for limit in bench.limits}
+    edges = {limit.name: mask_edges(snapshot, limit) for limit in bench.limits}
     n_bands = sum(max(0, edges[limit.name].size - 1) for limit, _ in pairs)
     quantile = NormalDist().inv_cdf(1 - 0.025 / max(1, n_bands))
     found = [
@@ -102,17 +104,6 @@ def concerns(limit: Limit, label: ChannelLabel) -> bool:
     return limit.concerns(label.sensor, label.channel)
 
 
-def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray) -> FloatArray:
-    """Return a mask between its points, straight in log-log, in the unit of the result squared/Hz.
-
-    A mask without a unit is in the unit that the channel has in the bench file. A band that ends
-    just outside of the mask has its value at the end.
-    """
-    mask = limit.mask
-    inside = np.clip(frequency, mask.frequency[0], mask.frequency[-1])
-    return mask.at(inside, label.unit, of_channel=_unit_in_file(bench, label))
-
-
 @dataclass(frozen=True, slots=True)
 class _Comparison:
     """One channel beside one mask in all bands of it; arrays of shape (n_bands,).
@@ -132,6 +123,7 @@ class _Comparison:
     low: FloatArray
     high: FloatArray
     added: FloatArray
+    removed: FloatArray
     error: FloatArray
     averages: FloatArray
     is_alone: NDArray[np.bool_]
@@ -144,7 +136,8 @@ class _Comparison:
 
     @property
     def outer_high(self) -> FloatArray:
-        return np.asarray(self.high * np.where(self.high > 0, 1 + self.error, 1.0))
+        high = self.high + self.removed
+        return np.asarray(high * np.where(high > 0, 1 + self.error, 1.0))
 
     def result(self, method: str) -> LimitResult:
         """Return the verdict, with the numbers of the band where the channel does worst."""
@@ -179,7 +172,7 @@ class _Comparison:
             return in_band(int(above.argmax()), Verdict.FAIL, None)
         highest = np.where(known, self.outer_high / self.mask, -math.inf)
         worst = int(highest.argmax())
-        if trusted.all() and highest.max() <= 1:
+        if trusted.all() and highest.max() <= 1 and self.outer_high.min() > 0:
             return in_band(worst, Verdict.PASS, None)
         return in_band(worst, Verdict.NOT_DECIDED, self._obstacle(known, trusted))
 
@@ -187,14 +180,16 @@ class _Comparison:
         """Return what keeps the limit from being decided."""
         would_fail = bool((self.low > self.mask).any())  # by scatter alone
         would_pass = bool((self.high <= self.mask).all())
-        by_clocks = not bool((self.low - self.added > self.mask).any())
+        by_clocks = would_fail and not bool((self.low - self.added > self.mask).any())
+        by_clocks |= would_pass and not bool((self.high + self.removed <= self.mask).all())
+        by_clocks |= bool(np.isinf(self.added).any())  # nothing is known of them
         reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
         reasons = (
             (Obstacle.NO_ESTIMATE, not known.all()),
             (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
             (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
             (Obstacle.FAULTY_CHANNEL, reads_high),
-            (Obstacle.CLOCKS, would_fail and by_clocks),
+            (Obstacle.CLOCKS, by_clocks),
             (Obstacle.MODEL_MISFIT, would_fail or would_pass),
         )
         return next((reason for reason, holds in reasons if holds), Obstacle.SPANS_LIMIT)
@@ -226,11 +221,11 @@ def _compare(
     label, frequency = snapshot.channels[column], snapshot.frequency
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
-        centre = mask = added = np.empty(0)
+        centre = mask = added = removed = np.empty(0)
     else:
         centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
-        mask = mask_psd(bench, limit, label, centre)
-        added = added_in_bands(snapshot, settings, edges, column)
+        mask = mean_mask(bench, limit, label, frequency, edges)
+        added, removed = effect_in_bands(snapshot, settings, edges, column)
     averages = averages_at(snapshot, centre)
     mean = spread = low = high = np.full(centre.shape, np.nan)
     if noise is not None and centre.size:
@@ -244,12 +239,13 @@ def _compare(
         )
         mean, spread = means.mean, means.spread
         low, high = decision_interval(means, quantile, averages)
+        mean = np.where(_is_complete(noise, column, edges), mean, np.nan)
     diagnostics = snapshot.diagnostics
     return _Comparison(
         limit=limit,
         label=label,
         covers=(limit.mask.frequency[0], limit.mask.frequency[-1]),
-        judged=_judged(snapshot, limit, edges),
+        judged=judged_range(snapshot, limit, edges),
         centre=centre,
         mask=mask,
         mean=mean,
@@ -257,6 +253,7 @@ def _compare(
         low=low,
         high=high,
         added=added,
+        removed=removed,
         error=_errors(snapshot, edges, judged_method(snapshot, settings), column),
         averages=averages,
         is_alone=np.array(
@@ -264,6 +261,13 @@ def _compare(
         ),
         is_faulty=column in diagnostics.clipped or column in diagnostics.stood_still,
     )
+
+
+def _is_complete(noise: SelfNoise, column: int, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether the noise is known at every frequency of each band."""
+    certain = np.isfinite(noise.cov[:, column]) | np.isfinite(deviation_at_bound(noise, column))
+    known = (np.isfinite(noise.noise_psd[:, column]) & certain)[edges[0] : edges[-1]]
+    return np.asarray(np.logical_and.reduceat(known, edges[:-1] - edges[0]))
 
 
 def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: int) -> FloatArray:
@@ -324,44 +328,3 @@ def _prediction(
         averages=min(float(each.averages.min()) for each in found),
         least=MIN_AVERAGES,
     )
-
-
-def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
-    for sensor in bench.sensors:
-        for channel in sensor.channels:
-            if (sensor.name, channel.name) == (label.sensor, label.channel):
-                return channel.unit
-    return None
-
-
-def _judged(snapshot: Snapshot, limit: Limit, edges: NDArray[np.int64]) -> tuple[float, float]:
-    """Return from and to which frequency a mask is judged; its own ends where it is to there."""
-    if edges.size < 2:
-        return math.nan, math.nan
-    frequency, (low, *_, high) = snapshot.frequency, limit.mask.frequency
-    first = float(frequency[edges[0]])
-    last = min(float(frequency[edges[-1] - 1]), highest_known(snapshot) or math.inf)
-    spacing = float(frequency[1])
-    return (
-        low if low >= spacing else first,
-        high if high <= last + 2 * spacing else last,
-    )
-
-
-def _edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
-    """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
-
-    Bands above the frequency from which on nothing is known are left out.
-    """
-    frequency = snapshot.frequency
-    mask = limit.mask
-    low = max(mask.frequency[0], float(frequency[1]))
-    high = min(mask.frequency[-1], float(frequency[-2]))
-    if high <= low:
-        return np.empty(0, dtype=np.int64)
-    n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
-    edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
-    edges[-1] += 1
-    edges = np.unique(edges).astype(np.int64)
-    known = highest_known(snapshot)
-    return edges[: 1 + np.count_nonzero(frequency[edges[:-1]] <= known)] if known else edges

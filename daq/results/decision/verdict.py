@@ -38,7 +38,7 @@ class Obstacle(enum.StrEnum):
     MODEL_MISFIT = "model-misfit"
     """One common motion does not explain the averages: the estimate may be too far off."""
     CLOCKS = "clocks"
-    """The clocks may have added what is above the limit."""
+    """The clocks may have added what is above the limit, or taken it away, or are not known."""
     TOO_FEW_AVERAGES = "too-few-averages"
     """With so few averages the interval cannot be trusted."""
     SPANS_LIMIT = "spans-limit"

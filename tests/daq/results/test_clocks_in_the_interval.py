@@ -1,4 +1,4 @@
-"""What clocks may have added lowers the lower end of every interval, and nothing else."""
+"""What clocks may have added lowers the lower end of every interval; what they took, the upper."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daq.estimation.diagnosis import bias_of_clocks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot_diagnostics import (
-    CLOCK_FACTOR,
-)
+from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, Synchronisation
 from daq.results.band_summary import channel_means
-from daq.results.clock_effect import added_in_bands
+from daq.results.clock_effect import effect_in_bands
+from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.formatting import level_with_error
 from tui.output.results import result_table
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BAND = (5.0, 15.0)
+OPPOSITE = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 4.0], [1.0, 4.0, 0.0]])
+"""Variances of the delay between sensors: B is late when C is early, by as much."""
 
 
 def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> None:
@@ -40,9 +42,9 @@ def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> Non
     for column in range(9):  # the verdict's number is the same
         band = slice(10, 30)
         noise = snapshot.results["three-sensor"].noise_psd[band, column]
-        assert added_in_bands(snapshot, SETTINGS, edges, column) == pytest.approx(
-            CLOCK_FACTOR * 0.01 * noise.mean()
-        )
+        added, removed = effect_in_bands(snapshot, SETTINGS, edges, column)
+        assert added == pytest.approx(CLOCK_FACTOR * 0.01 * noise.mean())
+        assert not removed.any()
 
 
 def test_they_add_no_more_than_the_noise_itself_and_nothing_where_unknown() -> None:
@@ -80,3 +82,26 @@ def test_curves_of_free_running_clocks_carry_it_at_every_frequency(tmp_path: Pat
     assert np.all(usual[known] <= noise.noise_psd[known] + 1e-12 * np.abs(noise.noise_psd[known]))
     rising = added[:, 2:] / np.abs(noise.noise_psd[:, 2:])
     assert np.nanmedian(rising[150:170]) > 10 * np.nanmedian(rising[10:20])  # as f²
+
+
+def test_clocks_that_err_in_opposite_ways_widen_the_upper_end() -> None:
+    """The three-sensor noise of the first is then ω² S σ² too low, in the mean over the motion."""
+    frequency = np.arange(101) * np.float64(0.5)
+    psd, noise, late = 1e-6, 1e-10, 20e-6
+    turn = np.exp(-0.5 * (2 * np.pi * frequency[:, None, None] * late) ** 2 * OPPOSITE)
+    csm = psd * turn + noise * np.eye(3)
+    dims = (1, 1, 1)
+    csm = csm.astype(np.complex128)
+    results = {"three-sensor": self_noise("three-sensor", csm, dims=dims, n_effective=1e9)}
+    found = bias_of_clocks(
+        Synchronisation({"A": 0.0, "B": late, "C": late}),
+        dims=dims,
+        frequency=frequency,
+        csm=csm,
+        results=results,
+    )
+    assert found.removed is not None
+    missing = noise - results["three-sensor"].noise_psd[1:, 0]
+    assert np.all(missing > 0)
+    assert np.all(found.removed[1:, 0] > missing)
+    np.testing.assert_allclose(found.removed[1:41, 0], CLOCK_FACTOR * missing[:40], rtol=0.05)

@@ -64,5 +64,5 @@ def test_what_is_not_known_is_left_out() -> None:
     assert told["stood_still"] == {"A.X": 3.0}
     assert told["left_out"] == {"gap": 2, "transient": 0}
     assert told["untested"] == "too-few-sensors"
-    assert set(told["synchronisation"]) == {"residual", "noise_bias", "reference"}
+    assert set(told["synchronisation"]) == {"residual", "noise_bias", "removed", "reference"}
     assert told["synchronisation"]["residual"]["C"] == 0.6e-6

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.results.band_summary import correlation_of
-from daq.results.decision.limits import concerns, mask_psd
+from daq.results.decision.limits import concerns
+from daq.results.decision.mask_bands import mask_psd
 from tui.application.test_view.clocks import COLOURS
 from tui.application.test_view.curves import data_curve, mask_curve, noise_curve
 from tui.application.test_view.units import units_of

@@ -196,6 +196,71 @@ def test_noise_that_may_come_from_the_clocks_does_not_fail() -> None:
     assert verdict_on(passing, 12e-12).verdict is Verdict.PASS
 
 
+def with_clocks(snapshot: Snapshot, **changed: object) -> Snapshot:
+    """Return the snapshot with other errors of its clocks."""
+    diagnostics = snapshot.diagnostics
+    found = replace(diagnostics.synchronisation, **changed)  # type: ignore[arg-type]
+    return replace(snapshot, diagnostics=replace(diagnostics, synchronisation=found))
+
+
+def test_noise_that_clocks_may_have_taken_away_does_not_pass() -> None:
+    """Where two clocks err in opposite ways, the noise of a third sensor comes out too low."""
+    snapshot = made_snapshot(n_effective=5000.0)
+    removed = np.full_like(snapshot.results["three-sensor"].noise_psd, 4e-12)
+    found = verdict_on(with_clocks(snapshot, removed=removed), 12e-12)
+    assert found.verdict is Verdict.NOT_DECIDED
+    assert found.obstacles == (Obstacle.CLOCKS,)
+    assert verdict_on(with_clocks(snapshot, removed=removed), 14e-12).verdict is Verdict.PASS
+
+
+def test_clocks_that_nobody_knows_decide_nothing() -> None:
+    snapshot = with_clocks(made_snapshot(n_effective=5000.0), residual={"A": 0.0, "B": math.nan})
+    for psd in (1e-14, 1e-9):
+        found = verdict_on(snapshot, psd)
+        assert found.verdict is Verdict.NOT_DECIDED
+        assert found.obstacles == (Obstacle.CLOCKS,)
+        assert found.prediction is None
+
+
+def test_noise_that_is_negative_for_certain_does_not_pass() -> None:
+    snapshot = made_snapshot(n_effective=5000.0)
+    noise = snapshot.results["three-sensor"]
+    wrong = replace(noise, noise_psd=np.abs(noise.noise_psd) * np.where(np.arange(9) < 1, -1, 1))
+    found = verdict_on(replace(snapshot, results={"three-sensor": wrong}), 12e-12)
+    assert found.verdict is Verdict.NOT_DECIDED
+    assert found.obstacles == (Obstacle.MODEL_MISFIT,)
+
+
+def test_a_band_is_judged_only_if_all_of_it_is_known() -> None:
+    snapshot = made_snapshot(n_effective=5000.0)
+    noise = snapshot.results["three-sensor"]
+    psd = noise.noise_psd.copy()
+    psd[25, 0] = np.nan  # 12.5 Hz
+    found = verdict_on(
+        replace(snapshot, results={"three-sensor": replace(noise, noise_psd=psd)}), 12e-12
+    )
+    assert found.verdict is Verdict.NOT_DECIDED
+    assert found.obstacles == (Obstacle.NO_ESTIMATE,)
+
+
+@pytest.mark.parametrize(
+    ("psd", "verdict"),
+    [
+        ("[12e-12, 12e-12, 4e-12, 4e-12, 12e-12, 12e-12]", Verdict.FAIL),  # noise up to 9e-12
+        ("[12e-12, 12e-12, 11e-12, 11e-12, 12e-12, 12e-12]", Verdict.PASS),
+    ],
+)
+def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(psd: str, verdict: Verdict) -> None:
+    text = MASK.format(psd=0, more="").replace("[0, 0]", psd)
+    text = text.replace("[1.0, 30.0]", "[1.0, 15.9, 16.0, 17.0, 17.1, 30.0]")
+    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
+    found = judge(bench, made_snapshot(n_effective=20_000.0), SETTINGS)
+    assert found is not None
+    assert found.verdict is verdict
+    if verdict is Verdict.FAIL:
+        assert all(15.9 < each.frequency < 17.1 for each in found.having(Verdict.FAIL))
+
+
 def test_the_noise_of_a_clipped_channel_is_an_upper_bound() -> None:
     snapshot = made_snapshot(n_effective=5000.0)
     clipped = replace(snapshot.diagnostics, clipped=dict.fromkeys(range(9), 0.01))

@@ -1,0 +1,91 @@
+"""The bands in which a noise mask is judged, and the mask in them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.results.band_summary import highest_known
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daq.bench.model import Bench, Limit
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
+    from estimator.self_noise.band_means import FloatArray
+
+BANDS_PER_OCTAVE = 3
+STEEP = 2.0
+"""Ratio of a mask's values in one band from which on the mask's points divide the band."""
+_ANY_UNIT = "m/s²"
+
+
+def mask_edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
+    """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
+
+    Where the mask varies by more than `STEEP` in a band, its own points divide it. The last one
+    ends where nothing is known any more.
+    """
+    frequency = snapshot.frequency
+    mask = limit.mask
+    low = max(mask.frequency[0], float(frequency[1]))
+    known = highest_known(snapshot) or math.inf
+    high = min(mask.frequency[-1], float(frequency[-2]), known)
+    if high <= low:
+        return np.empty(0, dtype=np.int64)
+    n_bands = max(1, round(BANDS_PER_OCTAVE * np.log2(high / low)))
+    edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
+    edges[-1] += 1
+    edges = np.unique(edges).astype(np.int64)
+    psd = mask.at(np.clip(frequency, low, high), mask.unit or _ANY_UNIT)[edges[0] : edges[-1]]
+    starts = edges[:-1] - edges[0]
+    steep = np.maximum.reduceat(psd, starts) > STEEP * np.minimum.reduceat(psd, starts)
+    points = np.searchsorted(frequency, mask.frequency[1:-1])
+    points = points[(points >= edges[0]) & (points < edges[-1])]
+    points = points[steep[np.searchsorted(edges, points, side="right") - 1]]
+    return np.unique(np.concatenate([edges, points])).astype(np.int64)
+
+
+def judged_range(snapshot: Snapshot, limit: Limit, edges: NDArray[np.int64]) -> tuple[float, float]:
+    """Return from and to which frequency a mask is judged; its own ends where it is to there."""
+    if edges.size < 2:
+        return math.nan, math.nan
+    frequency, (low, *_, high) = snapshot.frequency, limit.mask.frequency
+    first = float(frequency[edges[0]])
+    last = min(float(frequency[edges[-1] - 1]), highest_known(snapshot) or math.inf)
+    spacing = float(frequency[1])
+    return (
+        low if low >= spacing else first,
+        high if high <= last + 2 * spacing else last,
+    )
+
+
+def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray) -> FloatArray:
+    """Return a mask between its points, straight in log-log, in the unit of the result squared/Hz.
+
+    A mask without a unit is in the unit that the channel has in the bench file. A band that ends
+    just outside of the mask has its value at the end.
+    """
+    mask = limit.mask
+    inside = np.clip(frequency, mask.frequency[0], mask.frequency[-1])
+    return mask.at(inside, label.unit, of_channel=_unit_in_file(bench, label))
+
+
+def mean_mask(
+    bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatArray, edges: NDArray[np.int64]
+) -> FloatArray:
+    """Return the mean of a mask over the frequencies of each band, as that of the noise."""
+    first, last = int(edges[0]), int(edges[-1])
+    starts, width = edges[:-1] - first, np.gradient(frequency)[first:last]
+    psd = mask_psd(bench, limit, label, frequency[first:last])
+    return np.asarray(np.add.reduceat(psd * width, starts) / np.add.reduceat(width, starts))
+
+
+def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
+    for sensor in bench.sensors:
+        for channel in sensor.channels:
+            if (sensor.name, channel.name) == (label.sensor, label.channel):
+                return channel.unit
+    return None
