@@ -300,7 +300,7 @@ class EpsonDevice:
         counts = self._sampled.counts(self._sensor, first, n)
         whole = np.clip(np.rint(counts), -FULL_SCALE, FULL_SCALE).astype(np.int64)
         still: dict[str, NDArray[np.int64]] = dict.fromkeys("xyz", np.zeros(n, np.int64))
-        return still | {axis: whole[:, column] for column, axis in enumerate(self._axes)}
+        return still | dict(zip(self._axes, whole.T, strict=False))  # others are not recorded
 
     def _count(self, index: Any) -> Any:  # noqa: ANN401 -- one index or an array of them
         return (index - self._begin + self._first_count) % 65536

@@ -18,7 +18,7 @@ from sim_devices.errors import ServeError
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.devices import device_at, host_clock, paced_clock, serving
-from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
+from tests.sim_devices.simulated_bench import AXES, device, scenario, sensors, spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -239,3 +239,16 @@ def test_a_spec_that_cannot_be_served_is_refused_with_its_cause() -> None:
 def test_the_scenario_passes_through_json() -> None:
     table = scenario("A").to_dict()
     assert Scenario.from_dict(table).to_dict() == table
+
+
+async def test_a_device_may_record_two_of_its_axes() -> None:
+    table = device("A", channels={"A": list(AXES[:2])})
+    described = spec(table, speed=SPEED)
+    motion = {"spectra": [{"shape": "white", "level": 1e-6}] * 2}
+    plane = {"motion": motion, "sensors": {"A": {}}, "longest_block": 4096}
+    described["scenario"] = Scenario.from_dict(plane, sampling_rate=200.0).to_dict()
+    with serving(described) as (one,):
+        found = await blocks(sensors(one, table)[0], 200)
+    counts = np.concatenate([block.counts for block in found])
+    assert counts.shape[1] == 2
+    assert (counts.std(axis=0) > 1000).all()
