@@ -17,6 +17,7 @@ from daq.results.partners import without_partners
 from daq.timing.clock_model import ClockSource
 from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
 from estimator.diagnostics.shared_noise import MAX_CHANNELS
+from estimator.diagnostics.stability import MIN_SEGMENTS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tui.output.formatting import (
@@ -193,11 +194,17 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
 
 def not_searched(snapshot: Snapshot) -> list[str]:
     """Return remarks on what the diagnosis left out."""
-    n = len(snapshot.channels)
-    if n <= MAX_CHANNELS:
-        return []
-    text = f"noise that two channels share is not searched for among more than {MAX_CHANNELS}"
-    return [f"{text} channels, to limit the memory; these are {n}"]
+    lines = []
+    if (n := len(snapshot.channels)) > MAX_CHANNELS:
+        text = f"noise that two channels share is not searched for among more than {MAX_CHANNELS}"
+        lines.append(f"{text} channels, to limit the memory; these are {n}")
+    found = snapshot.diagnostics.diagnosis
+    if found is not None and found.stability is None and snapshot.n_segments >= 2 * MIN_SEGMENTS:
+        lines.append(
+            "whether the noise changes during the recording is not tested with --octaves, --reject "
+            "or segments with gaps: the intervals hold for steady noise"
+        )
+    return lines
 
 
 def faulty_channels(snapshot: Snapshot) -> list[str]:
