@@ -4,6 +4,10 @@ A digitizer without GPS, or whose receiver has lost it, states times that drift.
 its sensors and others then drift as well. They are measured in pieces of the whole recording, and
 their means over parts of it are compared with their scatter within the parts. That scatter is
 measured, not predicted: waves that cross the bench in changing directions add to it.
+
+Where the motion is weak, some delays are those of false peaks: up to 32 samples away, with small
+predicted deviations. Delays far from the others of their part are left out, and so are parts with
+one or two. Where many are false, nothing can be said.
 """
 
 from __future__ import annotations
@@ -41,6 +45,10 @@ _PARTS = 8
 _DRIFTS = 60.0  # χ² of 7 degrees of freedom: 2e-10; the scatter is estimated
 _OVERLAPS = 1.4  # variance of a mean of half overlapping pieces, against independent ones
 _NORMAL = 1.4826  # standard deviation of normal values over the median of their magnitudes
+_FALSE = 5.0  # scatters from the median of its part: a delay of a false peak
+_MOST_FALSE = 0.1  # of the delays
+_FEWEST = 3  # delays of a part: one or two may be false
+_BLIND = 4.0  # samples of scatter within parts: most peaks are false. Drifts leave 3 at most
 _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are wrong
 _GROWTH = 0.5  # of the stretch whose clocks are set, from one setting to the next
 _STEP = 16  # pieces that are measured in between
@@ -100,18 +108,26 @@ def _drifts(
     for column, number in enumerate(sensors):
         clock, mine = aligned.clocks[number], (at, delays[:, column], std[:, column])
         nominal = clock.ppm == clock.wander_ppm == 0
-        drift[number] = drift_of(*mine, nominal=nominal, duration=duration)
+        drift[number] = drift_of(
+            *mine, nominal=nominal, duration=duration, sampling_rate=welch.sampling_rate
+        )
         if is_reference[column]:
             drift[number] = 0.0
     return drift, sensors[int(np.argmax(is_reference))]
 
 
 def drift_of(
-    at: FloatArray, delays: FloatArray, std: FloatArray, *, nominal: bool, duration: float
+    at: FloatArray,
+    delays: FloatArray,
+    std: FloatArray,
+    *,
+    nominal: bool,
+    duration: float,
+    sampling_rate: float,
 ) -> float:
     """Return by how much delays of a sensor drift over a recording, in s rms.
 
-    0 where that is not more than they scatter, NaN where too few are known.
+    0 where that is not more than they scatter, NaN where too few are known or too many are false.
 
     Parameters
     ----------
@@ -122,24 +138,34 @@ def drift_of(
         too, which shows as scatter.
     duration : float
         Of the recording in s. Delays that drift far cannot be measured any more.
+    sampling_rate : float
+        Of the samples that the delays were measured from, in Hz.
     """
     known = np.isfinite(std) & (std > 0)
     at, delays, std = at[known], delays[known], std[known]
     if len(at) < 2 * _PARTS:
         return math.nan
     part = np.minimum((at - at[0]) / (at[-1] - at[0]) * _PARTS, _PARTS - 1).astype(np.int64)
-    n = np.bincount(part, minlength=_PARTS)
-    used = np.flatnonzero(n)
+    used = np.unique(part)
     middle = np.zeros(_PARTS)
     middle[used] = [median(delays[part == each]) for each in used]
     least = median(std)
     within = _NORMAL * median(np.abs(delays - middle[part]))
     within *= float(np.sqrt(len(at) / (len(at) - len(used))))
-    means = np.zeros(_PARTS)
-    means[used] = np.bincount(part, delays, minlength=_PARTS)[used] / n[used]
-    between = float(n @ (means - delays.mean()) ** 2)
     scatter = max(within, least)
+    away = np.abs(delays - middle[part])
+    false = away > _FALSE * np.maximum(scatter, std)
+    agrees = away <= _FALSE * scatter
+    agrees &= np.bincount(part[agrees], minlength=_PARTS)[part] >= _FEWEST
+    if np.mean(false) > _MOST_FALSE or np.count_nonzero(agrees) < 2 * _PARTS:
+        return math.nan
+    at, delays, part = at[agrees], delays[agrees], part[agrees]
+    n = np.bincount(part, minlength=_PARTS)
+    means = np.bincount(part, delays, minlength=_PARTS) / np.maximum(n, 1)
+    between = float(n @ (means - delays.mean()) ** 2)
     drifts = between > max(_DRIFTS * _OVERLAPS * scatter**2, len(at) * least**2)
+    if within * sampling_rate > _BLIND:
+        return math.nan
     if not drifts and (nominal or within <= _SCATTERS * least):
         return 0.0
     slope = float(np.polyfit(at, delays, 1)[0])

@@ -14,12 +14,14 @@ from daq.alignment.stated_utc import take_drift
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.stated_times import drift_of
 from daq.estimation.settings import Settings
+from daq.recording.reader import Recording
 from daq.results.band_summary import channel_means
 from daq.timing.clock_model import ClockSource
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.alignment.recordings import Sensor, blocks, create, write
 from tui.output.results import wrong_times
+from tui.studies.synthesis import synthesise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -189,7 +191,7 @@ def delays(seed: int, n: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def drift(at: np.ndarray, late: np.ndarray, std: np.ndarray, *, nominal: bool = True) -> float:
-    return drift_of(at, late, std, nominal=nominal, duration=64.0)
+    return drift_of(at, late, std, nominal=nominal, duration=64.0, sampling_rate=RATE)
 
 
 def test_steady_delays_are_never_called_drifting() -> None:
@@ -220,3 +222,67 @@ def test_delays_that_nobody_knows_do_not_count() -> None:
     unknown = np.where(at % 2 == 0, np.inf, std)
     wild = np.where(at % 2 == 0, 1e-3 * at, steady)
     assert drift(at, wild, unknown) == 0
+
+
+def false_peaks(seed: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return steady delays, a share of which lies anywhere in what is searched: 32 samples."""
+    at, late, std = delays(seed)
+    rng = np.random.default_rng(seed)
+    wrong = rng.uniform(size=len(at)) < share
+    return at, np.where(wrong, rng.uniform(-32, 32, len(at)) / RATE, late), std
+
+
+@pytest.mark.parametrize("share", [0.02, 0.06, 0.1, 0.3, 0.6, 1.0])
+def test_delays_at_false_peaks_are_not_a_drift(share: float) -> None:
+    found = [drift(*false_peaks(seed, share)) for seed in range(100)]
+    assert not [each for each in found if each > 0]
+    if share != 0.1:
+        assert np.isnan(found).mean() == pytest.approx(float(share > 0.1), abs=0.15)
+
+
+def test_delays_at_false_peaks_do_not_hide_a_drift() -> None:
+    for seed in range(100):
+        at, late, std = delays(seed)
+        drifting = late + 1e-5 * at / at[-1]
+        drifting[[seed % 64, 7 * seed % 64, 21 * seed % 64]] = 0.3, -0.5, 0.6
+        found = drift(at, drifting, std)
+        assert found == pytest.approx(1e-5 / np.sqrt(12), rel=0.2)
+
+
+def test_delays_of_weak_motion_are_not_false() -> None:
+    for seed in range(100):
+        at, late, std = delays(seed)
+        weak = np.arange(len(at)) % 3 == 0
+        late, std = (np.where(weak, 30 * each, each) for each in (late, std))
+        assert drift(at, late, std) == 0
+        found = drift(at, late + 3e-5 * at / at[-1], std)
+        assert found == pytest.approx(3e-5 / np.sqrt(12), rel=0.3)
+
+
+def test_single_delays_of_a_part_are_not_a_drift() -> None:
+    at, late, std = delays(4)
+    std[33:] = np.inf
+    late[63], std[63] = 0.3, 1e-6
+    assert drift(at, late, std) == 0
+
+
+@pytest.mark.parametrize("seed", [200, 203, 206])
+def test_exact_times_of_sensors_in_weak_motion_do_not_drift(tmp_path: Path, seed: int) -> None:
+    scenario = {
+        "seed": seed,
+        "motion": {"spectra": [{"shape": "white", "level": 0.3 * NOISE}] * 3},
+        "sensors": {
+            name: {"sampling_rate": 20.0, "noise": [{"shape": "white", "level": NOISE}] * 3}
+            for name in "abc"
+        },
+    }
+    path = synthesise(
+        tmp_path / "r.h5",
+        Scenario.from_dict(scenario),
+        duration=600.0,
+        block=1.0,
+        utc=dict.fromkeys("abc", 0.0),
+    )
+    with Recording.open(path) as recording:
+        snapshot = estimate([recording], SETTINGS)
+    assert not any(clock.drifts or clock.corrected for clock in snapshot.clocks)
