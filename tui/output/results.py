@@ -181,7 +181,7 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
         lines.append(
             f"The times that {listed(unchecked)} {'states' if len(unchecked) == 1 else 'state'}"
             " could not be compared with the motion: it is too weak, or the recording too short. If"
-            " they drift, motion counts as noise."
+            " they drift, the noise is wrong by a share of the motion."
         )
     nominal = [clock.sensor for clock in snapshot.clocks if math.isnan(clock.residual)]
     if nominal:
