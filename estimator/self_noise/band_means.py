@@ -162,7 +162,7 @@ def decision_interval(
     with np.errstate(invalid="ignore", divide="ignore"):
         low, high = interval_of_cov(np.abs(spread / mean), quantile, averages)
         below, above = mean - quantile * spread, mean + quantile * spread
-    return np.where(mean > 0, mean * low, below), np.where(mean > 0, mean * high, above)
+        return np.where(mean > 0, mean * low, below), np.where(mean > 0, mean * high, above)
 
 
 def interval_of_cov(

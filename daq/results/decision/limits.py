@@ -291,7 +291,7 @@ def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: i
     for advice in snapshot.diagnostics.advice:
         if advice.band is None or advice.level is Level.NOTE:
             continue
-        here = (centre >= advice.band[0]) & (centre <= advice.band[1])
+        here = (high >= advice.band[0]) & (low <= advice.band[1])
         if isinstance(advice, ModelMisfit):
             here &= ~explained
             error = np.where(here, np.maximum(error, advice.error), error)
