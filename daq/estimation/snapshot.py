@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, added, added_by_clocks
+from daq.estimation.snapshot_diagnostics import (
+    SnapshotDiagnostics,
+    added,
+    added_besides_motion,
+    added_by_clocks,
+    left_in,
+)
 from daq.recording.sensor_state import STATE_AFTER
 from estimator.errors import InsufficientDataError
 
@@ -235,11 +241,22 @@ class Snapshot:
 
     @property
     def added(self) -> FloatArray | None:
-        """What clocks and the edges of segments may have added to the noise PSD at most.
+        """What may be in the noise PSD at most that is no noise, of all causes together.
 
-        Shape and unit as of `added_by_clocks`.
+        Clocks, the edges of segments, and motion that few averages do not show. Shape and unit as
+        of `added_by_clocks`.
         """
         return added(self.diagnostics, self.results)
+
+    @property
+    def added_besides_motion(self) -> FloatArray | None:
+        """The same without that motion: of means whose method leaves none in."""
+        return added_besides_motion(self.diagnostics, self.results)
+
+    @property
+    def left_in(self) -> FloatArray | None:
+        """Motion that few averages may leave in the noise PSD at most, a part of `added`."""
+        return left_in(self.diagnostics, self.results)
 
     @property
     def removed(self) -> FloatArray | None:

@@ -72,7 +72,7 @@ def channel_means(
     """Return the mean noise of every channel in a band, each with its interval.
 
     It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
-    given, widened by what the clocks may have added or taken away, and by errors that all
+    given, widened by `Snapshot.added` and `Snapshot.removed`, and by errors that all
     frequencies have in common (`dimension_error`, `second_order_error`). Where maximum likelihood
     stands at its bound of zero at many frequencies, the mean is that of a noise constant over each
     octave, or over the band (`estimator.self_noise.quiet_sensor`).
@@ -110,7 +110,7 @@ def channel_means(
                     0.0
                     if each is None
                     else float(np.average(each[inside, column], weights=width[inside]))
-                    for each in (added, removed)
+                    for each in (snapshot.added_besides_motion, removed)
                 )
                 # noise that varies over the band may be larger: at most the mean, which is too high
                 most = max(high, float(means[column].mean[0])) if is_pooled else high

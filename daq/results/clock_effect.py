@@ -45,8 +45,8 @@ def effect_in_bands(
 ) -> tuple[FloatArray, FloatArray]:
     """Return what may have been added to a channel's mean noise, and taken from it, at most.
 
-    By the clocks, and at the edges of segments. Shapes (n_bands,), in unit²/Hz; infinite where
-    nothing is known of the clocks.
+    By the clocks, the edges of segments, and few averages. Shapes (n_bands,), in unit²/Hz;
+    infinite where nothing is known of the clocks.
     """
     nothing = np.zeros(len(edges) - 1)
     if not snapshot.diagnostics.synchronisation.is_known:
@@ -54,10 +54,7 @@ def effect_in_bands(
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if noise is None:
         return nothing, nothing
-    share = snapshot.diagnostics.synchronisation.noise_bias
     known = np.isfinite(noise.noise_psd[:, column])
-    if share is not None:
-        known &= np.isfinite(share[:, column])
     width = np.where(known, np.gradient(snapshot.frequency), 0.0)
     first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
     whole = np.add.reduceat(width[first:last], starts)

@@ -15,6 +15,7 @@ import numpy as np
 
 from estimator.diagnostics.band import BandDiagnosis
 from estimator.diagnostics.kinds import Untested
+from estimator.diagnostics.motion_left_in import of_coherency, share_of, unpredicted
 from estimator.diagnostics.relative_response import RelativeResponse, relative_response
 from estimator.diagnostics.rules import advise
 from estimator.diagnostics.shared_motion import (
@@ -23,13 +24,13 @@ from estimator.diagnostics.shared_motion import (
     may_have_moved,
     moved,
     shared_motion,
+    significant_dimensions,
 )
 from estimator.diagnostics.shared_noise import shared_noise
 from estimator.diagnostics.stability import Stability, stability
 from estimator.diagnostics.time_rules import changes
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
-from estimator.likelihood.chi_square import critical_value
 from estimator.likelihood.dimension import bands
 from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import (
@@ -47,7 +48,6 @@ from estimator.self_noise.coherency import (
     check_dims,
     check_frequency,
     coherency,
-    own_channels,
     testable,
 )
 from estimator.self_noise.live_channels import Presence, presence
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
 LOST = 0.5
 """Share of a band's frequencies with noise below its standard error from which `noise_lost` is
 set."""
-DIMENSION_LEVEL = 0.01
-"""Level of the test for further dimensions, for all pairs of sensors together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +95,9 @@ class Diagnostics:
         Relative responses of the comparable pairs: sensors with all their channels.
     advice : tuple of Advice
         Most severe first.
+    left_in : float64, shape (n_freqs, n_channels)
+        Motion that may be left in the noise estimate at most, in unit**2/Hz:
+        `estimator.diagnostics.motion_left_in`.
     stability : Stability or None
         None without segments, or with too few.
     """
@@ -113,6 +114,7 @@ class Diagnostics:
     bands: tuple[BandDiagnosis, ...]
     responses: tuple[RelativeResponse, ...]
     advice: tuple[Advice, ...]
+    left_in: FloatArray
     stability: Stability | None = None
 
 
@@ -187,13 +189,15 @@ def diagnose(
     tested = fit if q == d else _fit(matrix, there, q, n_effective)
     model, untested = _test(tested, there, n_effective, len(csm))
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
+    rest = there.spread(unpredicted(part.matrix, n_effective), sum(dims)) * given.psd
+    left_in = of_coherency(given, frequency, dims=dims, n_effective=n_effective)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
         snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
         lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
     canonical = CanonicalCoherence(matrix)
     del matrix  # as large as all averages
-    dimension = _dimension(canonical, there.dims, n_effective)
+    dimension = significant_dimensions(canonical, there.dims, n_effective)
     number = bands(frequency)
     insides = [number == band for band in sorted(set(number.tolist()))]
     found = tuple(
@@ -208,6 +212,7 @@ def diagnose(
             test=pool(model, inside, neighbours=neighbours),
             shared=_shared(canonical, there, len(dims), inside=inside, n_effective=n_effective),
             n_frequencies=int(inside.sum()),
+            left_in=share_of(left_in[inside], rest[inside], dims=dims),
         )
         for inside in insides
     )
@@ -265,6 +270,7 @@ def diagnose(
                 else tuple(changes(steady, course.times, np.repeat(np.arange(len(dims)), dims)))
             ),
         ),
+        left_in=left_in,
         stability=steady,
     )
 
@@ -341,31 +347,6 @@ def _test(
     information = fisher.information(fit.eigenvectors[:, :, fit.n_factors :])
     degrees = test.degrees + (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
     return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
-
-
-def _dimension(
-    canonical: CanonicalCoherence, dims: tuple[int, ...], n_effective: float
-) -> FloatArray:
-    """Return the number of significant canonical coherences between sensors, shape (n_freqs,).
-
-    Bartlett's test that all but the r largest are zero, for complex averages:
-    ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
-    """
-    pairs = list(combinations(range(len(dims)), 2))
-    found = np.zeros(len(canonical.usable))
-    if not pairs or n_effective <= 2 * max(dims):
-        return np.full(len(found), np.nan)
-    for j, k in pairs:
-        coherence = np.minimum(
-            canonical.between(own_channels(dims, j), own_channels(dims, k)), 1 - 1e-15
-        )
-        scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
-        statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
-        r = np.arange(coherence.shape[1])
-        degrees = 2 * (dims[j] - r) * (dims[k] - r)
-        limit = [critical_value(n, DIMENSION_LEVEL / len(pairs)) for n in degrees.tolist()]
-        found = np.maximum(found, (statistic > limit).sum(axis=1))
-    return np.where(canonical.usable, found, np.nan)
 
 
 def _responses(

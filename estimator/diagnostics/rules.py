@@ -35,6 +35,7 @@ from estimator.diagnostics.advice import (
 )
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import SharedNoise
+from estimator.diagnostics.motion_left_in import among_like_sensors
 from estimator.diagnostics.orientation import orientation
 from estimator.diagnostics.shared_motion import outsiders
 from estimator.likelihood.goodness_of_fit import less, rejected_below
@@ -48,13 +49,16 @@ if TYPE_CHECKING:
     from estimator.diagnostics.relative_response import RelativeResponse
     from estimator.diagnostics.shared_noise import SharedPairs
     from estimator.self_noise.coherency import Coherency
-    from estimator.types import FloatArray
+    from estimator.types import BoolArray, FloatArray
 
 TYPICAL = 10.0
 CROSSING = 20.0
 CROSSING_THREE = 100.0
 LARGE_ERROR = 0.5
 """Error, as a fraction of the noise, from which an estimate is wrong."""
+QUIET_ERROR = 0.25
+"""Share of motion in a channel's estimate from which it is advised: more than few averages leave
+in the noise of like sensors."""
 SMALL_ERROR = 0.05
 """Error, as a fraction of the noise, below which it is harmless."""
 
@@ -113,7 +117,7 @@ def advise(
         *_sensor_space(bands, dims),
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
-        *_left_in(bands, max(dims), n_effective),
+        *_left_in(bands, dims, n_effective),
     ]
     found = [
         *_absent(given, dims),
@@ -182,7 +186,13 @@ def _span(run: list[BandDiagnosis]) -> tuple[float, float]:
 def _is_weak(band: BandDiagnosis) -> bool:
     """Return whether the motion is weaker than the noise in every channel."""
     known = band.snr[~np.isnan(band.snr)]
-    return len(known) > 0 and bool(known.max() < 1) and not band.noise_lost.any()
+    is_known = len(known) > 0 and not band.noise_lost.any() and not _may_have_motion(band).any()
+    return is_known and bool(known.max() < 1)
+
+
+def _may_have_motion(band: BandDiagnosis) -> BoolArray:
+    """Return of which channels' noise a large part may be motion, shape (n_channels,)."""
+    return np.asarray(band.left_in >= QUIET_ERROR)
 
 
 def _absent(given: Coherency, dims: tuple[int, ...]) -> Iterator[Advice]:
@@ -336,7 +346,12 @@ def _dimensions(
     if len(dims) < 2:
         return
     full = min(sorted(dims)[-2:])
-    for run in _runs(bands, lambda band: band.dimension < full and not _is_weak(band)):
+
+    def is_missing(band: BandDiagnosis) -> bool:
+        hidden = _is_weak(band) or _may_have_motion(band).any()
+        return band.dimension < full and not hidden
+
+    for run in _runs(bands, is_missing):
         yield MissingDimension(
             level=Level.WARNING,
             band=_span(run),
@@ -357,29 +372,24 @@ def _weak_motion(bands: tuple[BandDiagnosis, ...]) -> Iterator[Advice]:
         yield WeakMotion(level=Level.NOTE, band=_span(run), snr=snr)
 
 
-def left_in(d: int, n_effective: float) -> float:
-    """Return the maximum weak motion left in by triad methods, as a fraction of the noise.
-
-    Parameters
-    ----------
-    d : int
-        Dimensions of the motion.
-    n_effective : float
-
-    Returns
-    -------
-    float
-        The maximum over the SNR s of ``ρ (1 − g)^(n / d)``, where ``ρ = s / (1 + 2 s)`` is the
-        motion that two like sensors do not predict and ``g = (s / (1 + s))²`` their coherence:
-        exact for d = 1 (`docs/decisions/0010`), an upper bound of measurements for d = 2 and 3.
-    """
-    s = np.geomspace(1e-4, 10, 501)
-    return float((s / (1 + 2 * s) * (1 - (s / (1 + s)) ** 2) ** (n_effective / d)).max())
-
-
-def _left_in(bands: tuple[BandDiagnosis, ...], d: int, n_effective: float) -> Iterator[Advice]:
-    """Yield advice on weak motion in most channels: scatter makes some SNRs far too high."""
-    share = left_in(d, n_effective)
+def _left_in(
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
+) -> Iterator[Advice]:
+    """Yield advice on motion in quiet sensors' noise, and on weak motion (with wild SNRs)."""
+    share = among_like_sensors(max(dims), n_effective)
+    most = max(share, QUIET_ERROR)
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    for run in _runs(bands, lambda band: bool((band.left_in > most).any())):
+        largest = np.max([band.left_in for band in run], axis=0)
+        channels = np.flatnonzero(largest > most)
+        yield MotionLeftIn(
+            level=Level.WARNING,
+            sensors=tuple(np.unique(sensor_of[channels]).tolist()),
+            band=_span(run),
+            share=float(largest.max()),
+            n_effective=float(n_effective),
+            channels=tuple(channels.tolist()),
+        )
     if share < SMALL_ERROR:
         return
     for run in _runs(bands, lambda b: bool((b.snr < 1).sum() > np.isfinite(b.snr).sum() / 2)):

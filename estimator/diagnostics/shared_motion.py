@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.likelihood.chi_square import critical_value
 from estimator.median import median
 from estimator.self_noise.coherency import blocks, own_channels
 
@@ -35,6 +36,8 @@ ERRORS = 3.0
 
 PARTS = 12
 """Number of parts of a test, at most."""
+DIMENSION_LEVEL = 0.01
+"""Level of the test for further dimensions, for all pairs of sensors together."""
 FREQUENCIES = 8
 """Number of frequencies that are averaged in a part."""
 LESS = 0.9
@@ -349,3 +352,28 @@ def is_coherent(g: FloatArray, known: BoolArray, least: float = MIN_COHERENCE) -
     total, count = (np.cumsum(np.append(0.0, each)) for each in (np.where(known, g, 0.0), known))
     mean = (total[high] - total[low]) / np.maximum(count[high] - count[low], 1.0)
     return np.asarray((mean >= least) | (g >= _OF_A_LINE))
+
+
+def significant_dimensions(
+    canonical: CanonicalCoherence, dims: tuple[int, ...], n_effective: float
+) -> FloatArray:
+    """Return the number of significant canonical coherences between sensors, shape (n_freqs,).
+
+    Bartlett's test that all but the r largest are zero, for complex averages:
+    ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
+    """
+    pairs = list(combinations(range(len(dims)), 2))
+    found = np.zeros(len(canonical.usable))
+    if not pairs or n_effective <= 2 * max(dims):
+        return np.full(len(found), np.nan)
+    for j, k in pairs:
+        coherence = np.minimum(
+            canonical.between(own_channels(dims, j), own_channels(dims, k)), 1 - 1e-15
+        )
+        scale = -2 * (n_effective - (dims[j] + dims[k]) / 2)
+        statistic = scale * np.cumsum(np.log1p(-coherence[:, ::-1]), axis=1)[:, ::-1]
+        r = np.arange(coherence.shape[1])
+        degrees = 2 * (dims[j] - r) * (dims[k] - r)
+        limit = [critical_value(n, DIMENSION_LEVEL / len(pairs)) for n in degrees.tolist()]
+        found = np.maximum(found, (statistic > limit).sum(axis=1))
+    return np.where(canonical.usable, found, np.nan)

@@ -81,7 +81,7 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
         f"the channel does worst. dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
         "interval of its margin is above zero in every band, and fails where it is below zero in "
         "one. The intervals hold for all channels and bands together with a probability of 95 %, "
-        "and include what the clocks may add."
+        "and include what the clocks may add, and motion that few averages do not show."
     )
     table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))

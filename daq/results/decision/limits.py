@@ -60,6 +60,9 @@ if TYPE_CHECKING:
 MIN_AVERAGES = 20.0
 """Averages below which the far tails of the interval have not been verified by simulation."""
 
+LARGE_SHARE = 0.25
+"""Share of motion in the estimate, at most, from which it is named as an obstacle."""
+
 
 def judge(bench: Bench | None, snapshot: Snapshot, settings: Settings) -> TestVerdict | None:
     """Return the verdict on all limits, by the method of the settings; None without limits."""
@@ -124,6 +127,7 @@ class _Comparison:
     high: FloatArray
     added: FloatArray
     removed: FloatArray
+    left_in: FloatArray
     error: FloatArray
     averages: FloatArray
     is_alone: NDArray[np.bool_]
@@ -183,12 +187,16 @@ class _Comparison:
         by_clocks = would_fail and not bool((self.low - self.added > self.mask).any())
         by_clocks |= would_pass and not bool((self.high + self.removed <= self.mask).all())
         by_clocks |= bool(np.isinf(self.added).any())  # nothing is known of them
+        without = self.low - self.left_in <= self.mask
+        is_large = self.left_in >= LARGE_SHARE * np.abs(self.mean)
+        by_motion = bool((is_large & without & (self.mean > self.mask)).any())
         reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
         reasons = (
             (Obstacle.NO_ESTIMATE, not known.all()),
             (Obstacle.NO_SHARED_MOTION, bool(self.is_alone.any())),
             (Obstacle.TOO_FEW_AVERAGES, not trusted.all()),
             (Obstacle.FAULTY_CHANNEL, reads_high),
+            (Obstacle.WEAK_MOTION, by_motion),
             (Obstacle.CLOCKS, by_clocks),
             (Obstacle.MODEL_MISFIT, would_fail or would_pass),
         )
@@ -221,11 +229,12 @@ def _compare(
     label, frequency = snapshot.channels[column], snapshot.frequency
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
-        centre = mask = added = removed = np.empty(0)
+        centre = mask = added = removed = left_in = np.empty(0)
     else:
         centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
         mask = mean_mask(bench, limit, label, frequency, edges)
         added, removed = effect_in_bands(snapshot, settings, edges, column)
+        left_in = _left_in(snapshot, edges, column)
     averages = averages_at(snapshot, centre)
     mean = spread = low = high = np.full(centre.shape, np.nan)
     if noise is not None and centre.size:
@@ -254,6 +263,7 @@ def _compare(
         high=high,
         added=added,
         removed=removed,
+        left_in=left_in,
         error=_errors(snapshot, edges, judged_method(snapshot, settings), column),
         averages=averages,
         is_alone=np.array(
@@ -300,6 +310,17 @@ def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: i
         elif isinstance(advice, TooFewDimensions):
             error = np.where(here & ~explained, np.inf, error)
     return error
+
+
+def _left_in(snapshot: Snapshot, edges: NDArray[np.int64], column: int) -> FloatArray:
+    """Return the motion that may be left in the mean noise of each band at most, unit²/Hz."""
+    found = snapshot.left_in
+    if found is None:
+        return np.zeros(len(edges) - 1)
+    inside, starts = slice(edges[0], edges[-1]), edges[:-1] - edges[0]
+    width = np.gradient(snapshot.frequency)[inside]
+    total = np.add.reduceat(found[inside, column] * width, starts)
+    return np.asarray(total / np.add.reduceat(width, starts))
 
 
 def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:

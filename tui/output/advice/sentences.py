@@ -308,7 +308,15 @@ def _weak_motion(advice: WeakMotion, names: Names) -> Explanation:
 
 @explain.register(MotionLeftIn)
 def _motion_left_in(advice: MotionLeftIn, names: Names) -> Explanation:
-    del names
+    if advice.channels:
+        quiet = listed([names.channels[channel] for channel in advice.channels])
+        return Explanation(
+            f"{quiet}: at {where(advice)} the motion is too weak beside the noise of the other "
+            f"sensors to be found in {advice.n_effective:.0f} averages: up to about "
+            f"{percent(advice.share)} of the noise estimate may be motion. The lower end of its "
+            "interval includes this.",
+            "Record longer or where the motion is stronger, or compare with quieter sensors.",
+        )
     return Explanation(
         f"At {where(advice)} the motion is too weak to be found in {advice.n_effective:.0f} "
         "averages: three-sensor and three-channel estimates may include motion and be too high by "

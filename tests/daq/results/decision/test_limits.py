@@ -423,3 +423,32 @@ def test_dimensions_that_do_not_explain_the_averages_decide_nothing(
     assert found.verdict is (verdict or Verdict.NOT_DECIDED)
     if verdict is None:
         assert {each.obstacle for each in found.limits} == {Obstacle.MODEL_MISFIT}
+
+
+@pytest.mark.parametrize("clocks_known", [True, False])
+def test_what_may_be_motion_does_not_fail(*, clocks_known: bool) -> None:
+    """Also where the clocks are taken as stated, and what they add is not known."""
+    snapshot = diagnosed()
+    noise = snapshot.results["three-sensor"]
+    psd = float(np.nanmedian(noise.noise_psd[:, 8]))
+    diagnosis = snapshot.diagnostics.diagnosis
+    assert diagnosis is not None
+
+    def found(share: float) -> TestVerdict:
+        left = share * np.nan_to_num(np.abs(noise.noise_psd))
+        left[:, :8] = 0
+        spectra = replace(diagnosis.per_frequency, left_in=left)
+        bias = np.full(left.shape, 0.0 if clocks_known else np.nan)
+        diagnostics = replace(
+            snapshot.diagnostics,
+            diagnosis=replace(diagnosis, per_frequency=spectra, advice=()),
+            synchronisation=replace(snapshot.diagnostics.synchronisation, noise_bias=bias),
+        )
+        more = 'sensors = ["C"]\nchannels = ["Z"]'
+        return verdict_on(replace(snapshot, diagnostics=diagnostics), psd / 1.6, more)
+
+    assert found(0.0).verdict is Verdict.FAIL
+    undecided = found(0.9)
+    assert undecided.verdict is Verdict.NOT_DECIDED
+    assert undecided.obstacles == (Obstacle.WEAK_MOTION,)
+    assert undecided.prediction is None

@@ -268,6 +268,20 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("too weak to be found in 20 averages", "up to about 8.5 %", "Record longer"),
     ),
     (
+        MotionLeftIn(
+            level=Level.WARNING,
+            sensors=(0,),
+            band=BAND,
+            share=0.6,
+            n_effective=190.0,
+            channels=(0, 1),
+        ),
+        (
+            "a.x and a.y: at 2–8 Hz",
+            "190 averages: up to about 60 % of the noise estimate",
+        ),
+    ),
+    (
         SwappedChannels(level=Level.WARNING, sensors=(0, 1), band=BAND, channels=((3, 1), (4, 0))),
         ("Channels are swapped: b.x follows a.y and b.y follows a.x.", "order of the channels"),
     ),
