@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GLOBAL_KEYS = (
     ("1 2 3 4", "the views: bench, test, result, recordings"),
     ("ctrl+p", "all commands by name"),
-    ("q", "quit, as Ctrl-C does; a recording goes on, and is found again"),
+    ("q", "quit, as Ctrl-C does; a recording continues, and is found again"),
 )
 WORDS = (
     ("data", "what the channel recorded: motion and noise (grey)"),
@@ -31,7 +31,7 @@ WORDS = (
     ("▾", "the estimate came out below zero there: its upper bound, or floor"),
     ("known to", "scatter of the noise at one frequency (c.o.v.), worst channel"),
     ("wanted", "the scatter to reach: the bench file's target_cov"),
-    ("segment", "a piece of the recording that is averaged; more make noise surer"),
+    ("segment", "a piece of the recording; more of them make the noise more certain"),
     ("excluded", "segments with a gap, clipping or a transient"),
     ("gaps", "how often samples are missing, and (how many)"),
     *((state.value, meaning) for state, meaning in STATE_MEANINGS.items()),

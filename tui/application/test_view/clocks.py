@@ -82,7 +82,7 @@ def clock_table(snapshot: Snapshot, settings: Settings, *, chosen: str, width: i
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style=f"bold {MUTED}")
     table.add_column("clock", no_wrap=True)
     wide = width >= 76
-    for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "left", "of noise"):
+    for title in ("rate, ppm", *(("wander, ppm",) if wide else ()), "error", "of noise"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("known by", no_wrap=True)
     shares, left = effect_by_sensor(snapshot, settings), residuals(snapshot)

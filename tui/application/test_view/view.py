@@ -78,7 +78,7 @@ class TestView(View):
         ("space", "draw this channel beside others that you choose; space again: no longer"),
         (", .  < >", "cursor left and right, and far: values are read off above the plot"),
         ("+ - [ ]", "zoom about the cursor, and move; esc: all of it, no cursor, one channel"),
-        ("f", "freeze the curves; recording goes on"),
+        ("f", "freeze the curves; recording continues"),
         ("t", "table: a row per channel, or per sensor"),
         ("c", "clocks: how they drift, and whether that matters; c again: noise"),
         ("v", "save the estimate as CSV and JSON, and this screen as a picture (SVG)"),
