@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.errors import WrongSettingError
-from daq.results.band_summary import band_of, channel_means, correlation_of, judged_method
+from daq.results.band_summary import band_of, correlation_of
 from daq.results.certificates import certificates_of, channel_of
-from daq.results.clock_effect import effect, relative_time
+from daq.results.clock_effect import relative_time
+from daq.results.noise_budget import known, noise_budgets
 from daq.results.uncertainty_budget import Budget, Component
 from daq.timing.clock_model import RelativeTime
-from estimator.diagnostics.advice import ModelMisfit
 from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
 from estimator.responses.derived_quantities import Value
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench, Certificate
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
+    from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.responses.calibration import ResponseCurve, SensorCalibration
     from estimator.types import ComplexArray, FloatArray
 
@@ -50,10 +50,13 @@ class Calibration:
     curves : tuple of ResponseCurve
         The same, in thirds of an octave.
     budgets : tuple of Budget
-        Of the sensitivities in the whole band and in octaves, and of the noise in the whole band.
+        Of the sensitivities in the whole band and in octaves, and of the noise in the whole band,
+        in terms of the calibrated sensitivities.
     confidence : float
     refused : mapping of int to str
-        Why a sensor is not calibrated.
+        Why a sensor is not calibrated. Its noise has no budget.
+    without_noise : tuple of ChannelLabel
+        Calibrated channels whose mean noise is not positive, and that have no budget of it.
     """
 
     reference: int
@@ -63,6 +66,7 @@ class Calibration:
     budgets: tuple[Budget, ...]
     confidence: float
     refused: dict[int, str] = field(default_factory=dict)
+    without_noise: tuple[ChannelLabel, ...] = ()
 
     def whole_band(self, quantity: str) -> tuple[Budget, ...]:
         """Return the budgets of a quantity in the widest band."""
@@ -144,15 +148,16 @@ def calibrate(
         raise InsufficientDataError(
             f"no sensor can be compared with {names[chosen]}: " + "; ".join(refused.values())
         )
-    budgets += work.noise(budgets)
+    noise, without_noise = work.noise(sensors, budgets)
     return Calibration(
         reference=chosen,
         certificates=certificates,
         sensors=tuple(sensors),
         curves=tuple(curves),
-        budgets=tuple(budgets),
+        budgets=(*budgets, *noise),
         confidence=confidence,
         refused=refused,
+        without_noise=tuple(without_noise),
     )
 
 
@@ -186,6 +191,7 @@ class _Work:
             # conservative: as if the certificates of all its channels erred together
             relative = certificate.expanded_uncertainty / certificate.k / abs(certificate.value)
             self._from_certificate = max(self._from_certificate, relative)
+        self._scale = scale
         self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
         n = snapshot.n_effective
         self._averages = min([n, *(octave.n_effective for octave in snapshot.octaves)])
@@ -252,7 +258,7 @@ class _Work:
         residual = self.snapshot.diagnostics.synchronisation.residual
         names = self.snapshot.sensor_names
         jitter = math.hypot(
-            *(_known(residual.get(names[each], 0.0)) for each in (found.sensor, found.reference))
+            *(known(residual.get(names[each], 0.0)) for each in (found.sensor, found.reference))
         )
         budgets = []
         for number in range(self.snapshot.dims[found.sensor]):
@@ -313,79 +319,29 @@ class _Work:
             return 0.0
         return float(np.sqrt(share.mean() / (2 * max(self._averages, 1.0) * share.size)))
 
-    def noise(self, sensitivities: Sequence[Budget]) -> list[Budget]:
-        """Return a budget for the noise of each channel over the whole band."""
-        snapshot = self.snapshot
-        method = judged_method(snapshot, self._settings)
-        found = snapshot.results.get(method)
-        if found is None:
-            return []
-        low, high = self.band
-        inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
-        gains: dict[tuple[str, str], float] = {}
+    def noise(
+        self, sensors: Sequence[SensorCalibration], sensitivities: Sequence[Budget]
+    ) -> tuple[list[Budget], list[ChannelLabel]]:
+        """Return budgets of the noise over the whole band, and the channels without noise."""
+        combined: dict[tuple[str, str], float] = {}
         for each in reversed(sensitivities):
-            gains[each.sensor, each.channel] = each.combined
-        misfit = max(
-            (
-                each.error
-                for each in snapshot.diagnostics.advice
-                if isinstance(each, ModelMisfit)
-                and (each.band is None or (each.band[0] <= high and each.band[1] >= low))
-            ),
-            default=0.0,
+            combined[each.sensor, each.channel] = each.combined
+        first, labels = int(self._first[self._reference]), self.snapshot.channels
+        calibrated = {
+            first + number: (1 / float(self._scale[first + number]), self._from_certificate)
+            for number in range(self.snapshot.dims[self._reference])
+        }
+        for found in sensors:
+            for number, gain in enumerate(found.gain.value.tolist()):
+                column = int(self._first[found.sensor]) + number
+                label = labels[column]
+                calibrated[column] = (gain, combined[label.sensor, label.channel])
+        return noise_budgets(
+            self.snapshot,
+            self._settings,
+            self.band,
+            calibrated,
+            averages=self._averages,
+            confidence=self._confidence,
+            is_absolute=bool(self._certificates),
         )
-        clocks = effect(snapshot, self._settings)
-        edges = snapshot.diagnostics.edge_leakage
-        budgets = []
-        for column, (label, mean) in enumerate(
-            zip(
-                snapshot.channels,
-                channel_means(found, snapshot, self._settings, self.band),
-                strict=True,
-            )
-        ):
-            value = float(mean.mean[0])
-            if not value > 0:
-                continue
-            leaks = 0.0 if edges is None else float(np.mean(edges.most[inside, column])) / value
-            counting = 0.0
-            if snapshot.quantisation_psd is not None:
-                psd = snapshot.quantisation_psd[inside, column]
-                counting = _known(float(np.mean(psd))) / value
-            own = gains.get((label.sensor, label.channel), self._from_certificate)
-            budgets.append(
-                Budget(
-                    sensor=label.sensor,
-                    channel=label.channel,
-                    quantity="noise",
-                    low=low,
-                    high=high,
-                    value=value,
-                    components=(
-                        Component(
-                            "estimate",
-                            "A",
-                            "normal",
-                            float(mean.spread[0]) / value,
-                            2 * max(self._averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
-                        ),
-                        Component("sensitivity", "B", "normal", 2 * own),
-                        Component(
-                            "clocks",
-                            "B",
-                            "rectangular",
-                            _known(float(clocks[column])) / _RECTANGULAR,
-                        ),
-                        Component("leakage", "B", "rectangular", leaks / _RECTANGULAR),
-                        Component("incoherence", "B", "rectangular", misfit / _RECTANGULAR),
-                        Component("quantisation", "B", "rectangular", counting / _RECTANGULAR),
-                    ),
-                    confidence=self._confidence,
-                    is_absolute=bool(self._certificates),
-                )
-            )
-        return budgets
-
-
-def _known(value: float) -> float:
-    return value if math.isfinite(value) else 0.0

@@ -15,13 +15,13 @@ from tui.output.calibration import (
     LEGEND,
     angle_table,
     budget_table,
-    calibration_document,
     matrix_table,
     noise_rows,
     remarks,
     sensitivity_table,
     title,
 )
+from tui.output.calibration_json import calibration_document
 from tui.output.console import check_places, for_people, hint, write_json
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def calibrate_recordings(
     sensitivities, noise = found.whole_band("sensitivity"), found.whole_band("noise")
     _show(screen, "Budget of the sensitivities, relative", budget_table(sensitivities))
     if noise:
-        _show(screen, "Noise", noise_rows(found, snapshot.unit))
+        _show(screen, "Noise, by the calibrated sensitivities", noise_rows(found, snapshot.unit))
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
     for line in (LEGEND, *remarks(found, snapshot), *problems(snapshot)):
         screen.print(line)

@@ -1,16 +1,15 @@
-"""Calibration results as tables, remarks and JSON."""
+"""Calibration results as tables and remarks."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from daq.bench.units import decibels
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import student_quantile
 from daq.timing.clock_model import RelativeTime
 from tui.output.formatting import signed, span
-from tui.output.json_values import plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.calibration import Calibration
     from daq.results.uncertainty_budget import Budget, Component
-    from estimator.responses.calibration import SensorCalibration
     from estimator.responses.derived_quantities import Value
 
 Rows = tuple[tuple[str, ...], ...]
@@ -85,7 +83,7 @@ def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str
     budgets = {(each.sensor, each.channel): each for each in found.whole_band("sensitivity")}
     for each in found.sensors:
         name = snapshot.sensor_names[each.sensor]
-        for number, channel in enumerate(_channels(snapshot, each.sensor)):
+        for number, channel in enumerate(channels_of(snapshot, each.sensor)):
             budget = budgets[name, channel]
             rows.append(
                 (
@@ -105,7 +103,7 @@ def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str
 def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
     """Return rotations and deviations from right angles."""
     k = _k(found)
-    reference = _channels(snapshot, found.reference)
+    reference = channels_of(snapshot, found.reference)
     most = max(each.rotation_deg.value.size for each in found.sensors)
     if most == 3:
         about = tuple(f"about {channel} (°)" for channel in reference)
@@ -128,7 +126,7 @@ def angle_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...]
 def matrix_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...], Rows]:
     """Return the relative response of every channel, cross-axis included."""
     k = _k(found)
-    reference = _channels(snapshot, found.reference)
+    reference = channels_of(snapshot, found.reference)
     name = snapshot.sensor_names[found.reference]
     rows = [
         (
@@ -142,7 +140,7 @@ def matrix_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str, ...
             ),
         )
         for each in found.sensors
-        for row, channel in enumerate(_channels(snapshot, each.sensor))
+        for row, channel in enumerate(channels_of(snapshot, each.sensor))
     ]
     return ("sensor", "channel", *(f"to {name}.{each}" for each in reference)), tuple(rows)
 
@@ -215,6 +213,17 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
             f"No certificate of {name} in the bench file: sensitivities are those of the bench file"
             f" times the values shown, if those of {name} are right."
         )
+    if found.whole_band("noise"):
+        lines.append(
+            "Noise is in terms of the sensitivities calibrated here, not of those of the bench "
+            "file: other tables and curves of noise differ by the squares of their ratios."
+        )
+    if found.without_noise:
+        channels = ", ".join(label.name for label in found.without_noise)
+        lines.append(
+            f"Mean noise of {channels}: not positive, and not shown. It is too small against the "
+            "motion or the noise of the other sensors."
+        )
     lines += _times(found, snapshot)
     lines += [
         f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
@@ -258,90 +267,6 @@ def _times(found: Calibration, snapshot: Snapshot) -> list[str]:
     return lines
 
 
-def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, Any]:
-    """Return a calibration as JSON (docs/json.md)."""
-    names = snapshot.sensor_names
-    curves = {each.sensor: each for each in found.curves}
-    document = {
-        "reference": names[found.reference],
-        "is_absolute": bool(found.certificates),
-        "certificates": [
-            {
-                "value": each.value,
-                "expanded_uncertainty": each.expanded_uncertainty,
-                "k": each.k,
-                "date": None if each.date is None else each.date.isoformat(),
-                "number": each.number,
-            }
-            for each in found.certificates
-        ],
-        "confidence": found.confidence,
-        "refused": {names[sensor]: why for sensor, why in found.refused.items()},
-        "sensors": [
-            {
-                "sensor": names[each.sensor],
-                "channels": _channels(snapshot, each.sensor),
-                "band_hz": [each.low, each.high],
-                "excess": each.excess,
-                "dof": each.dof,
-                "relative_time": relative_time(
-                    snapshot, names[each.sensor], names[found.reference]
-                ),
-                **{
-                    key: {"value": value.value.tolist(), "standard_error": value.error.tolist()}
-                    for key, value in _values(each).items()
-                },
-                "curve": {
-                    "frequency_hz": curves[each.sensor].frequency.tolist(),
-                    "real": curves[each.sensor].matrix.real.tolist(),
-                    "imag": curves[each.sensor].matrix.imag.tolist(),
-                    "standard_error": curves[each.sensor].error.tolist(),
-                },
-            }
-            for each in found.sensors
-        ],
-        "budgets": [
-            {
-                "sensor": each.sensor,
-                "channel": each.channel,
-                "quantity": each.quantity,
-                "is_absolute": each.is_absolute,
-                "band_hz": [each.low, each.high],
-                "value": each.value,
-                "components": [
-                    {
-                        "source": part.source,
-                        "type": part.kind,
-                        "distribution": part.distribution,
-                        "relative_standard_uncertainty": part.relative,
-                        "degrees_of_freedom": part.dof,
-                    }
-                    for part in each.components
-                ],
-                "combined_relative": each.combined,
-                "effective_degrees_of_freedom": each.dof,
-                "k": each.k,
-                "expanded_uncertainty": each.expanded,
-            }
-            for each in found.budgets
-        ],
-    }
-    return {key: plain(value) for key, value in document.items()}
-
-
-def _values(each: SensorCalibration) -> dict[str, Value]:
-    return {
-        "matrix": each.matrix,
-        "gain": each.gain,
-        "cross_axis": each.cross_axis,
-        "rotation_deg": each.rotation_deg,
-        "angle_deg": each.angle_deg,
-        "orthogonality_deg": each.orthogonality_deg,
-        "delay": each.delay,
-        "skew": each.skew,
-    }
-
-
 def _k(found: Calibration) -> float:
     dof = min(each.dof for each in found.sensors)
     return student_quantile(0.5 + found.confidence / 2, dof)
@@ -356,6 +281,7 @@ def _element(value: Value, number: int, k: float, scale: float = 1.0) -> str:
     )
 
 
-def _channels(snapshot: Snapshot, sensor: int) -> list[str]:
+def channels_of(snapshot: Snapshot, sensor: int) -> list[str]:
+    """Return the names of a sensor's channels."""
     name = snapshot.sensor_names[sensor]
     return [label.channel for label in snapshot.channels if label.sensor == name]

@@ -43,7 +43,10 @@ def calibration_section(
     ]
     if noise:
         tables += [
-            ("Noise with its expanded uncertainty", noise_rows(found, snapshot.unit)),
+            (
+                "Noise by the calibrated sensitivities, with its expanded uncertainty",
+                noise_rows(found, snapshot.unit),
+            ),
             ("Uncertainty budget of the noise PSD", budget_table(noise)),
         ]
     parts: list[Part] = [Paragraph(f"{title(found, snapshot)}. {remarks(found, snapshot)[0]}")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from datetime import date
 from typing import TYPE_CHECKING
 
@@ -16,13 +17,15 @@ from daq.bench.model import Sensor as BenchSensor
 from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.band_summary import judged_method
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from daq.timing.clock_model import RelativeTime
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
-from tui.output.calibration import with_error
+from tui.output.calibration import remarks, with_error
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -147,7 +150,12 @@ def test_relative_sensitivities_with_their_budget(snapshot: Snapshot) -> None:
     noise = found.whole_band("noise")
     assert len(noise) == 9
     for each in noise:  # white noise of 100 counts and of rounding, at 50 Hz
-        assert abs(each.value - 2 * 100.0**2 / 50) < 2 * each.expanded
+        assert abs(each.value - noise_of(each.sensor)) < 2 * each.expanded
+
+
+def noise_of(sensor: str, *, reference: str = "a", certificate: float = 1.0) -> float:
+    """Return the PSD of a sensor's noise in units of motion: of 100 counts at 50 Hz."""
+    return float(2 * 100.0**2 / 50 * (GAINS[reference] / certificate / GAINS[sensor]) ** 2)
 
 
 def test_a_certificate_makes_results_absolute(snapshot: Snapshot) -> None:
@@ -161,6 +169,46 @@ def test_a_certificate_makes_results_absolute(snapshot: Snapshot) -> None:
     assert certificate.relative == pytest.approx(0.01)
     assert each.combined == pytest.approx(0.01, rel=0.01)
     assert each.expanded == pytest.approx(0.0196, rel=0.01)
+
+
+@pytest.mark.parametrize("certificate", [1.03, 1.1])
+def test_noise_is_in_terms_of_the_calibrated_sensitivities(
+    snapshot: Snapshot, certificate: float
+) -> None:
+    noise = calibrate(snapshot, SETTINGS, bench(certificate, 1e-4)).whole_band("noise")
+    assert len(noise) == 9
+    for each in noise:
+        assert each.is_absolute
+        truth = noise_of(each.sensor, reference="b", certificate=certificate)
+        assert abs(each.value - truth) < 2 * each.expanded
+
+
+def test_a_sensor_that_is_not_calibrated_has_no_budget_of_its_noise() -> None:
+    rng = np.random.default_rng(4)
+    motion = 100 * rng.standard_normal((5000, 2))
+    samples = {name: motion + rng.standard_normal((5000, 2)) for name in "abc"}
+    samples["d"] = 80 * motion[:, :1] + rng.standard_normal((5000, 1))
+    settings = Settings(segment=2.0)
+    snapshot = estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
+    found = calibrate(snapshot, settings, None)
+    assert list(found.refused) == [3]
+    assert {each.sensor for each in found.budgets} == {"a", "b", "c"}
+
+
+def test_a_channel_without_positive_noise_is_named(snapshot: Snapshot) -> None:
+    method = judged_method(snapshot, SETTINGS)
+    noise = snapshot.results[method]
+    psd = noise.noise_psd.copy()
+    psd[:, 4] = -1.0
+    low = noise.low.copy()
+    low[:, 4] = -2.0
+    changed = replace(
+        snapshot, results={**snapshot.results, method: replace(noise, noise_psd=psd, low=low)}
+    )
+    found = calibrate(changed, SETTINGS, None)
+    assert [label.name for label in found.without_noise] == ["b.c1"]
+    assert len(found.whole_band("noise")) == 8
+    assert any("Mean noise of b.c1: not positive" in line for line in remarks(found, changed))
 
 
 def test_a_higher_level_of_confidence_widens_what_is_stated(snapshot: Snapshot) -> None:
