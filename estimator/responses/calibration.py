@@ -25,9 +25,13 @@ from estimator.responses.derived_quantities import Value, with_errors
 from estimator.self_noise.coherency import other_channels, own_channels
 
 if TYPE_CHECKING:
-    from estimator.types import BoolArray, ComplexArray, FloatArray
+    from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _STEPS = 3  # alternating estimates of delays and matrix
+_PER_INSTRUMENT = 2  # averages for each channel of the other sensors
+_NEIGHBOURS = 16  # frequencies on either side whose noise weights one
+_CORRELATED = 3  # the nearest of them, whose errors are its own
+_STANDS_OUT = 4.0  # noise over that of the neighbours that is not chance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,14 +134,14 @@ def _pair(
     inside = (frequency >= start.low) & (frequency <= start.high) & (frequency > 0)
     inside &= np.isfinite(csm).all(axis=(1, 2))
     own = [np.array(own_channels(dims, each)) for each in (sensor, reference)]
-    rest = other_channels(dims, sensor, reference)
     part, f = csm[inside], frequency[inside]
+    rest = _instruments(part, dims, (sensor, reference), n_effective)
     S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
     S_kk = part[:, rest[:, None], rest]
     by = np.linalg.solve(S_kk, S_rk.conj().swapaxes(1, 2))  # S_kk^-1 S_kr
     power, cross = S_rk @ by, S_jk @ by
     # less what the others tell by chance: Nagar's correction of two-stage least squares
-    chance = len(rest) / (n_effective - len(rest)) if n_effective > 2 * len(rest) else 0.0
+    chance = len(rest) / (n_effective - len(rest))
     power -= chance * (part[:, own[1][:, None], own[1]] - power)
     cross -= chance * (part[:, own[0][:, None], own[1]] - cross)
     power = (power + power.conj().swapaxes(1, 2)) / 2
@@ -146,8 +150,9 @@ def _pair(
     rows = np.zeros((len(f), d, csm.shape[1]), dtype=np.complex128)
     rows[:, np.arange(d), own[0]] = 1.0
     rows[:, :, own[1]] = -response
-    sigma = rows @ part @ rows.conj().swapaxes(1, 2)
-    level = np.einsum("fcc->f", sigma).real / d
+    # residuals of n averages from d fitted elements
+    sigma = rows @ part @ rows.conj().swapaxes(1, 2) * (n_effective / (n_effective - d))
+    level = _level(np.einsum("fcc->f", sigma).real / d)
     usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
     if usable.sum() < 4:
         raise InsufficientDataError(
@@ -162,6 +167,52 @@ def _pair(
         sigma[usable] / scale,
         start.delay,
     )
+
+
+def _instruments(
+    csm: ComplexArray, dims: tuple[int, ...], pair: tuple[int, int], n_effective: float
+) -> IntArray:
+    """Return the channels of the other sensors; with few averages only of the most coherent.
+
+    What m channels tell by chance can be corrected for with more than m + 1 averages.
+    """
+    rest = other_channels(dims, *pair)
+    if n_effective > _PER_INSTRUMENT * len(rest) + 1:
+        return rest
+    power = np.maximum(np.einsum("fpp->fp", csm).real, np.finfo(np.float64).tiny)
+    own = np.array(own_channels(dims, pair[1]))
+    share = np.mean(np.abs(csm[:, own]) ** 2 / power[:, own, None] / power[:, None, :], axis=0)
+    coherent = share.sum(axis=0)
+    others = [np.array(own_channels(dims, each)) for each in range(len(dims)) if each not in pair]
+    chosen: list[int] = []
+    for each in sorted(others, key=lambda channels: -float(coherent[channels].sum())):
+        if n_effective > len(chosen) + len(each) + 1 and (
+            not chosen or n_effective > _PER_INSTRUMENT * (len(chosen) + len(each)) + 1
+        ):
+            chosen += each.tolist()
+    if len(chosen) < len(own):
+        raise InsufficientDataError(
+            f"sensors {pair[1]} and {pair[0]}: {n_effective:.3g} averages; expected more than "
+            f"{len(own) + 1}. Record for longer, or use shorter segments"
+        )
+    return np.array(sorted(chosen))
+
+
+def _level(noise: FloatArray) -> FloatArray:
+    """Return the noise by which frequencies are weighted: that of their neighbours.
+
+    A frequency's own is small where errors of its response happen to be: weights by it would bias
+    the response. It is kept where it stands out, by more than chance: lines, steep slopes.
+    """
+    known = noise > 0
+    size = np.log(np.where(known, noise, 1.0))
+    near = np.ones(2 * _NEIGHBOURS + 1)
+    near[_NEIGHBOURS - _CORRELATED : _NEIGHBOURS + _CORRELATED + 1] = 0.0
+    middle = slice(_NEIGHBOURS, _NEIGHBOURS + len(noise))
+    total, count = (np.convolve(each, near)[middle] for each in (size * known, 1.0 * known))
+    whole = size[known].mean() if known.any() else 0.0
+    around = np.exp(np.where(count > 0, total / np.maximum(count, 1.0), whole))
+    return np.where(known & (noise < _STANDS_OUT * around), around, noise)
 
 
 def calibrate_sensor(

@@ -101,6 +101,94 @@ def test_weak_motion_does_not_lower_gains() -> None:
     assert np.mean(scores) == pytest.approx(0.0, abs=0.35)
 
 
+def scores(
+    seed: int,
+    *,
+    d: int,
+    snr: tuple[float, ...],
+    n: int,
+    n_freqs: int,
+    quantities: tuple[str, ...] = ("gain",),
+) -> FloatArray:
+    """Return errors over standard errors for equal sensors, from Wishart matrices of n averages."""
+    rng = np.random.default_rng(seed)
+    p = d * len(snr)
+    noise = np.repeat(1 / np.sqrt(snr), d)[:, None]
+    shape = (n_freqs, d, n)
+    motion = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    shape = (n_freqs, p, n)
+    own = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+    samples = np.tile(motion, (1, len(snr), 1)) + noise * own
+    found = calibrate_sensor(
+        samples @ samples.conj().swapaxes(1, 2) / n,
+        1.0 + 0.5 * np.arange(n_freqs),
+        dims=(d,) * len(snr),
+        sensor=1,
+        reference=0,
+        n_effective=n,
+        band=(0.9, 1.0 + 0.5 * n_freqs),
+        correlation=np.ones(1),
+    )
+    truth = {"matrix": np.eye(d), "gain": 1.0, "delay": 0.0}
+    return np.concatenate(
+        [
+            np.ravel(
+                (getattr(found, each).value - truth.get(each, 0.0)) / getattr(found, each).error
+            )
+            for each in quantities
+        ]
+    )
+
+
+@pytest.mark.parametrize(("n", "snr"), [(50, (5.0, 1e3, 1e3)), (20, (10.0, 10.0, 10.0))])
+def test_noise_of_the_reference_does_not_lower_gains(n: int, snr: tuple[float, ...]) -> None:
+    """Weights by each frequency's own residual would, by 1.5 standard errors."""
+    found = [scores(seed, d=1, snr=snr, n=n, n_freqs=400) for seed in range(40)]
+    # 40 draws of one gain: 0.16
+    assert np.mean(found) == pytest.approx(0.0, abs=0.5)
+
+
+def test_errors_cover_the_truth_with_few_averages() -> None:
+    """Residuals of ten averages from three fitted elements are too small by three tenths."""
+    quantities = ("matrix", "orthogonality_deg", "delay")
+    found = [
+        scores(seed, d=3, snr=(100.0,) * 3, n=10, n_freqs=40, quantities=quantities)
+        for seed in range(60)
+    ]
+    # 60 draws of 15 values: 5 % at least; without the correction 1.5
+    assert np.mean(np.square(found)) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("n", [9, 14, 18])
+def test_many_sensors_and_few_averages_do_not_lower_gains(n: int) -> None:
+    found = [scores(seed, d=3, snr=(30.0,) * 5, n=n, n_freqs=60) for seed in range(15)]
+    # 15 draws of three gains: 0.15; by chance alone three standard errors
+    assert np.mean(found) == pytest.approx(0.0, abs=0.5)
+
+
+def test_too_few_averages_for_any_instrument_are_refused() -> None:
+    with pytest.raises(InsufficientDataError, match="expected more than 4"):
+        scores(0, d=3, snr=(100.0,) * 3, n=4, n_freqs=60)
+
+
+def test_a_line_in_the_noise_keeps_its_small_weight() -> None:
+    spectra = averaged(5)
+    csm, f = spectra.csm(), spectra.settings.frequencies
+    usual = calibrated(spectra)
+    csm[np.argmin(np.abs(f - 10.0)), 3:6, 3:6] += 1e4 * np.eye(3) * csm[0, 0, 0].real
+    found = calibrate_sensor(
+        csm,
+        f,
+        dims=DIMS,
+        sensor=1,
+        reference=0,
+        n_effective=spectra.n_effective,
+        band=(1.0, 20.0),
+        correlation=CORRELATION,
+    )
+    np.testing.assert_allclose(found.gain.error, usual.gain.error, rtol=0.1)
+
+
 def test_a_response_that_varies_over_the_band_is_detected() -> None:
     spectra = averaged(3, noise=0.02)
     csm = spectra.csm()
