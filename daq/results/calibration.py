@@ -19,6 +19,7 @@ from estimator.errors import InsufficientDataError
 from estimator.responses.calibration import calibrate_sensor, response_curve
 from estimator.responses.derived_quantities import Value
 from estimator.responses.edge_leakage import channel_responses, slope_factor
+from estimator.self_noise.coherency import other_channels, own_channels
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
@@ -235,19 +236,29 @@ class _Work:
         return np.asarray(np.geomspace(low, high * (1 + 1e-9), count + 1))
 
     def _curvature(self) -> ComplexArray:
-        """Return how a window's width changes relative responses, shape as their ratios.
+        """Return how a window's width changes relative responses, (n_freqs, n_channels).
 
-        ``factor D'' / (2 D)``: what averages over the width of a line differ by from its middle.
+        With the responses D of the channel and K of the instruments, both relative to the
+        reference, averages over the width of a line differ from its middle by
+        ``factor / 2 (D'' / D + 2 D' / D conj(K' / K))``.
         """
-        f = self.snapshot.frequency
+        f, dims, reference = self.snapshot.frequency, self.snapshot.dims, self._reference
         window = get_window(self._settings.window, 512)
         factor = slope_factor(window, 512 / self._settings.segment)
-        ratio = channel_responses(self._csm, f, dims=self.snapshot.dims).ratio
+        found = channel_responses(self._csm, f, dims=dims)
+        ratio, slopes = found.ratio[:, :, reference], found.slopes()[:, :, reference]
+        width = np.gradient(f)[1:-1, None]
         bending = np.full(ratio.shape, np.nan, dtype=np.complex128)
-        width = np.gradient(f)[1:-1, None, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             second = (ratio[2:] - 2 * ratio[1:-1] + ratio[:-2]) / width**2
             bending[1:-1] = factor / 2 * second / ratio[1:-1]
+        known_slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        for sensor in range(len(dims)):
+            own = list(own_channels(dims, sensor))
+            rest = other_channels(dims, sensor, reference)
+            count = np.isfinite(slopes[:, rest]).sum(axis=1)
+            mean = known_slopes[:, rest].sum(axis=1) / np.maximum(count, 1)
+            bending[:, own] += factor * slopes[:, own] * mean[:, None].conj()
         return bending
 
     def sensitivities(self, found: SensorCalibration) -> list[Budget]:
@@ -267,7 +278,7 @@ class _Work:
             channel = channel_of(self._bench, label.sensor, label.channel)
             gain = float(found.gain.value[number])
             scatter = float(found.gain.error[number]) / gain
-            bent = self._bending[inside, column, found.reference]
+            bent = self._bending[inside, column]
             bent = bent[np.isfinite(bent)]
             components = [
                 Component("estimate", "A", "normal", scatter, found.dof),

@@ -11,6 +11,7 @@ from daq.results.band_summary import channel_means, judged_method
 from daq.results.clock_effect import effect
 from daq.results.uncertainty_budget import Budget, Component
 from estimator.diagnostics.advice import ModelMisfit
+from estimator.self_noise.band_means import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -81,6 +82,8 @@ def noise_budgets(
         if not value > 0:
             unknown.append(label)
             continue
+        # the interval includes what averaging over the band does not reduce
+        half = known(float(mean.high[0] - mean.low[0]) / 2 / NORMAL_95)
         leaks = 0.0 if edges is None else float(np.mean(edges.most[inside, column])) / value
         counting = 0.0
         if snapshot.quantisation_psd is not None:
@@ -91,7 +94,7 @@ def noise_budgets(
                 "estimate",
                 "A",
                 "normal",
-                float(mean.spread[0]) / value,
+                max(float(mean.spread[0]), half) / value,
                 2 * max(averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
             ),
             Component("sensitivity", "B", "normal", 2 * uncertainty),

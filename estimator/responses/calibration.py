@@ -54,7 +54,8 @@ class SensorCalibration:
         Rotation vector of a triaxial sensor, about its three axes; for two channels, the angle from
         the first channel of the reference towards the second. Empty for one channel.
     angle_deg : Value, shape (d,)
-        Angle between each channel and that of the reference, non-negative.
+        Angle between each channel and that of the reference, non-negative; NaN for one channel.
+        Its errors are of first order: near 0 and 180° they do not hold.
     orthogonality_deg : Value, shape (d (d - 1) / 2,)
         Angles between channels 12, 13, 23, minus 90°.
     delay : Value, shape (d,)
@@ -151,7 +152,8 @@ def _pair(
     rows[:, np.arange(d), own[0]] = 1.0
     rows[:, :, own[1]] = -response
     # residuals of n averages from d fitted elements
-    sigma = rows @ part @ rows.conj().swapaxes(1, 2) * (n_effective / (n_effective - d))
+    sigma = rows @ part @ rows.conj().swapaxes(1, 2)
+    sigma *= n_effective / (n_effective - d)
     level = _level(np.einsum("fcc->f", sigma).real / d)
     usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
     if usable.sum() < 4:
@@ -162,9 +164,9 @@ def _pair(
     scale = level[usable, None, None]
     return _Pair(
         f[usable],
-        response[usable],
-        n_effective * power[usable] / scale,
-        sigma[usable] / scale,
+        np.asarray(response[usable], dtype=np.complex128),
+        np.asarray(n_effective * power[usable] / scale, dtype=np.complex128),
+        np.asarray(sigma[usable] / scale, dtype=np.complex128),
         start.delay,
     )
 

@@ -101,7 +101,9 @@ def _rotation_vector(matrix: FloatArray) -> FloatArray:
 
 
 def _axis_angles(matrix: FloatArray) -> FloatArray:
-    """Return the angle between each channel and that of the reference, degrees."""
+    """Return the angle between each channel and that of the reference, degrees; NaN for one."""
+    if len(matrix) == 1:
+        return np.full(1, np.nan)
     across = matrix - np.diag(np.diag(matrix))
     return np.asarray(np.rad2deg(np.arctan2(np.linalg.norm(across, axis=1), np.diag(matrix))))
 

@@ -23,6 +23,9 @@ Rows = tuple[tuple[str, ...], ...]
 _LEAST_SHOWN = 1e-5
 _VARIES = 1.5
 """Scatter over frequencies, over what errors explain, from which on a remark says so."""
+_ALIGNED = 3.0
+"""Standard errors from 0 and 180° from which on an angle is shown with its error."""
+_ROUNDING = 1e-6
 _SHORT = {
     "estimate": "est.",
     "variation": "var.",
@@ -57,6 +60,24 @@ def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
     if place == 0:  # integers, rounded to the digits that mean something
         value, expanded = round(value * step) / step, math.ceil(expanded * step) / step
     return f"{signed(value, f'.{place}f')} ± {expanded:.{place}f}"
+
+
+def angle(degrees: float, error: float, k: float) -> str:
+    """Return an angle with its expanded uncertainty, or its limit where it may be 0 or 180°.
+
+    An angle is a length: near its ends errors of first order do not hold.
+    """
+    if math.isnan(degrees):
+        return "–"
+    off = min(degrees, 180.0 - degrees)
+    if off >= _ALIGNED * error or not math.isfinite(error):
+        return with_error(degrees, k * error)
+    limit = off + k * error
+    if limit >= 180.0:
+        return "?"
+    place = max(0, 1 - math.floor(math.log10(limit))) if limit > 0 else 0
+    limit = math.ceil(limit * 10**place - _ROUNDING) / 10**place
+    return f"< {limit:.{place}f}" if degrees < 90.0 else f"> {180.0 - limit:.{place}f}"
 
 
 def share(relative: float) -> str:
@@ -94,7 +115,9 @@ def sensitivity_table(found: Calibration, snapshot: Snapshot) -> tuple[tuple[str
                     f"{budget.k:.2f}",
                     _element(each.delay, number, k, 1e6),
                     _element(each.skew, number, k, 1e6) if number else "0",
-                    _element(each.angle_deg, number, k),
+                    angle(
+                        float(each.angle_deg.value[number]), float(each.angle_deg.error[number]), k
+                    ),
                 )
             )
     return header, tuple(rows)
@@ -199,7 +222,8 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
     level = (
         f"Expanded uncertainties at a level of {100 * found.confidence:g} %, coverage factor k by "
         "the effective degrees of freedom. Angles, delays and cross-axis values: scatter of the "
-        f"estimate only, k = {_k(found):.2f}."
+        f"estimate only, k = {_k(found):.2f}; an angle within {_ALIGNED:g} standard errors of 0 or "
+        "180° has a limit."
     )
     lines = [level]
     if found.certificates:
@@ -224,10 +248,20 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
             f"Mean noise of {channels}: not positive, and not shown. It is too small against the "
             "motion or the noise of the other sensors."
         )
+    if any(each.gain.value.size == 1 for each in found.sensors):
+        lines.append(
+            "Sensors of one channel: where the motion has more than one direction, sensitivities "
+            "include the cosines of their tilts. Angles cannot be measured."
+        )
+    lines.append(
+        "Noise that a sensor or the reference shares with a third one biases the sensitivity by "
+        "its share of the motion; with three sensors it cannot be seen."
+    )
     lines += _times(found, snapshot)
     lines += [
         f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
         f"{each.excess:.2g} times the errors, or not all motion is common. The budget includes it."
+        " The sensitivity is a mean over the band weighted by SNR: see the curve in the JSON file."
         for each in found.sensors
         if each.excess > _VARIES
     ]

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import replace
 from datetime import date
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -18,19 +18,20 @@ from daq.errors import WrongSettingError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.results.band_summary import judged_method
+from daq.results.band_summary import channel_means, judged_method
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from daq.timing.clock_model import RelativeTime
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
-from tui.output.calibration import remarks, with_error
+from tui.output.calibration import angle, remarks, sensitivity_table, with_error
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.estimation.snapshot import Snapshot
+    from estimator.self_noise.band_means import BandMeans
 
 GAINS = {"a": 1.0, "b": 1.03, "c": 0.98}
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
@@ -261,6 +262,69 @@ def test_coverage_factors_are_those_of_the_tables(dof: float, expected: float) -
 )
 def test_values_are_rounded_to_their_uncertainty(value: float, expanded: float, text: str) -> None:
     assert with_error(value, expanded) == text
+
+
+@pytest.mark.parametrize(
+    ("degrees", "error", "text"),
+    [
+        (2.0, 0.01, "2.000 ± 0.020"),
+        (0.012, 0.005, "< 0.022"),
+        (179.99, 0.005, "> 179.980"),
+        (0.0, 1.0, "< 2.0"),
+        (float("nan"), float("nan"), "–"),
+    ],
+)
+def test_angles_near_their_ends_have_limits(degrees: float, error: float, text: str) -> None:
+    assert angle(degrees, error, 2.0) == text
+
+
+def test_sensors_of_one_channel_have_no_angle() -> None:
+    rng = np.random.default_rng(4)
+    motion = 100 * rng.standard_normal((5000, 1))
+    samples = {
+        name: sign * motion + rng.standard_normal((5000, 1))
+        for name, sign in (("a", 1), ("b", 1), ("c", -1))
+    }
+    settings = Settings(segment=2.0)
+    snapshot = estimate([recording_of_arrays(samples, 50.0, unit="m/s²")], settings)
+    found = calibrate(snapshot, settings, None)
+    header, rows = sensitivity_table(found, snapshot)
+    assert [row[header.index("angle (°)")] for row in rows] == ["–", "–"]
+    assert any("cosines of their tilts" in line for line in remarks(found, snapshot))
+
+
+def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
+    """It biases them by ``factor (2 pi)² (tau_b tau_c - tau_b² / 2)``."""
+    rng = np.random.default_rng(11)
+    n, rate, delays = 12_000, 100.0, {"a": 0.0, "b": 5e-3, "c": 20e-3}
+    spectrum = np.fft.rfft(rng.standard_normal((n, 1)), axis=0)
+    omega = 2 * np.pi * np.fft.rfftfreq(n, 1 / rate)[:, None]
+    samples = {
+        name: np.fft.irfft(spectrum * np.exp(-1j * omega * delay), n, axis=0)
+        + 1e-3 * rng.standard_normal((n, 1))
+        for name, delay in delays.items()
+    }
+    settings = Settings(segment=1.0, equalise="off", band=(1.0, 40.0))
+    snapshot = estimate([recording_of_arrays(samples, rate, unit="m/s²")], settings)
+    budget = calibrate(snapshot, settings, None).whole_band("sensitivity")[0]
+    bias = (2 * np.pi) ** 2 / 3 * (5e-3 * 20e-3 - 5e-3**2 / 2)  # Hann: factor 1 / (3 T²)
+    (leakage,) = (part for part in budget.components if part.source == "leakage")
+    assert leakage.relative * math.sqrt(3) == pytest.approx(bias, rel=0.05)
+    assert abs(budget.value - 1) < budget.expanded
+
+
+def test_an_error_common_to_the_band_is_in_the_budget_of_the_noise(
+    snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def widened(*args: Any) -> tuple[BandMeans, ...]:  # noqa: ANN401
+        return tuple(
+            replace(mean, low=0.8 * mean.mean, high=1.2 * mean.mean)
+            for mean in channel_means(*args)
+        )
+
+    monkeypatch.setattr("daq.results.noise_budget.channel_means", widened)
+    for budget in calibrate(snapshot, SETTINGS, None).whole_band("noise"):
+        assert budget.components[0].relative == pytest.approx(0.2 / 1.96, rel=1e-3)
 
 
 def test_the_command_says_it_all(recording: Path) -> None:

@@ -119,9 +119,10 @@ def scores(
     shape = (n_freqs, p, n)
     own = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
     samples = np.tile(motion, (1, len(snr), 1)) + noise * own
+    csm = np.asarray(samples @ samples.conj().swapaxes(1, 2) / n, dtype=np.complex128)
     found = calibrate_sensor(
-        samples @ samples.conj().swapaxes(1, 2) / n,
-        1.0 + 0.5 * np.arange(n_freqs),
+        csm,
+        np.asarray(1.0 + 0.5 * np.arange(n_freqs), dtype=np.float64),
         dims=(d,) * len(snr),
         sensor=1,
         reference=0,
