@@ -285,7 +285,7 @@ def diagnosis(
         bands=tuple(band for each in found for band in each.bands),
         responses=tuple(
             replace(each, delay=math.nan, delay_error=math.nan)
-            if (sensors[each.first], sensors[each.second]) in aligned
+            if each.is_ambiguous or (sensors[each.first], sensors[each.second]) in aligned
             else each
             for each in clearest.responses
         ),

@@ -56,7 +56,7 @@ def orientation(
     pair = (response.first, response.second)
     band = (response.low, response.high)
     counterpart, own = (sum(dims[:sensor]) for sensor in pair)
-    swapped = _swapped(response)
+    swapped = {} if response.is_ambiguous else _swapped(response)
     if swapped:
         yield SwappedChannels(
             level=Level.WARNING,
@@ -65,7 +65,8 @@ def orientation(
             channels=tuple((own + c, counterpart + other) for c, other in swapped.items()),
         )
         return
-    if _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
+    has_sign = not response.is_ambiguous
+    if has_sign and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
         yield Rotated(
             level=Level.NOTE,
             sensors=pair,
@@ -83,7 +84,7 @@ def orientation(
             band=band,
             deviation_deg=skew,
         )
-    for channel in response.reversed_channels:
+    for channel in response.reversed_channels if has_sign else ():
         yield ReversedPolarity(
             level=Level.WARNING,
             sensors=pair,
@@ -102,7 +103,7 @@ def orientation(
             ratio=float(response.gains[off]),
         )
     samples = response.delay * 2 * nyquist
-    if _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
+    if has_sign and _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
         yield Delay(
             level=Level.WARNING,
             sensors=pair,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.diagnostics.delay_cycle import cycle_is_ambiguous
 from estimator.diagnostics.shared_motion import (
     MIN_COHERENCE,
     CanonicalCoherence,
@@ -72,6 +73,9 @@ class RelativeResponse:
         Channels of `second` with opposite polarity.
     delay, delay_error : float
         Lag of `second` behind `first`, and its standard error, s.
+    is_ambiguous : bool
+        Whether the delay may be half a cycle or a cycle off, in so narrow a band of motion; then
+        the sign of `matrix` is not certain either.
     coherence : float
         Coherence in the direction of its minimum, mean over the band.
 
@@ -97,6 +101,7 @@ class RelativeResponse:
     reversed_channels: tuple[int, ...]
     delay: float
     delay_error: float
+    is_ambiguous: bool
     coherence: float
 
 
@@ -197,7 +202,7 @@ def relative_response(
     f, weight = frequency[inside], weight[inside]
     power = _power(csm, dims, first)[inside]
     S_ik, S_jk = (_part(csm, inside, channels, rest) / power[:, None, None] for channels in own)
-    delay, delay_error = _delay(f, weight, S_ik, S_jk)
+    delay, delay_error, is_ambiguous = _delay(f, weight, S_ik, S_jk)
     S_jk = S_jk * np.exp(2j * np.pi * f * delay)[:, None, None]
     matrix = _transfer(weight, S_ik, S_jk)
     horizontal = _horizontal_channels(d, vertical)
@@ -226,6 +231,7 @@ def relative_response(
         reversed_channels=reversed_channels,
         delay=delay,
         delay_error=delay_error,
+        is_ambiguous=is_ambiguous,
         coherence=float(g[inside].mean()),
     )
 
@@ -260,8 +266,11 @@ def _gains_and_skew(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _delay(
     f: FloatArray, weight: FloatArray, S_ik: ComplexArray, S_jk: ComplexArray
-) -> tuple[float, float]:
-    """Return the lag of the second sensor and its error in s: from a grid, refined by the phase."""
+) -> tuple[float, float, bool]:
+    """Return the lag of the second sensor and its error in s, and whether its cycle is ambiguous.
+
+    It is from a grid, refined by the phase.
+    """
     transfer = S_jk @ np.linalg.pinv(S_ik)
     known = np.isfinite(transfer).all(axis=(1, 2))
     f, weight, transfer = f[known], weight[known], transfer[known]
@@ -275,7 +284,9 @@ def _delay(
         np.atleast_1d((weight * f)[~part] @ phase[~part] / ((weight * f)[~part] @ f[~part]))
         for part in _parts(weight)
     ]
-    return delay, float(_jackknife(without, np.zeros(1))[0]) / (2 * np.pi)
+    aligned = transfer * np.exp(2j * np.pi * f * delay)[:, None, None]
+    error = float(_jackknife(without, np.zeros(1))[0]) / (2 * np.pi)
+    return delay, error, cycle_is_ambiguous(f, weight, aligned)
 
 
 def _parts(weight: FloatArray) -> list[BoolArray]:

@@ -59,9 +59,12 @@ class SensorCalibration:
     orthogonality_deg : Value, shape (d (d - 1) / 2,)
         Angles between channels 12, 13, 23, minus 90°.
     delay : Value, shape (d,)
-        Lag of each channel behind the reference, s.
+        Lag of each channel behind the reference, s; NaN if ambiguous.
     skew : Value, shape (d,)
         Delay of each channel minus that of the first.
+    is_ambiguous : bool
+        Whether the cycle of the delay, and with it the sign of `matrix`, is uncertain: in a narrow
+        band of motion.
     excess : float
         Scatter over frequencies relative to the errors: 1 if the model holds.
     dof : float
@@ -81,6 +84,7 @@ class SensorCalibration:
     orthogonality_deg: Value
     delay: Value
     skew: Value
+    is_ambiguous: bool
     excess: float
     dof: float
     n_frequencies: int
@@ -119,6 +123,7 @@ class _Pair:
     noise: ComplexArray
     """Sigma / s, (n_freqs, d, d)."""
     delay: float
+    is_ambiguous: bool
 
 
 def _pair(
@@ -168,6 +173,7 @@ def _pair(
         np.asarray(n_effective * power[usable] / scale, dtype=np.complex128),
         np.asarray(sigma[usable] / scale, dtype=np.complex128),
         start.delay,
+        start.is_ambiguous,
     )
 
 
@@ -284,6 +290,7 @@ def calibrate_sensor(
     covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
     covariance = covariance.reshape(d * d, d * d) * inflation / 2
     delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
+    unknown = np.nan if pair.is_ambiguous else 0.0
     to_first = np.eye(d)
     to_first[:, 0] -= 1.0
     return SensorCalibration(
@@ -293,8 +300,9 @@ def calibrate_sensor(
         high=float(f[-1]),
         matrix=Value(matrix, np.sqrt(np.diag(covariance)).reshape(d, d)),
         **with_errors(matrix, covariance),
-        delay=Value(delay, np.sqrt(np.diag(delay_cov))),
+        delay=Value(unknown + delay, unknown + np.sqrt(np.diag(delay_cov))),
         skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
+        is_ambiguous=pair.is_ambiguous,
         excess=excess,
         dof=2 * max(n_effective - d, 1.0) * len(f) / inflation,
         n_frequencies=len(f),

@@ -259,6 +259,13 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
     )
     lines += _times(found, snapshot)
     lines += [
+        f"{snapshot.sensor_names[each.sensor]}: cycle and sign of its delay are ambiguous in so "
+        "narrow a band of motion. The delay is not shown, and the relative response may have the "
+        "opposite sign."
+        for each in found.sensors
+        if each.is_ambiguous
+    ]
+    lines += [
         f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
         f"{each.excess:.2g} times the errors, or not all motion is common. The budget includes it."
         " The sensitivity is a mean over the band weighted by SNR: see the curve in the JSON file."

@@ -39,6 +39,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                 "sensor": names[each.sensor],
                 "channels": channels_of(snapshot, each.sensor),
                 "band_hz": [each.low, each.high],
+                "is_ambiguous": each.is_ambiguous,
                 "excess": each.excess,
                 "dof": each.dof,
                 "relative_time": relative_time(

@@ -152,7 +152,7 @@ def alignment_section(snapshot: Snapshot) -> Section:
                 " / ".join(plain_number(gain, ".4f") for gain in response.gains),
                 plain_number(response.nonorthogonality_deg, ".2f"),
                 plain_number(response.delay * 1e6, ".1f"),
-                _reversed(snapshot, response) or "none",
+                "?" if response.is_ambiguous else _reversed(snapshot, response) or "none",
             )
         )
     header = (

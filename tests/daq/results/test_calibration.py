@@ -22,6 +22,7 @@ from daq.results.band_summary import channel_means, judged_method
 from daq.results.calibration import calibrate
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from daq.timing.clock_model import RelativeTime
+from estimator.responses.derived_quantities import Value
 from tests.daq.alignment.recordings import Sensor, write
 from tui.cli.main import app
 from tui.commands.calibrate import side_by_side
@@ -291,6 +292,18 @@ def test_sensors_of_one_channel_have_no_angle() -> None:
     header, rows = sensitivity_table(found, snapshot)
     assert [row[header.index("angle (°)")] for row in rows] == ["–", "–"]
     assert any("cosines of their tilts" in line for line in remarks(found, snapshot))
+
+
+def test_an_ambiguous_delay_is_said(snapshot: Snapshot) -> None:
+    found = calibrate(snapshot, SETTINGS, None)
+    unknown = Value(np.full(3, np.nan), np.full(3, np.nan))
+    first = replace(found.sensors[0], delay=unknown, is_ambiguous=True)
+    changed = replace(found, sensors=(first, *found.sensors[1:]))
+    header, rows = sensitivity_table(changed, snapshot)
+    assert rows[0][header.index("delay (µs)")] == "?"
+    said = [line for line in remarks(changed, snapshot) if "ambiguous" in line]
+    assert len(said) == 1
+    assert said[0].startswith("b: cycle and sign")
 
 
 def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
