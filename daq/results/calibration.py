@@ -10,7 +10,6 @@ import numpy as np
 
 from daq.errors import WrongSettingError
 from daq.results.band_summary import band_of, correlation_of
-from daq.results.certificates import certificates_of, channel_of
 from daq.results.clock_effect import relative_time
 from daq.results.noise_budget import known, noise_budgets
 from daq.results.uncertainty_budget import Budget, Component
@@ -25,7 +24,7 @@ from estimator.spectra.windows import get_window
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.model import Bench, Certificate
+    from daq.bench.model import Bench, Certificate, Channel
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.responses.calibration import ResponseCurve, SensorCalibration
@@ -108,7 +107,7 @@ def calibrate(
     if not 0 < confidence < 1:
         raise WrongSettingError(f"confidence {confidence:g}: expected a fraction such as 0.95")
     names = snapshot.sensor_names
-    certified = [certificates_of(snapshot, bench, name) for name in names]
+    certified = [_certificates_of(snapshot, bench, name) for name in names]
     if reference is not None and reference not in names:
         raise WrongSettingError(f"reference {reference!r}: expected one of {', '.join(names)}")
     chosen = next((n for n, each in enumerate(certified) if each), 0)
@@ -186,7 +185,7 @@ class _Work:
         for number, certificate in enumerate(certificates):
             column = int(self._first[reference]) + number
             label = snapshot.channels[column]
-            channel = channel_of(bench, label.sensor, label.channel)
+            channel = _channel_of(bench, label.sensor, label.channel)
             if channel is not None:  # motion by the certificate, not by the bench file
                 scale[column] = channel.sensitivity / certificate.value
             # conservative: as if the certificates of all its channels erred together
@@ -275,7 +274,7 @@ class _Work:
         for number in range(self.snapshot.dims[found.sensor]):
             column = int(self._first[found.sensor]) + number
             label = labels[column]
-            channel = channel_of(self._bench, label.sensor, label.channel)
+            channel = _channel_of(self._bench, label.sensor, label.channel)
             gain = float(found.gain.value[number])
             scatter = float(found.gain.error[number]) / gain
             bent = self._bending[inside, column]
@@ -356,3 +355,28 @@ class _Work:
             confidence=self._confidence,
             is_absolute=bool(self._certificates),
         )
+
+
+def _certificates_of(snapshot: Snapshot, bench: Bench | None, name: str) -> tuple[Certificate, ...]:
+    """Return the certificates of a sensor, in the order of its channels; empty if one has none."""
+    channels = [
+        _channel_of(bench, name, each.channel) for each in snapshot.channels if each.sensor == name
+    ]
+    found = tuple(
+        each.certificate for each in channels if each is not None and each.certificate is not None
+    )
+    return found if len(found) == len(channels) else ()
+
+
+def _channel_of(bench: Bench | None, sensor: str, channel: str) -> Channel | None:
+    """Return a channel of the bench file by its name; None if there is none."""
+    return next(
+        (
+            found
+            for each in (() if bench is None else bench.sensors)
+            if each.name == sensor
+            for found in each.channels
+            if found.name == channel
+        ),
+        None,
+    )

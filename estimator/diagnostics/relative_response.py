@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.diagnostics.delay_cycle import cycle_is_ambiguous
 from estimator.diagnostics.shared_motion import (
     MIN_COHERENCE,
     CanonicalCoherence,
@@ -28,6 +27,7 @@ from estimator.self_noise.coherency import (
     other_channels,
     own_channels,
 )
+from estimator.spectra.delay_cycle import cycle_is_ambiguous
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency

@@ -21,8 +21,8 @@ from tui.output.calibration import (
     sensitivity_table,
     title,
 )
-from tui.output.calibration_json import calibration_document
 from tui.output.console import check_places, for_people, hint, write_json
+from tui.output.json_document import calibration_document
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

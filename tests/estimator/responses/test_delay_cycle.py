@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from estimator.diagnostics.advice import Delay, ReversedPolarity
-from estimator.diagnostics.delay_cycle import cycle_is_ambiguous
 from estimator.diagnostics.orientation import orientation
 from estimator.diagnostics.relative_response import relative_response
 from estimator.responses.calibration import calibrate_sensor
+from estimator.spectra.delay_cycle import cycle_is_ambiguous
 
 if TYPE_CHECKING:
     from estimator.types import ComplexArray, FloatArray
