@@ -15,7 +15,6 @@ import numpy as np
 
 from estimator.diagnostics.band import BandDiagnosis
 from estimator.diagnostics.kinds import Untested
-from estimator.diagnostics.motion_left_in import of_coherency, share_of, unpredicted
 from estimator.diagnostics.relative_response import RelativeResponse, relative_response
 from estimator.diagnostics.rules import advise
 from estimator.diagnostics.shared_motion import (
@@ -51,6 +50,7 @@ from estimator.self_noise.coherency import (
     testable,
 )
 from estimator.self_noise.live_channels import Presence, presence
+from estimator.self_noise.motion_left_in import motion_left_in, share_of, unpredicted
 
 if TYPE_CHECKING:
     from estimator.diagnostics.advice import Advice
@@ -97,7 +97,7 @@ class Diagnostics:
         Most severe first.
     left_in : float64, shape (n_freqs, n_channels)
         Motion that may be left in the noise estimate at most, in unit**2/Hz:
-        `estimator.diagnostics.motion_left_in`.
+        `estimator.self_noise.motion_left_in`.
     stability : Stability or None
         None without segments, or with too few.
     """
@@ -190,7 +190,8 @@ def diagnose(
     model, untested = _test(tested, there, n_effective, len(csm))
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     rest = there.spread(unpredicted(part.matrix, n_effective), sum(dims)) * given.psd
-    left_in = of_coherency(given, frequency, dims=dims, n_effective=n_effective)
+    third = np.where(frequency > 0, bands(frequency), -1)
+    left_in = motion_left_in(given, third, dims=dims, n_effective=n_effective)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
         snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))

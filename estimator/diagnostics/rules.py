@@ -35,11 +35,11 @@ from estimator.diagnostics.advice import (
 )
 from estimator.diagnostics.kinds import Level
 from estimator.diagnostics.misfit import SharedNoise
-from estimator.diagnostics.motion_left_in import among_like_sensors
 from estimator.diagnostics.orientation import orientation
 from estimator.diagnostics.shared_motion import outsiders
 from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.live_channels import presence
+from estimator.self_noise.motion_left_in import among_like_sensors
 from estimator.self_noise.result import Flag
 
 if TYPE_CHECKING:

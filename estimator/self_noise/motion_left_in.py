@@ -27,8 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.likelihood.dimension import bands
-from estimator.self_noise.coherency import blocks, check_dims, coherency, inverse
+from estimator.self_noise.coherency import blocks, inverse
 
 if TYPE_CHECKING:
     from estimator.self_noise.coherency import Coherency
@@ -72,49 +71,34 @@ def among_like_sensors(d: int, n_effective: float) -> float:
 
 
 def motion_left_in(
-    csm: ComplexArray, frequency: FloatArray, *, dims: tuple[int, ...], n_effective: float
+    given: Coherency, band: IntArray, *, dims: tuple[int, ...], n_effective: float
 ) -> FloatArray:
     """Return the motion that may be left in the noise estimate of every channel at most.
 
     Parameters
     ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
-        channels grouped by sensor, all in one unit.
-    frequency : float64, shape (n_freqs,)
-        Hz, ascending.
+    given : Coherency
+        Averages of three or more sensors, channels grouped by sensor, all in one unit.
+    band : int64, shape (n_freqs,)
+        Number of the third octave of each frequency, non-decreasing; negative where the result is
+        not wanted.
     dims : tuple of int
-        Number of channels of each of three or more sensors.
+        Number of channels of each sensor.
     n_effective : float
         Number of independent averages.
 
     Returns
     -------
     float64, shape (n_freqs, n_channels)
-        In unit**2/Hz. Zero where it is negligible, and where it is not known: at 0 Hz, without two
-        other sensors of live channels, and if n_effective does not exceed their number.
-
-    Raises
-    ------
-    InvalidMatrixError
-        As `estimator.self_noise.coherency.coherency`.
-    InsufficientDataError
-        With fewer than three sensors.
+        In unit**2/Hz. Zero where it is negligible, and where it is not known: without two other
+        sensors of live channels, and if n_effective does not exceed their number.
     """
-    check_dims(dims)
-    return of_coherency(coherency(csm, dims), frequency, dims=dims, n_effective=n_effective)
-
-
-def of_coherency(
-    given: Coherency, frequency: FloatArray, *, dims: tuple[int, ...], n_effective: float
-) -> FloatArray:
-    """Return the result of `motion_left_in` for a checked and normalised matrix."""
     left = np.zeros(given.psd.shape)
-    good = np.flatnonzero(given.valid & (frequency > 0))
+    good = np.flatnonzero(given.valid & (band >= 0))
     if not len(good):
         return left
     dead: BoolArray = np.asarray(given.absent[good].any(axis=0))
-    band = bands(frequency)[good]
+    band = band[good]
     steps = np.flatnonzero(np.diff(band, prepend=-1))
     at_once = next(blocks(len(good), len(dead))).stop
     steps = steps[np.diff(steps // at_once, prepend=-1) > 0]

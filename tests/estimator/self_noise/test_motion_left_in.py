@@ -9,7 +9,9 @@ import pytest
 
 from estimator.diagnostics.advice import MissingDimension, MotionLeftIn, WeakMotion
 from estimator.diagnostics.diagnose import diagnose
-from estimator.diagnostics.motion_left_in import motion_left_in
+from estimator.likelihood.dimension import bands
+from estimator.self_noise.coherency import coherency
+from estimator.self_noise.motion_left_in import motion_left_in
 from estimator.self_noise.three_sensor import three_sensor
 from tests.estimator.csm_models import random_bench, wishart
 
@@ -23,6 +25,11 @@ QUIET = [  # dB of the motion and of the other sensors re the quiet one, average
     (3, 20, 280),
     (3, 15, 280),
 ]
+
+
+def left_in(csm: ComplexArray, dims: tuple[int, ...], n_effective: float) -> FloatArray:
+    band = np.where(FREQUENCY > 0, bands(FREQUENCY), -1)
+    return motion_left_in(coherency(csm, dims), band, dims=dims, n_effective=n_effective)
 
 
 def drawn(
@@ -44,7 +51,7 @@ def test_lower_ends_reach_below_the_motion(
     for seed in range(6):
         csm, dims = drawn(d, motion_db, others_db, n, seed=seed)
         found = three_sensor(csm, dims=dims, n_effective=n)
-        left = motion_left_in(csm, FREQUENCY, dims=dims, n_effective=n)[1:, :d]
+        left = left_in(csm, dims, n)[1:, :d]
         noise, low = found.noise_psd[1:, :d], found.low[1:, :d]
         above.append((low - left > 1).mean())
         above_without.append((low > 1).mean())
@@ -65,19 +72,17 @@ def test_motion_that_is_found_leaves_nothing_in(
     d: int, motion_db: float, others_db: float, n: int
 ) -> None:
     csm, dims = drawn(d, motion_db, others_db, n)
-    left = motion_left_in(csm, FREQUENCY, dims=dims, n_effective=n)
+    left = left_in(csm, dims, n)
     assert (left > 0).mean() < 0.01
 
 
 def test_what_is_left_in_scales_with_the_unit_and_is_local() -> None:
     csm, dims = drawn(3, 3, 20, 280)
-    left = motion_left_in(csm, FREQUENCY, dims=dims, n_effective=280)
-    np.testing.assert_allclose(
-        motion_left_in(1e-18 * csm, FREQUENCY, dims=dims, n_effective=280), 1e-18 * left
-    )
+    left = left_in(csm, dims, 280)
+    np.testing.assert_allclose(left_in(1e-18 * csm, dims, 280), 1e-18 * left)
     unknown = csm.copy()
     unknown[30:] = np.nan
-    cut = motion_left_in(unknown, FREQUENCY, dims=dims, n_effective=280)
+    cut = left_in(unknown, dims, 280)
     np.testing.assert_allclose(cut[:9], left[:9])
     assert not cut[30:].any()
 
@@ -86,14 +91,14 @@ def test_strong_motion_at_one_frequency_hides_and_adds_nothing() -> None:
     csm, dims = drawn(1, 0, 20, 280)
     line = csm.copy()
     line[12] += 1e6
-    left = motion_left_in(line, FREQUENCY, dims=dims, n_effective=280)
+    left = left_in(line, dims, 280)
     assert left[12, 0] == 0
     assert np.all(left[8:12, 0] > 0.5)
 
 
 def test_fewer_averages_than_two_sensors_have_channels_say_nothing() -> None:
     csm, dims = drawn(3, 3, 20, 12)
-    assert not motion_left_in(csm, FREQUENCY, dims=dims, n_effective=6.0).any()
+    assert not left_in(csm, dims, 6.0).any()
 
 
 @pytest.mark.parametrize("sensors", [3, 5])
