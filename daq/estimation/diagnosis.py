@@ -186,7 +186,7 @@ def bias_of_clocks(
 
     The noise of sensor i by those of j and k is off by ``ω² S cov(τ_j − τ_i, τ_k − τ_i)``: too high
     by errors of its own clock, too low by at most ``ω² S (σ_j + σ_k)²/4`` if j and k err in
-    opposite ways.
+    opposite ways. Two sensors have no such third one: their noise can only be too high.
     """
     residual = np.array(list(found.residual.values()))
     if not results or len(residual) != len(dims):
@@ -194,7 +194,9 @@ def bias_of_clocks(
     noise = next(iter(results.values())).noise_psd
     coherent = np.diagonal(csm, axis1=1, axis2=2).real - noise
     # a − b of two others is in error by σ_a + σ_b at most, and a third is between them at best
-    others = [np.sort(np.delete(residual, sensor))[-2:].mean() for sensor in range(len(dims))]
+    others = np.zeros(len(dims))
+    if len(dims) > 2:
+        others = np.array([np.sort(np.delete(residual, i))[-2:].mean() for i in range(len(dims))])
     apart = (2 * np.pi * frequency[:, None] * np.repeat(others, dims)) ** 2
     removed = np.maximum(coherent, 0.0) * -np.expm1(-CLOCK_FACTOR * apart)
     turn = 2 * np.pi * frequency[:, None] * np.repeat(residual, dims)

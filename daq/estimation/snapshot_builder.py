@@ -211,7 +211,7 @@ class SnapshotBuilder:
             channels,
             dimensions=estimates.dimensions,
             faulty={*clipped, *stood_still},
-            aligned=aligned_pairs(passes[-1].aligned.clocks),
+            aligned=aligned_pairs(clock_states(passes)),
             course=segment_course(passes, channels, self._unit, self._equalisation),
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)

@@ -23,6 +23,8 @@ from estimator.self_noise.result import Flag
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from estimator.self_noise.result import SelfNoise
@@ -205,6 +207,29 @@ def _widened(mean: BandMeans, error: float) -> BandMeans:
     """Return a mean with an error in common added to both halves of its interval."""
     low = mean.mean - np.hypot(mean.mean - mean.low, error)
     return replace(mean, low=low, high=mean.mean + np.hypot(mean.high - mean.mean, error))
+
+
+def mean_in_bands(
+    psd: FloatArray | None, noise_psd: FloatArray, edges: NDArray[np.int64], frequency: FloatArray
+) -> FloatArray:
+    """Return the mean of a PSD over each band, where the noise is known; 0 if there is none.
+
+    Parameters
+    ----------
+    psd, noise_psd : float64, shape (n_freqs,)
+        Of one channel.
+    edges : int64, shape (n_bands + 1,)
+        Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
+    frequency : float64, shape (n_freqs,)
+        In Hz.
+    """
+    if psd is None:
+        return np.zeros(len(edges) - 1)
+    width = np.where(np.isfinite(noise_psd), np.gradient(frequency), 0.0)
+    first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
+    whole = np.add.reduceat(width[first:last], starts)
+    total = np.add.reduceat(np.where(width > 0, psd * width, 0.0)[first:last], starts)
+    return np.asarray(total / np.where(whole > 0, whole, 1.0))
 
 
 def deviation_at_bound(noise: SelfNoise, column: int) -> FloatArray:

@@ -11,8 +11,6 @@ from daq.results.band_summary import band_of, judged_method
 from daq.timing.clock_model import RelativeTime
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from estimator.self_noise.band_means import FloatArray
@@ -38,34 +36,6 @@ def effect(snapshot: Snapshot, settings: Settings) -> FloatArray:
     total = np.where(known, noise, 0.0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.where(total > 0, np.maximum(added.sum(axis=0), 0.0) / total, np.nan))
-
-
-def effect_in_bands(
-    snapshot: Snapshot, settings: Settings, edges: NDArray[np.int64], column: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return what may have been added to a channel's mean noise, and taken from it, at most.
-
-    By the clocks, the edges of segments, and few averages. Shapes (n_bands,), in unit²/Hz;
-    infinite where nothing is known of the clocks.
-    """
-    nothing = np.zeros(len(edges) - 1)
-    if not snapshot.diagnostics.synchronisation.is_known:
-        return nothing + math.inf, nothing + math.inf
-    noise = snapshot.results.get(judged_method(snapshot, settings))
-    if noise is None:
-        return nothing, nothing
-    known = np.isfinite(noise.noise_psd[:, column])
-    width = np.where(known, np.gradient(snapshot.frequency), 0.0)
-    first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
-    whole = np.add.reduceat(width[first:last], starts)
-
-    def mean(psd: FloatArray | None) -> FloatArray:
-        if psd is None:
-            return nothing
-        total = np.add.reduceat((psd[:, column] * width)[first:last], starts)
-        return np.asarray(total / np.where(whole > 0, whole, 1.0))
-
-    return mean(snapshot.added), mean(snapshot.removed)
 
 
 def effect_by_sensor(snapshot: Snapshot, settings: Settings) -> dict[str, float]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, SnapshotDiagnostics
 from daq.results.band_summary import channel_means, judged_method
 from daq.results.clock_effect import effect
 from daq.results.uncertainty_budget import Budget, Component
@@ -72,9 +74,13 @@ def noise_budgets(
     clocks = effect(snapshot, settings)
     edges = snapshot.diagnostics.edge_leakage
     means = channel_means(found, snapshot, settings, band)
+    # without what has lines of its own
+    scatter = SnapshotDiagnostics(dimensions=snapshot.diagnostics.dimensions)
+    plain_means = channel_means(found, replace(snapshot, diagnostics=scatter), settings, band)
     budgets: list[Budget] = []
     unknown: list[ChannelLabel] = []
-    for column, (label, mean) in enumerate(zip(snapshot.channels, means, strict=True)):
+    every = zip(snapshot.channels, means, plain_means, strict=True)
+    for column, (label, mean, plain) in enumerate(every):
         if column not in calibrated:
             continue
         ratio, uncertainty = calibrated[column]
@@ -82,8 +88,13 @@ def noise_budgets(
         if not value > 0:
             unknown.append(label)
             continue
-        # the interval includes what averaging over the band does not reduce
-        half = known(float(mean.high[0] - mean.low[0]) / 2 / NORMAL_95)
+        # the interval includes errors that averaging over the band does not reduce
+        half = known(float(plain.high[0] - plain.low[0]) / 2 / NORMAL_95)
+        late, left = (
+            0.0 if psd is None else known(float(np.mean(psd[inside, column]))) / value
+            for psd in (snapshot.removed, snapshot.left_in)
+        )
+        late = max(known(float(clocks[column])), late / CLOCK_FACTOR)
         leaks = 0.0 if edges is None else float(np.mean(edges.most[inside, column])) / value
         counting = 0.0
         if snapshot.quantisation_psd is not None:
@@ -98,7 +109,8 @@ def noise_budgets(
                 2 * max(averages, 1.0) * max(int(inside.sum()) / 2, 1.0),
             ),
             Component("sensitivity", "B", "normal", 2 * uncertainty),
-            Component("clocks", "B", "rectangular", known(float(clocks[column])) / _RECTANGULAR),
+            Component("clocks", "B", "rectangular", late / _RECTANGULAR),
+            Component("motion", "B", "rectangular", left / _RECTANGULAR),
             Component("leakage", "B", "rectangular", leaks / _RECTANGULAR),
             Component("incoherence", "B", "rectangular", misfit / _RECTANGULAR),
             Component("quantisation", "B", "rectangular", counting / _RECTANGULAR),

@@ -17,7 +17,7 @@ class Component:
     ----------
     source : str
         "estimate", "variation", "clocks", "leakage", "quantisation", "certificate",
-        "sensitivity" or "incoherence".
+        "sensitivity", "incoherence" or "motion".
     kind : str
         "A" (from the scatter of these data) or "B" (from elsewhere).
     distribution : str

@@ -12,6 +12,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -206,7 +207,8 @@ class ClockState:
             is_one_count = self.offset_source is other.offset_source is None
             return RelativeTime.STATED if is_one_count else RelativeTime.WHOLE_SAMPLES
         if all(state.source is ClockSource.NOMINAL_RATE for state in states):
-            return RelativeTime.WHOLE_SAMPLES
+            is_one = not any(isnan(state.residual) for state in states)
+            return RelativeTime.WHOLE_SAMPLES if is_one else RelativeTime.ALIGNED
         is_stated = all(state.source is ClockSource.DEVICE_UTC for state in states)
         if is_stated and not any(each.refined or each.corrected or each.drifts for each in states):
             return RelativeTime.STATED

@@ -200,8 +200,8 @@ def _instruments(
             chosen += each.tolist()
     if len(chosen) < len(own):
         raise InsufficientDataError(
-            f"sensors {pair[1]} and {pair[0]}: {n_effective:.3g} averages; expected more than "
-            f"{len(own) + 1}. Record for longer, or use shorter segments"
+            f"sensors {pair[1]} and {pair[0]}: {n_effective:.3g} averages are too few for so many "
+            "channels of the other sensors. Record for longer, or use shorter segments"
         )
     return np.array(sorted(chosen))
 

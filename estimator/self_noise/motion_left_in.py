@@ -91,7 +91,7 @@ def motion_left_in(
     -------
     float64, shape (n_freqs, n_channels)
         In unit**2/Hz. Zero where it is negligible, and where it is not known: without two other
-        sensors of live channels, and if n_effective does not exceed their number.
+        sensors of equally many live channels, and if n_effective does not exceed their number.
     """
     left = np.zeros(given.psd.shape)
     good = np.flatnonzero(given.valid & (band >= 0))
@@ -167,7 +167,8 @@ def _of_bands(
     for d in sorted(set(shared.tolist())):
         if n <= 2 * d:
             continue
-        parts = {j: np.arange(first[j], first[j] + d) for j, own in enumerate(dims) if own >= d}
+        # of more channels, nobody knows which sense the motion of fewer
+        parts = {j: np.arange(first[j], first[j] + d) for j, own in enumerate(dims) if own == d}
         alive = [j for j, part in parts.items() if not dead[part].any()]
         pairs = list(combinations(alive, 2))
         for j, k in pairs[:: 1 + len(pairs) // (MAX_PAIRS + 1)]:

@@ -23,6 +23,7 @@ from tui.output.calibration import (
 )
 from tui.output.console import check_places, for_people, hint, write_json
 from tui.output.json_document import calibration_document
+from tui.output.results import wrong_times
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,7 +59,7 @@ def calibrate_recordings(
     if noise:
         _show(screen, "Noise, by the calibrated sensitivities", noise_rows(found, snapshot.unit))
         _show(screen, "Budget of the noise PSD, relative", budget_table(noise))
-    for line in (LEGEND, *remarks(found, snapshot), *problems(snapshot)):
+    for line in (LEGEND, *remarks(found, snapshot), *wrong_times(snapshot), *problems(snapshot)):
         screen.print(line)
     write_json(json, calibration_document(found, snapshot))
     hint(f"To sign: huddle report {files[0]}")

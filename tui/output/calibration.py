@@ -35,6 +35,7 @@ _SHORT = {
     "certificate": "cert.",
     "sensitivity": "sens.",
     "incoherence": "incoh.",
+    "motion": "motion",
 }
 LEGEND = (
     "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
@@ -42,7 +43,8 @@ LEGEND = (
     "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
     "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
     "the reference. sens.: twice the uncertainty of the sensitivity. incoh.: motion or noise that "
-    "the model does not explain. u: combined standard uncertainty. U: expanded uncertainty, k u. "
+    "the model does not explain. motion: motion that few averages may leave in. u: combined "
+    "standard uncertainty. U: expanded uncertainty, k u. "
     "1–2: angle between the first and the second channel, less 90°."
 )
 
@@ -259,9 +261,9 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
     )
     lines += _times(found, snapshot)
     lines += [
-        f"{snapshot.sensor_names[each.sensor]}: cycle and sign of its delay are ambiguous in so "
-        "narrow a band of motion. The delay is not shown, and the relative response may have the "
-        "opposite sign."
+        f"{snapshot.sensor_names[each.sensor]}: the cycle of its delay is ambiguous in so "
+        "narrow a band of motion. The delay is not shown; the relative response may have the "
+        "opposite sign, and angles may be off by 180°."
         for each in found.sensors
         if each.is_ambiguous
     ]

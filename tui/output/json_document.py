@@ -314,6 +314,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
         ],
         "confidence": found.confidence,
         "refused": {names[sensor]: why for sensor, why in found.refused.items()},
+        "without_noise": [label.name for label in found.without_noise],
         "sensors": [
             {
                 "sensor": names[each.sensor],

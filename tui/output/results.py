@@ -17,7 +17,6 @@ from daq.results.partners import without_partners
 from daq.timing.clock_model import ClockSource
 from estimator.diagnostics.advice import Copies, NoSharedMotion, NoSignal
 from estimator.diagnostics.shared_noise import MAX_CHANNELS
-from estimator.diagnostics.stability import MIN_SEGMENTS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from tui.output.formatting import (
@@ -187,7 +186,7 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
     if nominal:
         lines.append(
             f"The samples of {listed(nominal)} are taken to be at their nominal rate. If it is not "
-            "exact, the noise is too high or too low, and the intervals do not contain it."
+            "exact, the noise is too high or too low; the intervals do not include this error."
         )
     return lines
 
@@ -198,11 +197,17 @@ def not_searched(snapshot: Snapshot) -> list[str]:
     if (n := len(snapshot.channels)) > MAX_CHANNELS:
         text = f"noise that two channels share is not searched for among more than {MAX_CHANNELS}"
         lines.append(f"{text} channels, to limit the memory; these are {n}")
+    causes = (
+        ("--octaves", bool(snapshot.octaves)),
+        ("--reject", bool(snapshot.left_out.get(Reason.TRANSIENT))),
+        ("segments with gaps", snapshot.bridged is not None),
+    )
     found = snapshot.diagnostics.diagnosis
-    if found is not None and found.stability is None and snapshot.n_segments >= 2 * MIN_SEGMENTS:
+    if found is not None and found.stability is None and any(holds for _, holds in causes):
+        cause = listed([name for name, holds in causes if holds])
         lines.append(
-            "whether the noise changes during the recording is not tested with --octaves, --reject "
-            "or segments with gaps: the intervals hold for steady noise"
+            f"whether the noise changes during the recording is not tested with {cause}: the "
+            "intervals hold for steady noise"
         )
     return lines
 

@@ -37,8 +37,8 @@ OBSTACLES: Mapping[Obstacle, str] = {
     "record again.",
     Obstacle.NO_SEGMENTS: "There is no whole segment without a gap: record longer, or choose a "
     "shorter segment.",
-    Obstacle.NO_ESTIMATE: "There is no noise estimate for {channels}: see the advice on what is "
-    "missing, and record again.",
+    Obstacle.NO_ESTIMATE: "{channels}: no noise estimate at some frequencies of the limit. See the "
+    "advice on what is missing, and record again.",
     Obstacle.OUTSIDE_SPECTRUM: "The spectrum has no frequency of {limits}: choose longer segments "
     "or another sampling rate.",
     Obstacle.NO_SHARED_MOTION: "A sensor records none of the motion that the others share: see the "
@@ -52,7 +52,7 @@ OBSTACLES: Mapping[Obstacle, str] = {
     "beside the noise of the other sensors to be found. Record longer or where the motion is "
     "stronger, or compare with quieter sensors.",
     Obstacle.CLOCKS: "{channels}: errors of the clocks are too large to decide, or not known. Give "
-    "the sensors one clock, or record longer for their rates to be known.",
+    "the sensors one clock, or record longer without --clocks nominal.",
     Obstacle.TOO_FEW_AVERAGES: "The uncertainty of fewer than {averages:g} averages is not "
     "reliable: record longer.",
     Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",

@@ -77,11 +77,13 @@ def limits_section(snapshot: Snapshot, found: TestVerdict | None) -> Section | N
         "channel", "limit", "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict",
     )  # fmt: skip
     note = (
-        f"By the {method} estimate, in bands a third of an octave wide; shown is the band where "
-        f"the channel does worst. dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
+        f"By the {method} estimate, in bands a third of an octave wide, divided at notches and "
+        "steps of the limit; shown is the band where the channel does worst. "
+        f"dB re 1 ({snapshot.unit})²/Hz. A channel passes where the whole "
         "interval of its margin is above zero in every band, and fails where it is below zero in "
         "one. The intervals hold for all channels and bands together with a probability of 95 %, "
-        "and include what the clocks may add, and motion that few averages do not show."
+        "and include what the clocks may add or take away, and motion that few averages do not "
+        "show."
     )
     table = Table(header, tuple(rows), left=frozenset({0, 1, 6}), tones=tones)
     return Section("Verdict against the limits", (table, Paragraph(note, "quiet")))

@@ -52,15 +52,17 @@ class Margins:
         Natural logarithm of limit over noise.
     cov : float64
         Of the noise.
-    clocks : float64
-        By how much more the noise must be above the limit, for what clocks may have added.
+    added, removed : float64
+        By how much more the noise must be above the limit, or below it, for what is no noise and
+        what is missing in the estimate: a natural logarithm.
     can_fail : bool
         False where the estimate is an upper bound.
     """
 
     margin: FloatArray
     cov: FloatArray
-    clocks: FloatArray
+    added: FloatArray
+    removed: FloatArray
     can_fail: BoolArray
 
 
@@ -148,8 +150,8 @@ def _chances(
         margins.cov * math.sqrt(share), quantile, np.full(estimate.shape, averages)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        passes = _normal_cdf((then - np.log(high)) / deviation)
-        short = np.where(low > 0, np.log(low), -np.inf) - margins.clocks
+        passes = _normal_cdf((then - np.log(high) - margins.removed) / deviation)
+        short = np.where(low > 0, np.log(low), -np.inf) - margins.added
         fails = np.where(margins.can_fail, _normal_cdf((short - then) / deviation), 0.0)
     return np.asarray(passes.prod(axis=1) + 1 - (1 - fails).prod(axis=1))
 

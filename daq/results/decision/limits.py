@@ -1,10 +1,10 @@
 """Noise masks of the bench file, and which channels are below them for certain.
 
 A mask is judged in bands a third of an octave wide, where single frequencies scatter less: the mean
-noise beside the mean of the mask. Where the mask is steep, its own points divide the bands. A
-channel passes where the whole interval of its band means is below the mask in every band, and fails
-where the whole interval of one band is above it. The intervals hold for all channels, masks and
-bands together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
+noise beside the mean of the mask. Notches, peaks and steps of the mask divide the bands. A channel
+passes where the whole interval of its band means is below the mask in every band, and fails where
+the whole interval of one band is above it. The intervals hold for all channels, masks and bands
+together (Bonferroni): of tests with all channels just at the mask, one in forty fails.
 
 What the clocks may have added to the noise or taken from it, and what the estimate may be off by
 where one common motion does not explain the averages, widens the interval. Noise that is below zero
@@ -27,9 +27,9 @@ from daq.results.band_summary import (
     deviation_at_bound,
     dimension_error,
     judged_method,
+    mean_in_bands,
     second_order_error,
 )
-from daq.results.clock_effect import effect_in_bands
 from daq.results.decision.decision_time import Margins, predict
 from daq.results.decision.mask_bands import judged_range, mask_edges, mean_mask
 from daq.results.decision.verdict import (
@@ -127,6 +127,7 @@ class _Comparison:
     high: FloatArray
     added: FloatArray
     removed: FloatArray
+    by_clocks: FloatArray
     left_in: FloatArray
     error: FloatArray
     averages: FloatArray
@@ -184,12 +185,12 @@ class _Comparison:
         """Return what keeps the limit from being decided."""
         would_fail = bool((self.low > self.mask).any())  # by scatter alone
         would_pass = bool((self.high <= self.mask).all())
-        by_clocks = would_fail and not bool((self.low - self.added > self.mask).any())
-        by_clocks |= would_pass and not bool((self.high + self.removed <= self.mask).all())
-        by_clocks |= bool(np.isinf(self.added).any())  # nothing is known of them
         without = self.low - self.left_in <= self.mask
-        is_large = self.left_in >= LARGE_SHARE * np.abs(self.mean)
-        by_motion = bool((is_large & without & (self.mean > self.mask)).any())
+        is_large = (self.left_in >= LARGE_SHARE * np.abs(self.mean)) & (self.mean > self.mask)
+        by_motion = bool(((is_large | (self.low > self.mask)) & without).any())
+        by_clocks = would_fail and not bool((self.low - self.by_clocks > self.mask).any())
+        by_clocks |= would_pass and not bool((self.high + self.removed <= self.mask).all())
+        by_clocks |= bool(np.isinf(self.removed).any())  # nothing is known of them
         reads_high = self.is_faulty and (would_fail or bool((self.mean > self.mask).any()))
         reasons = (
             (Obstacle.NO_ESTIMATE, not known.all()),
@@ -211,7 +212,8 @@ class _Comparison:
         return Margins(
             margin=np.where(positive, in_log, in_linear),
             cov=np.where(positive, self.spread / np.abs(self.mean), 1.0),
-            clocks=np.log1p(self.added / self.mask),
+            added=np.log1p(self.added / self.mask),
+            removed=np.log1p(self.removed / self.mask),
             can_fail=np.full(self.mean.shape, not self.is_faulty),
         )
 
@@ -229,12 +231,16 @@ def _compare(
     label, frequency = snapshot.channels[column], snapshot.frequency
     noise = snapshot.results.get(judged_method(snapshot, settings))
     if edges.size < 2:
-        centre = mask = added = removed = left_in = np.empty(0)
+        centre = mask = np.empty(0)
     else:
         centre = np.sqrt(frequency[edges[:-1]] * frequency[edges[1:] - 1])
         mask = mean_mask(bench, limit, label, frequency, edges)
-        added, removed = effect_in_bands(snapshot, settings, edges, column)
-        left_in = _left_in(snapshot, edges, column)
+
+    def in_bands(psd: FloatArray | None) -> FloatArray:
+        if psd is None or noise is None or not centre.size:
+            return np.zeros(centre.shape)
+        return mean_in_bands(psd[:, column], noise.noise_psd[:, column], edges, frequency)
+
     averages = averages_at(snapshot, centre)
     mean = spread = low = high = np.full(centre.shape, np.nan)
     if noise is not None and centre.size:
@@ -250,6 +256,7 @@ def _compare(
         low, high = decision_interval(means, quantile, averages)
         mean = np.where(_is_complete(noise, column, edges), mean, np.nan)
     diagnostics = snapshot.diagnostics
+    unknown = 0.0 if diagnostics.synchronisation.is_known else math.inf
     return _Comparison(
         limit=limit,
         label=label,
@@ -261,9 +268,10 @@ def _compare(
         spread=spread,
         low=low,
         high=high,
-        added=added,
-        removed=removed,
-        left_in=left_in,
+        added=in_bands(snapshot.added) + unknown,
+        removed=in_bands(snapshot.removed) + unknown,
+        by_clocks=in_bands(snapshot.added_by_clocks),
+        left_in=in_bands(snapshot.left_in),
         error=_errors(snapshot, edges, judged_method(snapshot, settings), column),
         averages=averages,
         is_alone=np.array(
@@ -312,17 +320,6 @@ def _errors(snapshot: Snapshot, edges: NDArray[np.int64], method: str, column: i
     return error
 
 
-def _left_in(snapshot: Snapshot, edges: NDArray[np.int64], column: int) -> FloatArray:
-    """Return the motion that may be left in the mean noise of each band at most, unit²/Hz."""
-    found = snapshot.left_in
-    if found is None:
-        return np.zeros(len(edges) - 1)
-    inside, starts = slice(edges[0], edges[-1]), edges[:-1] - edges[0]
-    width = np.gradient(snapshot.frequency)[inside]
-    total = np.add.reduceat(found[inside, column] * width, starts)
-    return np.asarray(total / np.add.reduceat(width, starts))
-
-
 def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
     """Return what keeps the whole test from a decision."""
     found = set()
@@ -330,6 +327,8 @@ def _general_obstacles(snapshot: Snapshot) -> set[Obstacle]:
         found.add(Obstacle.SENSORS_LOST)
     if snapshot.n_segments == 0:
         found.add(Obstacle.NO_SEGMENTS)
+    if not snapshot.diagnostics.synchronisation.is_known:
+        found.add(Obstacle.CLOCKS)
     return found
 
 
@@ -341,7 +340,8 @@ def _prediction(
         Margins(
             margin=np.concatenate([part.margin for part in parts]),
             cov=np.concatenate([part.cov for part in parts]),
-            clocks=np.concatenate([part.clocks for part in parts]),
+            added=np.concatenate([part.added for part in parts]),
+            removed=np.concatenate([part.removed for part in parts]),
             can_fail=np.concatenate([part.can_fail for part in parts]),
         ),
         quantile=quantile,

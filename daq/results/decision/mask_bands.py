@@ -12,21 +12,21 @@ from daq.results.band_summary import highest_known
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench, Limit
     from daq.estimation.snapshot import ChannelLabel, Snapshot
     from estimator.self_noise.band_means import FloatArray
 
 BANDS_PER_OCTAVE = 3
-STEEP = 2.0
-"""Ratio of a mask's values in one band from which on the mask's points divide the band."""
-_ANY_UNIT = "m/s²"
+BENT = 2.0
+"""Ratio of a mask to a straight line through its band from which on its points divide the band."""
 
 
 def mask_edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
     """Return edges of third-octave bands within a mask's frequencies, each with a bin or more.
 
-    Where the mask varies by more than `STEEP` in a band, its own points divide it. The last one
-    ends where nothing is known any more.
+    Where the mask leaves a straight line through a band by more than `BENT`, its own points divide
+    the band: notches, peaks and steps. The last band ends where nothing is known any more.
     """
     frequency = snapshot.frequency
     mask = limit.mask
@@ -39,13 +39,29 @@ def mask_edges(snapshot: Snapshot, limit: Limit) -> NDArray[np.int64]:
     edges = np.searchsorted(frequency, np.geomspace(low, high, n_bands + 1))
     edges[-1] += 1
     edges = np.unique(edges).astype(np.int64)
-    psd = mask.at(np.clip(frequency, low, high), mask.unit or _ANY_UNIT)[edges[0] : edges[-1]]
-    starts = edges[:-1] - edges[0]
-    steep = np.maximum.reduceat(psd, starts) > STEEP * np.minimum.reduceat(psd, starts)
+    bent = _is_bent(mask, snapshot.unit, frequency, edges)
     points = np.searchsorted(frequency, mask.frequency[1:-1])
     points = points[(points >= edges[0]) & (points < edges[-1])]
-    points = points[steep[np.searchsorted(edges, points, side="right") - 1]]
+    points = points[bent[np.searchsorted(edges, points, side="right") - 1]]
     return np.unique(np.concatenate([edges, points])).astype(np.int64)
+
+
+def _is_bent(
+    mask: Mask, unit: str, frequency: FloatArray, edges: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return whether a mask leaves a straight line in log-log, by band."""
+    inside = slice(int(edges[0]), int(edges[-1]))
+    x = np.log(frequency[inside])
+    f = np.clip(frequency[inside], mask.frequency[0], mask.frequency[-1])
+    y = np.log(mask.at(f, unit, of_channel=unit))
+    starts, counts = edges[:-1] - edges[0], np.diff(edges)
+    first, last = starts, starts + counts - 1
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = np.nan_to_num((y[last] - y[first]) / (x[last] - x[first]))
+    line = np.repeat(y[first], counts) + np.repeat(slope, counts) * (
+        x - np.repeat(x[first], counts)
+    )
+    return np.asarray(np.maximum.reduceat(np.abs(y - line), starts) > np.log(BENT))
 
 
 def judged_range(snapshot: Snapshot, limit: Limit, edges: NDArray[np.int64]) -> tuple[float, float]:

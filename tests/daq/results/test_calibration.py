@@ -303,7 +303,7 @@ def test_an_ambiguous_delay_is_said(snapshot: Snapshot) -> None:
     assert rows[0][header.index("delay (µs)")] == "?"
     said = [line for line in remarks(changed, snapshot) if "ambiguous" in line]
     assert len(said) == 1
-    assert said[0].startswith("b: cycle and sign")
+    assert said[0].startswith("b: the cycle of its delay")
 
 
 def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:

@@ -11,8 +11,7 @@ from daq.estimation.diagnosis import bias_of_clocks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, Synchronisation
-from daq.results.band_summary import channel_means
-from daq.results.clock_effect import effect_in_bands
+from daq.results.band_summary import channel_means, mean_in_bands
 from estimator.methods import self_noise
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.formatting import level_with_error
@@ -42,9 +41,11 @@ def test_means_are_lowered_by_four_times_what_is_expected_of_the_clocks() -> Non
     for column in range(9):  # the verdict's number is the same
         band = slice(10, 30)
         noise = snapshot.results["three-sensor"].noise_psd[band, column]
-        added, removed = effect_in_bands(snapshot, SETTINGS, edges, column)
-        assert added == pytest.approx(CLOCK_FACTOR * 0.01 * noise.mean())
-        assert not removed.any()
+        added = snapshot.added
+        assert added is not None
+        psd = snapshot.results["three-sensor"].noise_psd[:, column]
+        mean = mean_in_bands(added[:, column], psd, edges, snapshot.frequency)
+        assert mean == pytest.approx(CLOCK_FACTOR * 0.01 * noise.mean())
 
 
 def test_they_add_no_more_than_the_noise_itself_and_nothing_where_unknown() -> None:
@@ -105,3 +106,19 @@ def test_clocks_that_err_in_opposite_ways_widen_the_upper_end() -> None:
     assert np.all(missing > 0)
     assert np.all(found.removed[1:, 0] > missing)
     np.testing.assert_allclose(found.removed[1:41, 0], CLOCK_FACTOR * missing[:40], rtol=0.05)
+
+
+def test_errors_of_two_clocks_take_nothing_from_the_noise_of_two_sensors() -> None:
+    frequency = np.arange(11) * np.float64(1.0)
+    csm = np.broadcast_to(np.ones((2, 2)) + 1e-3 * np.eye(2), (11, 2, 2)).astype(np.complex128)
+    found = bias_of_clocks(
+        Synchronisation({"A": 0.0, "B": 1e-4}),
+        dims=(1, 1),
+        frequency=frequency,
+        csm=csm,
+        results={"two-channel": self_noise("two-channel", csm, dims=(1, 1), n_effective=1e3)},
+    )
+    assert found.removed is not None
+    assert not found.removed.any()
+    assert found.noise_bias is not None
+    assert (found.noise_bias[1:, 1] > 0).all()

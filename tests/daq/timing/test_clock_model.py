@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -409,6 +410,7 @@ def clock(sensor: str, source: ClockSource) -> ClockState:
         ({"source": ClockSource.DEVICE_UTC, "corrected": 1e-6}, RelativeTime.ALIGNED),
         ({"source": ClockSource.DEVICE_UTC, "drifts": True}, RelativeTime.ALIGNED),
         ({"source": ClockSource.NOMINAL_RATE}, RelativeTime.WHOLE_SAMPLES),
+        ({"source": ClockSource.NOMINAL_RATE, "residual": math.nan}, RelativeTime.ALIGNED),
         ({"source": ClockSource.SAMPLE_INSTANTS}, RelativeTime.ALIGNED),
         ({}, RelativeTime.ALIGNED),
     ],

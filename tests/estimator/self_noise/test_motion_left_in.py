@@ -112,3 +112,12 @@ def test_advice_names_the_channels_of_the_quiet_sensor(sensors: int) -> None:
     assert 0.4 < advice.share <= 1
     # of a test in which the noise of A is mostly motion these would be wrong
     assert not [e for e in found.advice if isinstance(e, WeakMotion | MissingDimension)]
+
+
+def test_strong_motion_beside_a_sensor_of_one_channel_leaves_nothing_in() -> None:
+    """Its channel senses what the third one of the others does, and not the first."""
+    dims, frequencies = (3, 3, 1), len(FREQUENCY)
+    senses = np.vstack([np.eye(3), np.eye(3), [[0.0, 0.0, 1.0]]])
+    csm = np.broadcast_to(1e4 * senses @ senses.T + np.eye(7), (frequencies, 7, 7))
+    drawn_csm = wishart(csm.astype(np.complex128), 200, np.random.default_rng(1))[0]
+    assert not left_in(drawn_csm, dims, 200).any()

@@ -97,7 +97,7 @@ def _delay(advice: Delay, names: Names) -> Explanation:
     if advice.delay < 0:
         early, late = late, early
     return Explanation(
-        f"Sensor {late} lags sensor {early} by {abs(advice.delay) * 1e3:.3g} ms "
+        f"The samples of {late} lag those of {early} by {abs(advice.delay) * 1e3:.3g} ms "
         f"({abs(advice.delay_samples):.2g} samples): {EFFECT_OF_DELAY}.",
         "Synchronise the clocks, and use a tapered window.",
     )

@@ -20,7 +20,9 @@ def prediction(
     margin: float, *, cov: float = 0.1, n: int = 50, clocks: float = 0.0, can_fail: bool = True
 ) -> Prediction:
     """Return the prediction for channels that are all as far from the limit."""
-    margins = Margins(np.full(n, margin), np.full(n, cov), np.full(n, clocks), np.full(n, can_fail))
+    margins = Margins(
+        np.full(n, margin), np.full(n, cov), np.full(n, clocks), np.zeros(n), np.full(n, can_fail)
+    )
     return predict(margins, quantile=QUANTILE, elapsed=100.0, averages=100.0, least=20.0)
 
 
@@ -50,7 +52,9 @@ def test_what_clocks_may_have_added_does_not_fail_with_time() -> None:
 
 
 def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
-    margins = Margins(np.full(9, 5.0), np.full(9, 0.3), np.zeros(9), np.ones(9, dtype=bool))
+    margins = Margins(
+        np.full(9, 5.0), np.full(9, 0.3), np.zeros(9), np.zeros(9), np.ones(9, dtype=bool)
+    )
     found = predict(margins, quantile=QUANTILE, elapsed=10.0, averages=10.0, least=20.0)
     assert found.seconds is not None
     assert 20 <= found.seconds < 28
@@ -64,7 +68,7 @@ def test_it_decides_as_often_as_it_says() -> None:
     for _ in range(150):
         truth = rng.normal(0.5, 0.15, n)
         now = truth + cov * rng.standard_normal(n)
-        margins = Margins(now, np.full(n, cov), np.zeros(n), np.ones(n, dtype=bool))
+        margins = Margins(now, np.full(n, cov), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
         found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
         if found.seconds is None:
             continue

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from daq.bench.loading import parse
+from daq.bench.model import Limit
 from daq.results.band_summary import channel_means, dimension_error, second_order_error
 from daq.results.decision.limits import MIN_AVERAGES, judge
+from daq.results.decision.mask_bands import mask_edges
 from daq.results.decision.verdict import LimitResult, Obstacle, TestVerdict, Verdict
 from estimator.diagnostics.advice import ModelMisfit
 from estimator.diagnostics.kinds import Level
@@ -214,12 +216,14 @@ def test_noise_that_clocks_may_have_taken_away_does_not_pass() -> None:
 
 
 def test_clocks_that_nobody_knows_decide_nothing() -> None:
-    snapshot = with_clocks(made_snapshot(n_effective=5000.0), residual={"A": 0.0, "B": math.nan})
-    for psd in (1e-14, 1e-9):
-        found = verdict_on(snapshot, psd)
-        assert found.verdict is Verdict.NOT_DECIDED
-        assert found.obstacles == (Obstacle.CLOCKS,)
-        assert found.prediction is None
+    for n_effective in (5000.0, MIN_AVERAGES - 1):
+        snapshot = made_snapshot(n_effective=n_effective)
+        snapshot = with_clocks(snapshot, residual={"A": 0.0, "B": math.nan})
+        for psd in (1e-14, 1e-9):
+            found = verdict_on(snapshot, psd)
+            assert found.verdict is Verdict.NOT_DECIDED
+            assert Obstacle.CLOCKS in found.obstacles
+            assert found.prediction is None  # time does not mend it
 
 
 def test_noise_that_is_negative_for_certain_does_not_pass() -> None:
@@ -425,10 +429,13 @@ def test_dimensions_that_do_not_explain_the_averages_decide_nothing(
         assert {each.obstacle for each in found.limits} == {Obstacle.MODEL_MISFIT}
 
 
+@pytest.mark.parametrize(("excess", "share"), [(1.6, 0.9), (1.2, 0.2)])
 @pytest.mark.parametrize("clocks_known", [True, False])
-def test_what_may_be_motion_does_not_fail(*, clocks_known: bool) -> None:
+def test_what_may_be_motion_does_not_fail(
+    excess: float, share: float, *, clocks_known: bool
+) -> None:
     """Also where the clocks are taken as stated, and what they add is not known."""
-    snapshot = diagnosed()
+    snapshot = diagnosed(n_effective=5000.0)
     noise = snapshot.results["three-sensor"]
     psd = float(np.nanmedian(noise.noise_psd[:, 8]))
     diagnosis = snapshot.diagnostics.diagnosis
@@ -445,10 +452,21 @@ def test_what_may_be_motion_does_not_fail(*, clocks_known: bool) -> None:
             synchronisation=replace(snapshot.diagnostics.synchronisation, noise_bias=bias),
         )
         more = 'sensors = ["C"]\nchannels = ["Z"]'
-        return verdict_on(replace(snapshot, diagnostics=diagnostics), psd / 1.6, more)
+        return verdict_on(replace(snapshot, diagnostics=diagnostics), psd / excess, more)
 
     assert found(0.0).verdict is Verdict.FAIL
-    undecided = found(0.9)
+    undecided = found(share)
     assert undecided.verdict is Verdict.NOT_DECIDED
     assert undecided.obstacles == (Obstacle.WEAK_MOTION,)
     assert undecided.prediction is None
+
+
+def test_a_smooth_mask_of_many_points_has_no_more_bands_than_one_of_two() -> None:
+    """However steep it is."""
+    snapshot = made_snapshot()
+    frequency = np.geomspace(1.0, 90.0, 300)
+    many, two = (
+        Limit(name="limit", frequency=tuple(f), psd=tuple(1e-9 * f**-4))
+        for f in (frequency, frequency[[0, -1]])
+    )
+    np.testing.assert_array_equal(mask_edges(snapshot, many), mask_edges(snapshot, two))

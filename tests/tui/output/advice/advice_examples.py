@@ -307,11 +307,11 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     ),
     (
         replace(LEADS, delay=0.02, delay_samples=0.8),
-        ("Sensor b lags sensor a by 20 ms (0.8 samples)", "Synchronise the clocks"),
+        ("The samples of b lag those of a by 20 ms (0.8 samples)", "Synchronise the clocks"),
     ),
     (
         LEADS,
-        ("Sensor a lags sensor b by 20 ms (0.8 samples)",),
+        ("The samples of a lag those of b by 20 ms (0.8 samples)",),
     ),
     (
         UnequalResponses(
