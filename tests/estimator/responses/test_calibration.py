@@ -168,7 +168,7 @@ def test_many_sensors_and_few_averages_do_not_lower_gains(n: int) -> None:
 
 
 def test_too_few_averages_for_any_instrument_are_refused() -> None:
-    with pytest.raises(InsufficientDataError, match="expected more than 4"):
+    with pytest.raises(InsufficientDataError, match="averages are too few"):
         scores(0, d=3, snr=(100.0,) * 3, n=4, n_freqs=60)
 
 
