@@ -74,16 +74,18 @@ def channel_means(
     """Return the mean noise of every channel in a band, each with its interval.
 
     It is the 95 % interval of one channel, unless another `quantile` of the normal distribution is
-    given, widened by `Snapshot.added` and `Snapshot.removed`, and by errors that all
-    frequencies have in common (`dimension_error`, `second_order_error`). Where maximum likelihood
-    stands at its bound of zero at many frequencies, the mean is that of a noise constant over each
-    octave, or over the band (`estimator.self_noise.quiet_sensor`).
+    given, widened by `Snapshot.added`, `Snapshot.removed` and `taken_by_bound`, and by errors that
+    all frequencies have in common (`dimension_error`, `second_order_error`). Where maximum
+    likelihood stands at its bound of zero at many frequencies, the mean is that of a noise constant
+    over each octave, or over the band (`estimator.self_noise.quiet_sensor`).
     """
     frequency = snapshot.frequency
     edges = band_edges(frequency, band)
     correlation, width = correlation_of(settings), np.gradient(frequency)
     at_bound = (noise.flags & Flag.BOUNDARY) != 0
-    added, removed = snapshot.added, snapshot.removed
+    added, removed = snapshot.added, taken_by_bound(noise, snapshot.dims)
+    if snapshot.removed is not None:
+        removed = removed + snapshot.removed
     means = [
         band_means(
             noise.noise_psd[:, column],
@@ -94,7 +96,7 @@ def channel_means(
             quantile=quantile,
             deviation=deviation_at_bound(noise, column),
             added=None if added is None else added[:, column],
-            removed=None if removed is None else removed[:, column],
+            removed=removed[:, column],
         )
         for column in range(noise.noise_psd.shape[1])
     ]
@@ -230,6 +232,26 @@ def mean_in_bands(
     whole = np.add.reduceat(width[first:last], starts)
     total = np.add.reduceat(np.where(width > 0, psd * width, 0.0)[first:last], starts)
     return np.asarray(total / np.where(whole > 0, whole, 1.0))
+
+
+def taken_by_bound(noise: SelfNoise, dims: tuple[int, ...]) -> FloatArray:
+    """Return what the bound of zero of other sensors takes from the mean noise at most.
+
+    Shape (n_freqs, n_channels), in unit**2/Hz. Where maximum likelihood stands at it, it would else
+    have come out below: by ``sqrt(2 / pi)`` standard deviations on average, if the noise is far
+    below its scatter. So much noise too little is left to the other sensors
+    (docs/validation/maximum-likelihood.md).
+    """
+    n_channels = noise.noise_psd.shape[1]
+    deviation = [deviation_at_bound(noise, column) for column in range(n_channels)]
+    below = math.sqrt(2 / math.pi) * np.nan_to_num(np.stack(deviation, axis=1))
+    sensor_of = np.repeat(np.arange(len(dims)), dims)
+    found = np.zeros(below.shape)
+    for sensor in range(len(dims)):
+        most = below[:, sensor_of == sensor].max(axis=1)
+        others = sensor_of != sensor
+        found[:, others] = np.maximum(found[:, others], most[:, None])
+    return found
 
 
 def deviation_at_bound(noise: SelfNoise, column: int) -> FloatArray:

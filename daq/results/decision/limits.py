@@ -29,6 +29,7 @@ from daq.results.band_summary import (
     judged_method,
     mean_in_bands,
     second_order_error,
+    taken_by_bound,
 )
 from daq.results.decision.decision_time import Margins, predict
 from daq.results.decision.mask_bands import judged_range, mask_edges, mean_mask
@@ -254,6 +255,7 @@ def _compare(
         )
         mean, spread = means.mean, means.spread
         low, high = decision_interval(means, quantile, averages)
+        high = high + in_bands(taken_by_bound(noise, snapshot.dims))
         mean = np.where(_is_complete(noise, column, edges), mean, np.nan)
     diagnostics = snapshot.diagnostics
     unknown = 0.0 if diagnostics.synchronisation.is_known else math.inf

@@ -10,12 +10,16 @@ import numpy as np
 from daq.bench.model import Channel
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.results.band_summary import channel_means, deviation_at_bound
+from daq.results.band_summary import channel_means, deviation_at_bound, taken_by_bound
 from estimator.diagnostics.advice import WeakMotion
+from estimator.methods import self_noise
 from estimator.self_noise.result import Flag
+from tests.estimator.csm_models import wishart
+from tests.tui.example_snapshot import made_snapshot
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,6 +27,8 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
 
 RATE = 100.0
+N_AVERAGES = 189.0
+UNKNOWN = SnapshotDiagnostics()
 BAND = (5.0, 45.0)
 SETTINGS = Settings(
     segment=2.0, clocks="nominal", methods=("maximum-likelihood",), dimension=None, band=BAND
@@ -88,3 +94,21 @@ def test_single_frequencies_at_the_bound_count_as_zero_with_their_deviation(tmp_
     found = channel_means(changed, snapshot, SETTINGS, BAND)[column]
     share = len(where) / ((snapshot.frequency >= BAND[0]) & (snapshot.frequency <= BAND[1])).sum()
     assert abs(found.mean[0] / usual.mean[0] - (1 - share)) < 0.01
+
+
+def test_the_bound_of_a_quiet_sensor_takes_nothing_from_the_intervals_of_others() -> None:
+    """Their noise comes out as much too low as that of the quiet one cannot come out below zero."""
+    noise = np.array([0.1, 0.01, 1e-5])
+    csm = np.broadcast_to(np.ones((3, 3)) + np.diag(noise), (201, 3, 3)).astype(np.complex128)
+    snapshot = replace(made_snapshot(n_channels=1, n_effective=N_AVERAGES), diagnostics=UNKNOWN)
+    covered, without = [], []
+    for seed in range(20):
+        drawn = wishart(csm, round(N_AVERAGES), np.random.default_rng(seed))[0]
+        found = self_noise("maximum-likelihood", drawn, dims=(1, 1, 1), n_effective=N_AVERAGES)
+        changed = replace(snapshot, csm=drawn, results={"maximum-likelihood": found})
+        mean = channel_means(found, changed, SETTINGS, BAND)[1]
+        taken = taken_by_bound(found, (1, 1, 1))[10:91, 1].mean()
+        covered.append(mean.low[0] <= noise[1] <= mean.high[0])
+        without.append(noise[1] <= mean.high[0] - taken)
+    assert sum(covered) >= 17  # of 20 at 95 %, with a probability of 98 %
+    assert sum(without) <= 12
