@@ -154,16 +154,17 @@ def interval(
     Returns
     -------
     low, high : float64, same shape
-        ``noise_psd * exp(-/+ z c)`` with ``c = standard_error / noise_psd``. Above c = 1 the
-        upper end is linear instead of exponential in c, so that it is finite for an estimate of
-        zero.
+        ``noise_psd * exp(-/+ z c)`` with ``c = standard_error / noise_psd``. Above c = 1 / z the
+        lower end is 0: the estimate may be nothing but the scatter of other sensors. Above c = 1
+        the upper end is linear instead of exponential in c, so that it is finite for an estimate
+        of zero.
     """
     from scipy import special  # noqa: PLC0415 - takes a quarter of a second to import
 
     z = float(special.ndtri((1 + level) / 2))
     positive = np.where(noise_psd > 0, noise_psd, 1.0)
     c = np.where(noise_psd > 0, standard_error / positive, np.inf)
-    low = np.where(noise_psd > 0, noise_psd * np.exp(-z * c), 0.0)
+    low = np.where(z * c < 1, noise_psd * np.exp(-z * c), 0.0)
     high = np.maximum(noise_psd, standard_error) * np.exp(z * np.minimum(c, 1.0))
     unknown = ~np.isfinite(standard_error)
     return np.where(unknown, np.nan, low), np.where(unknown, np.nan, high)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
 from daq.bench.model import Channel
 from daq.estimation.estimation import estimate
@@ -112,3 +113,14 @@ def test_the_bound_of_a_quiet_sensor_takes_nothing_from_the_intervals_of_others(
         without.append(noise[1] <= mean.high[0] - taken)
     assert sum(covered) >= 17  # of 20 at 95 %, with a probability of 98 %
     assert sum(without) <= 12
+
+
+@pytest.mark.parametrize("n", [20, 46])
+def test_intervals_of_a_sensor_too_quiet_to_be_seen_reach_zero(n: int) -> None:
+    noise = np.array([0.1, 0.01, 1e-4])
+    csm = np.broadcast_to(np.ones((3, 3)) + np.diag(noise), (400, 3, 3)).astype(np.complex128)
+    drawn = wishart(csm, n, np.random.default_rng(1))[0]
+    found = self_noise("maximum-likelihood", drawn, dims=(1, 1, 1), n_effective=n)
+    covered = ((found.low <= noise) & (found.high >= noise)).mean(axis=0)
+    # 400 frequencies: 95 % less three standard errors; with logarithmic lower ends 80 % at C
+    assert (covered > 0.95 - 3 * np.sqrt(0.05 * 0.95 / 400)).all()
