@@ -22,11 +22,11 @@ LONG = ("run", "record", "watch", "serve", "devices", "demo", "import", "simulat
 pseudo_terminals = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
 
 
-def run(bench: Path, folder: Path) -> list[str]:
-    """Return the command for a run as short as it may be."""
+def run(bench: Path, folder: Path, duration: str = "6s") -> list[str]:
+    """Return the command for a run: by default as short as it may be."""
     out = str(folder / "r.h5")
     return python_command(
-        "tui", "run", str(bench), "--duration", "6s", "--segment", "0.5s", "--out", out
+        "tui", "run", str(bench), "--duration", duration, "--segment", "0.5s", "--out", out
     )
 
 
@@ -80,7 +80,7 @@ def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar(
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "60"}
     try:
         with subprocess.Popen(
-            run(bench, tmp_path),
+            run(bench, tmp_path, "1min"),  # simulated time runs fast
             stdout=subprocess.DEVNULL,
             stderr=theirs,
             env=environment,
