@@ -281,7 +281,7 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
 
 
 def _times(found: Calibration, snapshot: Snapshot) -> list[str]:
-    """Return which delays are not known, or not wholly, and which clocks."""
+    """Return which delays are not known, or not wholly."""
     names = snapshot.sensor_names
     by_time: dict[RelativeTime, list[str]] = {}
     for each in found.sensors:
@@ -300,12 +300,6 @@ def _times(found: Calibration, snapshot: Snapshot) -> list[str]:
         lines.append(
             f"Delay of {which[RelativeTime.WHOLE_SAMPLES]}: known up to whole samples. How many "
             "samples the sensors are apart follows from arrival times or from the motion."
-        )
-    unknown = [clock.sensor for clock in snapshot.clocks if math.isnan(clock.residual)]
-    if unknown:
-        lines.append(
-            f"The error of the clocks of {', '.join(unknown)} is not known, and not in the budgets:"
-            " their samples are taken to be at the nominal rate."
         )
     return lines
 

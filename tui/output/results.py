@@ -186,7 +186,8 @@ def wrong_times(snapshot: Snapshot) -> list[str]:
     if nominal:
         lines.append(
             f"The samples of {listed(nominal)} are taken to be at their nominal rate. If it is not "
-            "exact, the noise is too high or too low; the intervals do not include this error."
+            "exact, the noise is too high or too low; intervals and budgets do not include this "
+            "error."
         )
     return lines
 

@@ -52,7 +52,8 @@ OBSTACLES: Mapping[Obstacle, str] = {
     "beside the noise of the other sensors to be found. Record longer or where the motion is "
     "stronger, or compare with quieter sensors.",
     Obstacle.CLOCKS: "{channels}: errors of the clocks are too large to decide, or not known. Give "
-    "the sensors one clock, or record longer without --clocks nominal.",
+    "the sensors one clock, or record longer for their rates to be known (with --clocks nominal "
+    "they never are).",
     Obstacle.TOO_FEW_AVERAGES: "The uncertainty of fewer than {averages:g} averages is not "
     "reliable: record longer.",
     Obstacle.SPANS_LIMIT: "The uncertainty of {channels} spans the limit.",

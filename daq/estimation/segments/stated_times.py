@@ -152,6 +152,8 @@ def drift_of(
     least = median(std)
     within = _NORMAL * median(np.abs(delays - middle[part]))
     within *= float(np.sqrt(len(at) / (len(at) - len(used))))
+    if within * sampling_rate > _BLIND:
+        return math.nan
     scatter = max(within, least)
     away = np.abs(delays - middle[part])
     false = away > _FALSE * np.maximum(scatter, std)
@@ -164,8 +166,6 @@ def drift_of(
     means = np.bincount(part, delays, minlength=_PARTS) / np.maximum(n, 1)
     between = float(n @ (means - delays.mean()) ** 2)
     drifts = between > max(_DRIFTS * _OVERLAPS * scatter**2, len(at) * least**2)
-    if within * sampling_rate > _BLIND:
-        return math.nan
     if not drifts and (nominal or within <= _SCATTERS * least):
         return 0.0
     slope = float(np.polyfit(at, delays, 1)[0])

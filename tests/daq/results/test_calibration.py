@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import replace
 from datetime import date
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.snapshot import Snapshot
     from estimator.self_noise.band_means import BandMeans
+    from estimator.self_noise.result import SelfNoise
 
 GAINS = {"a": 1.0, "b": 1.03, "c": 0.98}
 SETTINGS = Settings(segment=2.0, band=(1.0, 20.0))
@@ -329,10 +330,12 @@ def test_the_delay_of_a_third_sensor_is_in_the_budget_of_the_others() -> None:
 def test_an_error_common_to_the_band_is_in_the_budget_of_the_noise(
     snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def widened(*args: Any) -> tuple[BandMeans, ...]:  # noqa: ANN401
+    def widened(
+        noise: SelfNoise, snapshot: Snapshot, settings: Settings, band: tuple[float, float]
+    ) -> tuple[BandMeans, ...]:
         return tuple(
             replace(mean, low=0.8 * mean.mean, high=1.2 * mean.mean)
-            for mean in channel_means(*args)
+            for mean in channel_means(noise, snapshot, settings, band)
         )
 
     monkeypatch.setattr("daq.results.noise_budget.channel_means", widened)
